@@ -1,4 +1,4 @@
-"""Beside an autopilot: beside_autopilot.py FIRMWARE LINK LAT LON [CAMERA], where a flight folder's files lie."""
+"""Beside an autopilot: beside_autopilot.py FIRMWARE LINK LAT LON [CAMERA]. Run it in a flight folder."""
 
 import sys
 from contextlib import suppress
@@ -20,10 +20,10 @@ options = MavlinkOptions(firmware=firmware)
 bridge = MavlinkBridge(
     parse_connection(link), lambda prior: Navigator(matcher, prior), options, start, origin=origin, site=site
 )
-# A camera, or without one the flight folder's pictures at their own pace.
+# A camera or, without one, the flight folder's pictures in real time.
 pictures = capture(cameras[0]) if cameras else replay(Path("frames"), Path("telemetry.csv"), rate_hz=5.0)
-with bridge, suppress(KeyboardInterrupt):  # the usual end beside a camera
+with bridge, suppress(KeyboardInterrupt):  # the usual way to stop with a camera
     for picture in pictures:
-        if picture is not None:  # a camera had none for a while
+        if picture is not None:  # None: the camera had no picture for a while
             bridge.submit(*picture)
-print(bridge.status)  # closed, the frame in progress has been answered
+print(bridge.status)  # after closing, the last frame has been answered

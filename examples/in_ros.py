@@ -1,4 +1,4 @@
-"""In ROS: in_ros.py 1|2 [NAME:=VALUE ...], a node of your own, run where the map and camera.yaml lie."""
+"""In ROS: in_ros.py 1|2 [NAME:=VALUE ...], your own node. Run it in the folder of the map and camera.yaml."""
 
 import sys
 from contextlib import suppress
@@ -16,9 +16,9 @@ node = import_module(f"scenematch.bridges.ros{sys.argv[1]}").Node("scenematch", 
 bridge = RosBridge(node, site, lambda prior: Navigator(matcher, prior), RosOptions())
 topics = RosTopics(
     image="/down/image_raw", compass="", height="/mavros/global_position/rel_alt"
-)  # "" leaves one out
+)  # "" disables a topic
 try:
-    with suppress(KeyboardInterrupt):  # the usual end
+    with suppress(KeyboardInterrupt):  # the usual way to stop
         node.spin(bridge.handlers(topics), bridge.check_input, None)
 finally:
     bridge.close()

@@ -1,4 +1,4 @@
-"""A CSI camera of a Jetson by GStreamer into Live. Run it where map.tif and camera.yaml lie: LAT LON."""
+"""Feed a Jetson's CSI camera into Live by GStreamer. Run it in the folder of map.tif and camera.yaml: LAT LON."""
 
 import sys
 
@@ -7,7 +7,7 @@ from scenematch import RecentValues
 from scenematch.bridges.pictures import capture
 
 matcher = SceneMatcher(OrthoMap.open("map.tif"), Camera.load("camera.yaml"), method="auto")
-matcher.warmup()  # lookups and plans exist before take-off
+matcher.warmup()  # builds lookups and plans before take-off
 start = Prior(lat_deg=float(sys.argv[1]), lon_deg=float(sys.argv[2]), sigma_m=15.0)
 pipeline = (
     "exec:gst-launch-1.0 -q nvarguscamerasrc ! video/x-raw(memory:NVMM),width=1280,height=720,framerate=15/1"

@@ -1,8 +1,8 @@
-"""MISB KLV (ST 0601) to a .SRT that scenematch reads; needs klvdata.
+"""Convert MISB KLV (ST 0601) to a .SRT that scenematch reads; needs klvdata.
 
     python klv_to_srt.py flight.klv > flight.srt
 
-The camera points down, its top to the nose; with another mount leave the last line out.
+The camera points down, its top to the nose; for another mount leave out the last line.
 """
 
 import datetime

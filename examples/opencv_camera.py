@@ -1,4 +1,4 @@
-"""A USB camera by OpenCV into Live. Run it where map.tif and camera.yaml lie, with the start: LAT LON."""
+"""Feed a USB camera into Live by OpenCV. Run it in the folder of map.tif and camera.yaml: LAT LON (the start)."""
 
 import sys
 import time
@@ -9,7 +9,7 @@ from engine import Answer, Camera, Fix, Frame, Live, LiveOptions, Navigator, Ort
 from scenematch import RecentValues
 
 matcher = SceneMatcher(OrthoMap.open("map.tif"), Camera.load("camera.yaml"), method="auto")
-matcher.warmup()  # lookups and plans exist before take-off
+matcher.warmup()  # builds lookups and plans before take-off
 start = Prior(lat_deg=float(sys.argv[1]), lon_deg=float(sys.argv[2]), sigma_m=15.0)
 KNOWN = ("roll_deg", "pitch_deg", "heading_deg", "height_agl_m")
 vehicle = RecentValues((True, True, True))  # call vehicle.add(ns, roll, pitch, heading, height) for your autopilot
@@ -24,8 +24,8 @@ def deliver(answer: Answer) -> None:
 with Live(lambda prior: Navigator(matcher, prior or start), deliver, options=LiveOptions(deadline_ms=500)) as live:
     camera = cv2.VideoCapture(0)
     while camera.grab():
-        taken_ns = time.monotonic_ns()  # less what your camera takes from exposure to here
+        taken_ns = time.monotonic_ns()  # minus your camera's latency from exposure to here
         image = camera.retrieve()[1]
-        time.sleep(0.02)  # until the attitude after the exposure is there
+        time.sleep(0.02)  # until the attitude after the exposure has arrived
         known = dict(zip(KNOWN, vehicle.at(taken_ns) or (None,) * 4, strict=True))
         live.submit(Frame.from_bgr(image, taken_ns, **known), captured_ns=taken_ns)

@@ -1,4 +1,4 @@
-"""A Raspberry Pi's camera by picamera2 into Live. Run it where map.tif and camera.yaml lie: LAT LON."""
+"""Feed a Raspberry Pi camera into Live by picamera2. Run it in the folder of map.tif and camera.yaml: LAT LON."""
 
 import sys
 
@@ -8,7 +8,7 @@ from engine import Answer, Camera, Fix, Frame, Live, LiveOptions, Navigator, Ort
 from scenematch import RecentValues
 
 matcher = SceneMatcher(OrthoMap.open("map.tif"), Camera.load("camera.yaml"), method="auto")
-matcher.warmup()  # lookups and plans exist before take-off
+matcher.warmup()  # builds lookups and plans before take-off
 start = Prior(lat_deg=float(sys.argv[1]), lon_deg=float(sys.argv[2]), sigma_m=15.0)
 KNOWN = ("roll_deg", "pitch_deg", "heading_deg", "height_agl_m")
 vehicle = RecentValues((True, True, True))  # call vehicle.add(ns, roll, pitch, heading, height) for your autopilot

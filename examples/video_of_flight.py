@@ -1,4 +1,4 @@
-"""A flight folder's pictures as a video, with telemetry as it goes beside one. Run it in the flight folder."""
+"""Convert a flight folder's pictures to a video with its telemetry.csv. Run it in the flight folder."""
 
 import csv
 from pathlib import Path
@@ -12,7 +12,7 @@ size = pictures[0].shape[1::-1]
 video = cv2.VideoWriter("flight.mp4", cv2.VideoWriter_fourcc(*"mp4v"), (len(rows) - 1) / seconds, size)
 for index, picture in enumerate(pictures):
     video.write(picture)
-    rows[index]["frame"] = str(index)  # beside a video a frame's name is its index
+    rows[index]["frame"] = str(index)  # with a video, a frame's name is its index
 video.release()
 with Path("video.csv").open("w", encoding="utf-8", newline="") as file:
     table = csv.DictWriter(file, rows[0])

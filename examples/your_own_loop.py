@@ -1,4 +1,4 @@
-"""Your own loop: frames from anywhere, answers as values. Run it where a flight folder's files lie."""
+"""Your own loop: frames from anywhere, answers as values. Run it in a flight folder."""
 
 import csv
 from pathlib import Path
@@ -11,7 +11,7 @@ from engine import Budget, Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior
 site = OrthoMap.open("map.tif", surface="dsm.tif")
 camera = Camera.load("camera.yaml")
 matcher = SceneMatcher(site, camera, method="ncc", device="auto")
-matcher.warmup()  # lookups and plans exist before take-off
+matcher.warmup()  # builds lookups and plans before take-off
 
 rows = list(csv.DictReader(Path("telemetry.csv").read_text(encoding="utf-8").splitlines()))
 start = Prior(lat_deg=float(rows[0]["lat_deg"]), lon_deg=float(rows[0]["lon_deg"]), sigma_m=10.0)

@@ -1,4 +1,4 @@
-"""The product around the engine: track a flight, compare methods, simulation, bridges, as a library.
+"""The product around the engine, as a library: track flights, compare methods, simulate, bridge to autopilots.
 
 ::
 
@@ -7,8 +7,7 @@
     files = FlightFiles.in_folder("flight")
     summary = track(files, "out", TrackSettings(method="sift"))
 
-Nothing here prints: a run reports to the :class:`Progress` that it is given. A message of an error names the
-argument that it is about.
+Nothing here prints: a run reports to its :class:`Progress`. Error messages name the argument at fault.
 """
 
 from typing import TYPE_CHECKING
@@ -108,9 +107,9 @@ _NAMES = {
     "scenematch.runs.track_export": "export_track",
     "scenematch.runs.tracking": "track",
 }
-"""The public names by module. A module is imported when one of its names is used: a run needs few of them."""
+"""The public names by module. A module is imported only when one of its names is used."""
 
-if not TYPE_CHECKING:  # checkers of types know the names above, and refuse others
+if not TYPE_CHECKING:  # type checkers know the names above and reject others
     __getattr__ = imported_on_use(__name__, _NAMES)
 
 

@@ -1,6 +1,6 @@
-"""Drapes a map over the ground of a Gazebo world: a mesh with the map as its picture, as model://map_ground.
+"""Drape a map over the ground of a Gazebo world: a mesh textured with the map, as model://map_ground.
 
-The model's x is east, its y is north. It has a version for Gazebo classic and one for Gazebo Harmonic.
+The model's x is east, its y is north. There is one version for Gazebo classic and one for Gazebo Harmonic.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ CONFIG = """<?xml version="1.0"?>
   <description>A map draped over the ground.</description>
 </model>
 """
-# Gazebo Harmonic ignores the mesh's material: the picture shines by itself, as nothing else does.
+# Gazebo Harmonic ignores the mesh's material, so the picture is emissive.
 GLOWING = """
         <material>
           <diffuse>0 0 0 1</diffuse>
@@ -62,14 +62,14 @@ GLOWING = """
             </metal>
           </pbr>
         </material>"""
-# Lit by the ambient light alone, it looks as the photograph does.
+# Lit only by ambient light, it looks like the photograph.
 MATERIAL = "newmtl ground\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd ../materials/textures/map.png\n"
 
 
 def vertices(site: OrthoMap, step_px: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """The mesh: places (N, 3) in metres, places in the picture (N, 2) in [0, 1] from its bottom left, its shape.
+    """The mesh: vertices (N, 3) in metres, texture coordinates (N, 2) in [0, 1] from the bottom left, shape.
 
-    The metres are ArduPilot's, about the middle of the map: so the simulated vehicle's latitude is the map's.
+    Metres are ArduPilot's, from the map's centre, so that the simulated vehicle's latitude is the map's.
     """
     columns, rows = (np.r_[np.arange(0, n, step_px), n] - 0.5 for n in (site.width_px, site.height_px))
     xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
@@ -108,7 +108,7 @@ def write_ground(map_path: Path, surface: Path | None, models: Path, step_px: in
         picture = np.moveaxis(source.read([1, 2, 3] if source.count >= 3 else [1]), 0, 2)
     if picture.shape[:2] != (site.height_px, site.width_px):
         raise SystemExit(
-            f"{map_path}: expected a map on a metric grid, which is not resampled when it is opened; "
+            f"{map_path}: expected a map on a metric grid, which needs no resampling when opened; "
             f"gdalwarp -t_srs {site.crs.to_string()} {map_path} metric.tif makes one"
         )
     Image.fromarray(picture.squeeze()).save(folder / "materials/textures/map.png")
@@ -124,12 +124,12 @@ def write_ground(map_path: Path, surface: Path | None, models: Path, step_px: in
 
 
 def main() -> None:
-    """Write the model, and print where the world has its origin, for the launch files and for SITL."""
+    """Write the model, and print the world's origin for the launch files and SITL."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("map", type=Path, help="GeoTIFF of 8 bits")
     parser.add_argument("--surface", type=Path, help="surface model; without it the ground is flat")
     parser.add_argument("--models", type=Path, default=Path(__file__).parent / "models")
-    parser.add_argument("--step-px", type=int, default=8, help="of the mesh, in pixels of the map")
+    parser.add_argument("--step-px", type=int, default=8, help="spacing of the mesh in map pixels")
     wanted = parser.parse_args()
     try:
         site = write_ground(wanted.map, wanted.surface, wanted.models, wanted.step_px)

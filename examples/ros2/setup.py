@@ -21,7 +21,7 @@ setup(
     zip_safe=True,
     maintainer="scenematch",
     maintainer_email="scenematch@example.org",
-    description="Positions from a downward camera and a map, where GNSS is gone.",
+    description="Positions from a downward camera and a map, without GNSS.",
     license="Apache-2.0",
     entry_points={"console_scripts": [f"node = {NAME}.node:main", f"truth = {NAME}.truth:main"]},
 )

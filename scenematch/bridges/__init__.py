@@ -1,1 +1,1 @@
-"""Bridges to autopilots and ROS: they translate messages and hold no algorithms."""
+"""Bridges to autopilots and ROS: they translate messages and contain no algorithms."""

@@ -1,8 +1,8 @@
-"""A live camera: the newest picture with its capture time, through stalls, repeats and reconnections.
+"""A live camera: deliver the newest picture with its capture time, despite stalls, repeats and reconnections.
 
-A thread reads, so that no picture waits in a buffer and a read that blocks stops nobody. Sources are a camera's
-number, a URL or SDP file that OpenCV's FFmpeg opens, and ``exec:COMMAND``, which writes JPEG pictures to its
-standard output: that is how GStreamer and libcamera are read without a build of OpenCV that has them.
+A separate thread reads, so that no picture waits in a buffer and a blocked read delays nobody. A source is a
+camera's number, a URL or SDP file that OpenCV's FFmpeg opens, or ``exec:COMMAND``, which writes JPEG pictures to
+its standard output. The latter reads GStreamer and libcamera without a special build of OpenCV.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ __all__ = ["CameraStream", "capture"]
 Image = NDArray[np.uint8]
 
 EXEC = "exec:"
-"""Begins a source that is a command."""
+"""Prefix of a source that is a command."""
 
 _REOPEN_S = 1.0
-_STALL_S = 2.0  # without a picture, after which the camera is opened again
-_START_S = 15.0  # the same of a command before its first picture: it may start as slowly
-_CLOSE_S = 3.0  # that closing waits for a read in progress
-_IDLE_S = 0.5  # without a new picture, after which the caller is woken
+_STALL_S = 2.0  # without a picture, after which the camera is reopened
+_START_S = 15.0  # the same for a command before its first picture: it may start slowly
+_CLOSE_S = 3.0  # longest time that closing waits for a read in progress
+_IDLE_S = 0.5  # without a new picture, after which ``next`` returns
 _READ_BYTES = 65536
 _JPEG_BEGIN, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 _MAX_JPEG_BYTES = 64 * 2**20
@@ -52,13 +52,13 @@ _log = logging.getLogger("scenematch")
 
 
 class _Source(Protocol):
-    """An open camera. ``read`` blocks until a picture arrives, and returns None where there are no more."""
+    """An open camera. ``read`` blocks until a picture arrives, and returns None after the last."""
 
     def read(self) -> tuple[Image, int] | None:
         """The next picture (H, W, 3) RGB and its time of arrival on ``time.monotonic_ns``."""
 
     def interrupt(self) -> None:
-        """Let a read that blocks return, where that can be done from another thread."""
+        """Make a blocked read return, if possible from another thread."""
 
     def close(self) -> None:
         """Release the camera."""
@@ -91,14 +91,14 @@ class _OpenCvSource:
         return (_rgb(image), arrived_ns) if good and image is not None else None
 
     def interrupt(self) -> None:
-        return  # the next picture or the timeout does
+        return  # the next picture or the timeout ends the read
 
     def close(self) -> None:
         self._camera.release()
 
 
 def _open_stream(source: str) -> Any:
-    """A stream that does not buffer; OpenCV takes FFmpeg's options from the environment, which is put back."""
+    """A stream without buffering; OpenCV reads FFmpeg's options from the environment, which is then restored."""
     given = os.environ.get(_FFMPEG_VARIABLE)
     os.environ[_FFMPEG_VARIABLE] = given or _FFMPEG_OPTIONS
     try:
@@ -109,7 +109,7 @@ def _open_stream(source: str) -> Any:
 
 
 class _CommandSource:
-    """JPEG pictures, one after the other, from the standard output of a command."""
+    """Consecutive JPEG pictures from the standard output of a command."""
 
     def __init__(self, command: str) -> None:
         try:
@@ -126,7 +126,7 @@ class _CommandSource:
                 data = np.frombuffer(bytes(self._buffer[begin : end + 2]), np.uint8)
                 del self._buffer[: end + 2]
                 image = cv2.imdecode(data, cv2.IMREAD_COLOR)
-                if image is not None:  # an end within a thumbnail
+                if image is not None:  # this end may be a thumbnail's
                     return _rgb(image), self._arrived_ns
                 continue
             data = self._process.stdout.read(_READ_BYTES)
@@ -150,13 +150,13 @@ def _rgb(image: Any) -> Image:
 
 
 class CameraStream:
-    """Reads a source in a thread, and opens it again where it ends or stalls.
+    """Reads a source in a thread, and reopens it if it ends or stalls.
 
     Args:
         source: number, URL, SDP file or ``exec:COMMAND``.
 
     Raises:
-        TelemetryError: it cannot be opened now. Later failures are logged, and it is opened again.
+        TelemetryError: it cannot be opened now. After later failures it is reopened, and they are logged.
     """
 
     def __init__(self, source: str) -> None:
@@ -165,12 +165,12 @@ class CameraStream:
         self._newest: tuple[Image, int] | None = None
         self._last: Image | None = None
         self._arrived_s = time.monotonic()
-        self._number = 0  # of the present reader; an older one that still blocks is not listened to
-        self._has_read = self._has_started = False  # ever; since it was opened last
+        self._number = 0  # of the present reader; an older one that still blocks is ignored
+        self._has_read = self._has_started = False  # ever; since the source was last opened
         self._start(self._open())
 
     def next(self, timeout_s: float) -> tuple[Image, int] | None:
-        """The newest picture that differs from the one before it; None where none came in time."""
+        """The newest picture that differs from the one before it; None if none came in time."""
         until = time.monotonic() + timeout_s
         while (left_s := until - time.monotonic()) > 0.0:
             with self._changed:
@@ -181,22 +181,22 @@ class CameraStream:
         return None
 
     def close(self) -> None:
-        """Stop reading; a process that ends while a thread is within compiled code is aborted."""
+        """Stop reading; a process that ends while a thread runs compiled code would abort."""
         self._number += 1
         self._source.interrupt()
         self._thread.join(_CLOSE_S)
 
     def reopen(self, cause: str) -> None:
-        """Abandon the present reader and open the source again.
+        """Abandon the present reader and reopen the source.
 
         Raises:
-            TelemetryError: a command ended without ever having given a picture.
+            TelemetryError: a command ended without ever delivering a picture.
         """
         if not self._has_read and self._name.startswith(EXEC) and not self._thread.is_alive():
             raise TelemetryError(
                 f"camera_source: expected pictures, got none: {quoted(self._name)} ended before the first"
             )
-        _log.warning("camera %s: %s; opened again", quoted(self._name), cause)
+        _log.warning("camera %s: %s; reopened", quoted(self._name), cause)
         self._number += 1
         self._source.interrupt()
         self._arrived_s = time.monotonic()
@@ -207,7 +207,7 @@ class CameraStream:
 
     @property
     def failure(self) -> str | None:
-        """Why the source must be opened again; None while pictures come, if only repeated ones."""
+        """Why the source must be reopened; None while pictures arrive, even repeated ones."""
         if not self._thread.is_alive():
             return "the stream ended"
         limit_s = _START_S if self._name.startswith(EXEC) and not self._has_started else _STALL_S
@@ -244,19 +244,18 @@ class CameraStream:
 
 
 def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Generator[tuple[Image, int] | None, None, None]:
-    """Capture pictures from a camera or stream, for ever.
+    """Capture pictures from a camera or stream forever.
 
     Args:
-        source: as of :class:`CameraStream`; a file of pictures ends like a stream, and begins again.
-        exposure_to_grab_ms: time from exposure to arrival, a property of the camera.
+        source: see :class:`CameraStream`; a file of pictures starts again when it ends.
+        exposure_to_grab_ms: camera latency, from exposure to arrival.
 
     Yields:
-        Picture and capture time; None where no new one came for half a second. A picture that is identical to the
-        last is none: a camera that hangs repeats its last one.
+        Picture and capture time; None if no new one came for half a second. A picture identical to the last does
+        not count: a hung camera repeats its last one.
 
     Raises:
-        TelemetryError: the camera or stream cannot be opened at first, or is a command that ends before its first
-            picture.
+        TelemetryError: the camera or stream cannot be opened at first, or a command ends before its first picture.
     """
     stream = CameraStream(source)
     try:

@@ -1,4 +1,4 @@
-"""The velocity over ground that the last fixes give: to send the vehicle its own back would be circular."""
+"""Velocity over ground from the last fixes: sending the vehicle its own velocity back would be circular."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 from engine.values import Fix
 from scenematch.bridges.vehicle import VehicleState
 
-_MIN_SPAN_S = 0.4  # between the first and the last of the fixes
+_MIN_SPAN_S = 0.4  # between the first and the last fix
 _MAX_SPAN_S, _MAX_SPAN_ALONE_S = 1.5, 0.8  # the latter without the vehicle's velocity
-# 1 sigma of what is not followed within that time: an estimator's velocity drifts, a vehicle turns and brakes.
+# 1 sigma of unmodelled change in that time: an estimator's velocity drifts, a vehicle turns and brakes.
 _DRIFT_MPS2, _ACCELERATION_MPS2 = 0.3, 1.5
 
 
@@ -34,10 +34,10 @@ class _Sample:
 
 
 class VelocityFromFixes:
-    """A line through the last fixes, less what the vehicle's own velocity changed meanwhile.
+    """A line fitted to the last fixes, corrected for changes in the vehicle's own velocity.
 
-    The change comes from its accelerometers, so that only the mean velocity is taken from the fixes, and it holds
-    at the last one rather than in the middle of the time.
+    The changes come from the vehicle's accelerometers. The fixes thus give only the mean velocity, and the result
+    is valid at the last fix rather than in the middle of the interval.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class VelocityFromFixes:
         self._resets: int | None = None
 
     def add(self, fix: Fix, captured_ns: int, resets: int, vehicle: VehicleState) -> GroundVelocity | None:
-        """Add a fix; returns the velocity at it, None after a reset or without earlier fixes."""
+        """Add a fix; returns the velocity at its time, or None after a reset or without earlier fixes."""
         east, north = vehicle.east_velocity_mps, vehicle.north_velocity_mps
         sample = _Sample(captured_ns * 1e-9, fix, None if east is None or north is None else (east, north))
         samples = self._samples
@@ -65,13 +65,13 @@ class VelocityFromFixes:
 
 
 def _own_velocities(samples: list[_Sample]) -> np.ndarray | None:
-    """(N, 2) velocities that the vehicle reported, or None where one is missing."""
+    """(N, 2) velocities reported by the vehicle, or None if one is missing."""
     known = [sample.velocity_mps for sample in samples]
     return None if None in known else np.array(known)
 
 
 def _velocity(samples: list[_Sample], own_mps: np.ndarray | None, changed_mps: float) -> GroundVelocity:
-    """The slope of the fixes less the vehicle's own movement, plus its last own velocity."""
+    """The slope of the fixes minus the vehicle's own movement, plus its own last velocity."""
     times_s = np.array([sample.time_s for sample in samples])
     times_s -= times_s.mean()
     positions_m = np.array([(sample.fix.east_m, sample.fix.north_m) for sample in samples])

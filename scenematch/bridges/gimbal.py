@@ -1,7 +1,7 @@
-"""A camera on a gimbal: the attitude of a body that would hold the camera as its calibration's mount says.
+"""A camera on a gimbal: compute the attitude of a body to which the camera would be fixed by its mount.
 
-The gimbal turns the mount for each frame in this way, and a camera that looks straight down, where a gimbal's own
-roll and yaw are the same turn, has a level body.
+The gimbal's rotation is thus expressed as a body attitude for each frame. If the camera looks straight down, where
+the gimbal's own roll and yaw coincide, that body is level.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Array = NDArray[np.float64]
 _FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # mount of a camera that looks ahead
 _EARTH_YAW = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 _VEHICLE_YAW = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
-_LOCKED_YAW = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK  # what older devices state instead of either
+_LOCKED_YAW = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK  # set by older devices instead of either
 
 
 def body_behind(enu_from_gimbal: Array, mount: Array) -> Attitude:
-    """The body that holds a camera by its mount where a gimbal points it.
+    """The body whose mount holds the camera as the gimbal points it.
 
     Args:
         enu_from_gimbal: (3, 3) rotation from the gimbal's forward, right and down axes.
@@ -34,12 +34,12 @@ def body_behind(enu_from_gimbal: Array, mount: Array) -> Attitude:
 
 
 def from_device(q: list[float], flags: int, heading_deg: float) -> Array | None:
-    """The rotation that GIMBAL_DEVICE_ATTITUDE_STATUS states; None where it states none.
+    """The rotation that GIMBAL_DEVICE_ATTITUDE_STATUS states; None if it states none.
 
     Args:
-        q: w, x, y, z, of a level frame that faces north or, by the flags, where the vehicle faces.
-        flags: of the device.
-        heading_deg: of the vehicle.
+        q: w, x, y, z, relative to a level frame that faces north or, by the flags, the vehicle's heading.
+        flags: flags of the device.
+        heading_deg: heading of the vehicle.
 
     Returns:
         (3, 3) from the gimbal's axes to east, north and up.
@@ -51,7 +51,7 @@ def from_device(q: list[float], flags: int, heading_deg: float) -> Array | None:
 
 
 def from_mount(roll_deg: float, pitch_deg: float, yaw_deg: float, heading_deg: float) -> Array | None:
-    """The rotation that MOUNT_ORIENTATION states, whose yaw is about the vehicle; None where it states none."""
+    """The rotation that MOUNT_ORIENTATION states, with yaw relative to the vehicle; None if it states none."""
     if not all(map(math.isfinite, (roll_deg, pitch_deg, yaw_deg))):
         return None
     return enu_from_body(roll_deg, pitch_deg, yaw_deg + heading_deg)

@@ -16,10 +16,10 @@ PeerAddress = tuple[str, int] | None
 """Host and port that sent a datagram; None on a point-to-point link."""
 
 _DATAGRAM_BYTES = 65535
-_MAX_DATAGRAMS = 256  # per call, so that a flood cannot starve the reader's other work
+_MAX_DATAGRAMS = 256  # per call, so that a flood cannot stop the reader's other work
 _SYNTAX = "udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 _KINDS = {"udp": "udpin", "udpin": "udpin", "udpout": "udpout", "tcp": "tcp", "tcpout": "tcp", "serial": "serial"}
-"""Kinds of links by their names here, in pymavlink and MAVProxy (udp listens) and in MAVSDK (tcpout)."""
+"""Kinds of links by their names here, in pymavlink and MAVProxy (udp listens), and in MAVSDK (tcpout)."""
 
 
 class Link(Protocol):
@@ -75,14 +75,14 @@ class Connection:
 
 
 def parse_connection(text: str, *, listen_anywhere: bool = False) -> Connection:
-    """Read a connection string, in the forms of pymavlink, MAVProxy and MAVSDK, too.
+    """Read a connection string, also in the forms of pymavlink, MAVProxy and MAVSDK.
 
     Args:
-        text: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD. ``udp`` is udpin; two slashes
-            may stand before the host or device (udp://:14540), a comma before the baud rate, and a device may come
-            without its kind (/dev/ttyACM0,57600). Without a host, udpin listens on 127.0.0.1, and with
-            ``listen_anywhere`` on every IPv4 address.
-        listen_anywhere: permits listening on addresses that other machines can reach.
+        text: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD. ``udp`` means udpin. Two
+            slashes may precede the host or device (udp://:14540), a comma the baud rate, and a device needs no
+            kind (/dev/ttyACM0,57600). Without a host, udpin listens on 127.0.0.1, or with ``listen_anywhere`` on
+            every IPv4 address.
+        listen_anywhere: allow listening on addresses that other machines can reach.
 
     Raises:
         OptionError: the syntax is wrong, or the address is not loopback and ``listen_anywhere`` is off.
@@ -102,7 +102,7 @@ def parse_connection(text: str, *, listen_anywhere: bool = False) -> Connection:
     if kind == "udpin" and not listen_anywhere and not _is_loopback(host):
         raise OptionError(
             f"connect: expected a loopback address to listen on, got {host!r}; "
-            "add `listen_anywhere` to be reached from other machines, or send there by udpout"
+            "add `listen_anywhere` to accept other machines, or send to them by udpout"
         )
     return Connection(kind, host, number)
 
@@ -139,7 +139,7 @@ class _Udp:
     def receive(self, timeout_s: float) -> list[tuple[bytes, PeerAddress]]:
         received: list[tuple[bytes, PeerAddress]] = []
         if _wait(self._socket, timeout_s):
-            # Connection refused: the peer does not listen yet.
+            # Connection refused: the peer is not listening yet.
             with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
                 while len(received) < _MAX_DATAGRAMS:
                     data, sender = self._socket.recvfrom(_DATAGRAM_BYTES)

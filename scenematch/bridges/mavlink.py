@@ -1,4 +1,4 @@
-"""The MAVLink bridge: images and the autopilot's telemetry go into the engine, its fixes to the autopilot.
+"""The MAVLink bridge: feed images and the autopilot's telemetry to the engine, and its fixes to the autopilot.
 
 One thread reads the link and keeps it alive; images arrive in the caller's thread, answers in the engine's.
 """
@@ -57,7 +57,7 @@ __all__ = [
 _log = logging.getLogger("scenematch")
 
 CONFIRM_COMMAND = mavlink.MAV_CMD_USER_1
-"""COMMAND_LONG to the bridge's component by which an operator vouches for the fixes that contradict the track."""
+"""COMMAND_LONG to the bridge's component by which an operator confirms fixes that contradict the track."""
 
 _POLL_S = 0.02
 _SILENCE_NS = 5_000_000_000  # without a heartbeat, after which the vehicle counts as disconnected
@@ -70,24 +70,24 @@ class MavlinkBridge:
 
     Args:
         connection: endpoint of the autopilot.
-        make_navigator: as in :class:`engine.navigation.live.Live`.
-        options: which message is sent, and which fixes are withheld.
+        make_navigator: see :class:`engine.navigation.live.Live`.
+        options: which message to send, and which fixes to withhold.
         start: prior position at the start of the flight.
         live: deadlines of the frames.
-        origin: NED origin to set on an autopilot that reports none; None sets none, so that local positions stay
-            unsent.
-        use_velocity: whether the autopilot's velocity is used for dead reckoning between fixes.
-        site: the map; None holds the first fixes against neither the start nor a receiver.
-        check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, where it has a fix.
-        gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None is a fixed one.
+        origin: NED origin to set on an autopilot that reports none; None sets none, so local positions are not
+            sent.
+        use_velocity: whether to use the autopilot's velocity for dead reckoning between fixes.
+        site: the map; None checks the first fixes against neither the start nor a receiver.
+        check_gnss: whether to check the first fixes against the autopilot's GNSS receiver, if it has a fix.
+        gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None for a fixed camera.
         system_id: MAVLink system id of the vehicle; messages of other systems are ignored.
-        component_id: component of the vehicle that the bridge is.
+        component_id: component id of the bridge on the vehicle.
         key: 32-byte key of MAVLink signing; None sends and accepts unsigned packets.
         watch: called with every answer; must return quickly.
         on_sent: called with every fix that was sent; must return quickly.
 
     Raises:
-        OSError: the link cannot be opened. After that, a link that fails is reopened.
+        OSError: the link cannot be opened. Later, a link that fails is reopened.
     """
 
     def __init__(
@@ -121,18 +121,18 @@ class MavlinkBridge:
         self._encoder = PacketEncoder(system_id, key, component_id)
         self._sending = threading.Lock()
         self._navigator: Navigator | None = None
-        self._resets_before = 0  # by navigators that have been replaced
+        self._resets_before = 0  # of navigators that have been replaced
         self._velocity = VelocityFromFixes()
         self._counters = MavlinkCounters()
         self._confirmed = False  # by an operator, for the next fix
         self._peer: PeerAddress = None
-        self._connected_ns = 0  # when the vehicle was heard first, or again
+        self._connected_ns = 0  # when the vehicle was first heard, or heard again
         self._last_done_ns = {"heartbeat": 0, "timesync": 0, "log": 0}
         self._closed = threading.Event()
         self._link: Link | None = connection.open()
         self._decoder = self._new_decoder(self._link)
         self._live = Live(self._new_navigator, self.deliver, start, live)
-        # A reader that holds Python's lock while it waits for a core would keep the worker waiting.
+        # If the reader held Python's lock while waiting for a core, the worker would have to wait too.
         self._reader = start_thread(self._read, "scenematch-mavlink", None if live is None else live.realtime)
 
     def __enter__(self) -> MavlinkBridge:
@@ -160,7 +160,7 @@ class MavlinkBridge:
         return self._counters.status(connected=self.connected, dropped=self._decoder.dropped)
 
     def submit(self, image: NDArray[np.uint8], captured_ns: int) -> None:
-        """Submit the newest image; one that still waits is dropped.
+        """Submit the newest image; an image still waiting is dropped.
 
         Args:
             image: (H, W, 3) RGB or (H, W) grey, uint8.
@@ -195,7 +195,7 @@ class MavlinkBridge:
             self._keep_ready_to_arm()
 
     def _keep_ready_to_arm(self) -> None:
-        """Send what ArduPilot asks for before it arms: word of its camera, or a fix of every receiver."""
+        """Send what ArduPilot requires before arming: a live camera, or a fix from every receiver."""
         now_ns, gnss, gps_id = time.monotonic_ns(), self.telemetry.gnss, self._options.gps_id
         if self._options.needs_origin:
             self._send(no_position_message(now_ns))
@@ -207,7 +207,7 @@ class MavlinkBridge:
             )
 
     def _is_trusted(self, answer: Answer, now_s: float) -> bool:
-        """Whether a fix continues the track that the autopilot was sent, or its GNSS before there is one."""
+        """Whether a fix continues the track sent to the autopilot or, before the first fix, its GNSS."""
         stamp_ns, gnss = answer.frame.timestamp_ns, self.telemetry.gnss
         assert stamp_ns is not None  # set by submit
         if self._confirmed:
@@ -228,7 +228,7 @@ class MavlinkBridge:
         return trusted
 
     def _send_fix(self, fix: Fix, captured_ns: int, *, trusted: bool) -> str | None:
-        """Send a fix; returns the cause where it is withheld."""
+        """Send a fix; returns the cause if it is withheld."""
         report = self._compose(fix, captured_ns)
         cause = withhold_reason(report, self._options) if self.connected else "no autopilot"
         if cause is None and self.telemetry.firmware != MAV_AUTOPILOTS[self._options.firmware]:
@@ -249,7 +249,7 @@ class MavlinkBridge:
         return None
 
     def _awaits_receiver(self) -> bool:
-        """Whether the first fix waits for what the autopilot says of its receiver, which is asked for."""
+        """Whether the first fix must wait for the autopilot's report on its receiver, which is requested."""
         checked = self._site is not None and self._check_gnss and not self._guard.has_fix
         recent = time.monotonic_ns() - self._connected_ns < _GNSS_STALE_NS
         return checked and recent and self.telemetry.has_receiver is None
@@ -259,7 +259,7 @@ class MavlinkBridge:
             self._send(notice_message(severity, text))
 
     def _new_navigator(self, start: Prior | None) -> Navigator:
-        """Create a navigator; replacing one counts as a reset, since the new one acquires the position afresh."""
+        """Create a navigator; replacing one counts as a reset because the new one acquires the position again."""
         navigator = self._make_navigator(start)
         if self._navigator is not None:
             self._resets_before += _resets(self._navigator) + 1
@@ -270,7 +270,7 @@ class MavlinkBridge:
         resets = self._resets_before + (0 if self._navigator is None else _resets(self._navigator))
         origin, vehicle = self.telemetry.origin, self.telemetry.vehicle(captured_ns)
         if origin is None and self._origin is not None and vehicle.down_m is not None:
-            # Before it has a position an autopilot reports a height above sea level of 0.
+            # An autopilot without a position reports a height above sea level of 0.
             vehicle = replace(vehicle, alt_amsl_m=self._origin.alt_amsl_m - vehicle.down_m)
         return FixReport(
             fix,
@@ -297,13 +297,13 @@ class MavlinkBridge:
                 _log.warning("MAVLink: %s; reopening the link in %g s", error, _REOPEN_S)
                 self._drop_link()
                 self._closed.wait(_REOPEN_S)
-            except Exception:  # caused by one packet: the next may be valid, and the link needs its reader
+            except Exception:  # one packet caused it: the next may be valid, and the link needs its reader
                 if self._is_due("log", time.monotonic_ns(), _REOPEN_S):
                     _log.exception("MAVLink: a packet could not be read or sent")
                 self._closed.wait(_POLL_S)
 
     def _receive(self, data: bytes, sender: PeerAddress) -> None:
-        """Handle bytes of one sender; while a vehicle is connected, only bytes from its address."""
+        """Handle bytes from one sender; while a vehicle is connected, only from its address."""
         if self._peer is not None and sender != self._peer and self.connected:
             return
         now_ns = time.monotonic_ns()
@@ -322,7 +322,7 @@ class MavlinkBridge:
             self.telemetry.update(message, now_ns)
 
     def _obey(self, message: Any) -> None:
-        """An operator's command to this component: to trust the fixes that contradict the track."""
+        """Handle an operator's command to trust the fixes that contradict the track."""
         if (message.target_system, message.target_component) != (self._system_id, self._component_id):
             return
         accepted = message.command == CONFIRM_COMMAND
@@ -332,7 +332,7 @@ class MavlinkBridge:
         self._send(acknowledgement_message(message.command, accepted=accepted))
 
     def _on_connected(self, now_ns: int) -> None:
-        """Start over with a vehicle that is heard for the first time, or again."""
+        """Start over with a vehicle that is heard for the first time or again."""
         self._counters.reconnections += self._connected_ns != 0
         self._connected_ns = now_ns
         self._last_done_ns["timesync"] = 0
@@ -340,7 +340,7 @@ class MavlinkBridge:
         self.telemetry.reset()
 
     def _keep_alive(self) -> None:
-        """Send what is periodic: heartbeats always, requests while the vehicle is connected."""
+        """Send periodic messages: heartbeats always, requests while the vehicle is connected."""
         now_ns = time.monotonic_ns()
         if self._is_due("heartbeat", now_ns, 1.0):
             self._send(heartbeat_message())
@@ -360,7 +360,7 @@ class MavlinkBridge:
         return due
 
     def _send(self, message: Any) -> bool:
-        """Send one message; returns whether the link took it."""
+        """Send one message; returns whether the link accepted it."""
         with self._sending:
             link = self._link
             if link is None:

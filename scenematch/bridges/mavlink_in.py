@@ -1,6 +1,7 @@
-"""The autopilot's telemetry: MAVLink messages in, the vehicle state at the time of a capture out.
+"""The autopilot's telemetry: turn MAVLink messages into the vehicle state at the time of a capture.
 
-Radians, NED, centidegrees and millimetres are converted here. Times are on ``time.monotonic_ns``, as captures are.
+Radians, NED, centidegrees and millimetres are converted here. Times are on ``time.monotonic_ns``, like those of
+captures.
 """
 
 from __future__ import annotations
@@ -40,9 +41,9 @@ GIMBAL_RATES_HZ = {
         mavlink.MAVLINK_MSG_ID_MOUNT_ORIENTATION: 50,
     },
 }
-"""The same of those that only a camera on a gimbal needs."""
+"""The same for messages needed only with a gimbal."""
 REQUESTED_RATES_HZ = {
-    # Each firmware lacks what the other has, and complains to the pilot about every such request.
+    # Each firmware lacks some of the other's messages, and complains to the pilot if asked for them.
     "ardupilot": _COMMON_RATES_HZ
     | {mavlink.MAVLINK_MSG_ID_RANGEFINDER: 10, mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 5},
     "px4": _COMMON_RATES_HZ | {mavlink.MAVLINK_MSG_ID_ALTITUDE: 10, mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 5},
@@ -63,19 +64,19 @@ HANDLED_MESSAGES = frozenset(
 
 _CLOCK_SAMPLES = 64
 _CLOCK_JUMP_NS = 1_000_000_000  # beyond which the autopilot must have rebooted
-_CLOCK_SLIP_NS = 10_000_000  # beyond what two round trips explain: its clock was set, since crystals drift less
-_MAX_STALE_STAMPS = 20  # consecutive stamps that far back, after which it must have rebooted too
+_CLOCK_SLIP_NS = 10_000_000  # more than two round trips explain: the clock was set, since crystals drift less
+_MAX_STALE_STAMPS = 20  # consecutive stamps that far back also mean a reboot
 _UNKNOWN_BELOW_M = -1000.0  # values of ALTITUDE below this are unknown by MAVLink's definition
 _UNIX_RANGE_US = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100: outside it the date is unknown
 _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
 # ESTIMATOR_STATUS of PX4 has the same bits as EKF_STATUS_REPORT of ArduPilot.
 _VELOCITY_KNOWN, _CONSTANT_POSITION = mavlink.EKF_VELOCITY_HORIZ, mavlink.EKF_CONST_POS_MODE
-_MIN_GNSS_SIGMA_M, _DEFAULT_GNSS_SIGMA_M = 0.5, 5.0  # the latter where the receiver states no accuracy
+_MIN_GNSS_SIGMA_M, _DEFAULT_GNSS_SIGMA_M = 0.5, 5.0  # the latter if the receiver states no accuracy
 
 
 @dataclass(frozen=True, slots=True)
 class GnssFix:
-    """A position by the autopilot's own receiver, in WGS84 degrees, with one standard deviation per axis."""
+    """A position from the autopilot's own receiver, in WGS84 degrees, with one standard deviation per axis."""
 
     lat_deg: float
     lon_deg: float
@@ -86,9 +87,10 @@ class GnssFix:
 class AutopilotClock:
     """Maps the autopilot's time since boot to the local monotonic clock.
 
-    The offset is that of the TIMESYNC exchange with the shortest round trip; without TIMESYNC it is bounded by the
-    message with the shortest delay, since none arrives before it was sent. An exchange that contradicts it by less
-    than a reboot does takes its place: the clock was set, and stamps by the old offset would be as wrong.
+    The offset is from the TIMESYNC exchange with the shortest round trip. Without TIMESYNC, the message with the
+        shortest delay bounds it, since none arrives before it was sent. If a new exchange contradicts the offset
+            by less than a reboot would, it replaces it: the clock was set, and the old offset is wrong by that
+                much.
     """
 
     def __init__(self) -> None:
@@ -116,7 +118,7 @@ class AutopilotClock:
             now_ns: local time of arrival.
 
         Returns:
-            False where the offset jumped against earlier responses: the autopilot has rebooted.
+            False if the offset jumped from earlier responses: the autopilot has rebooted.
         """
         if stamp_ns not in self._requests:
             return True
@@ -133,7 +135,7 @@ class AutopilotClock:
         return True
 
     def local_ns(self, remote_ns: int, arrival_ns: int) -> int | None:
-        """Local time of a remote stamp, never after its arrival; None where it is a second old or more."""
+        """Local time of a remote stamp, never after its arrival; None if it is a second old or more."""
         self._by_arrival.append(remote_ns - arrival_ns)
         offset_ns = self.offset_ns
         assert offset_ns is not None  # one was just added
@@ -142,18 +144,18 @@ class AutopilotClock:
 
 
 class MavlinkTelemetry:
-    """Recent telemetry of one autopilot. May be read from another thread than the one that updates it.
+    """Recent telemetry of one autopilot. May be read and updated from different threads.
 
     Args:
-        gimbal_mount: (3, 3) mount of a camera on a gimbal; None is one that is fixed to the vehicle.
-        bridge_component: component of the vehicle that the bridge itself is.
+        gimbal_mount: (3, 3) mount of a camera on a gimbal; None for one fixed to the vehicle.
+        bridge_component: component id of the bridge itself.
 
     Attributes:
-        origin: NED origin of the autopilot; None where it has reported none.
+        origin: NED origin of the autopilot; None if it has reported none.
         firmware: MAV_AUTOPILOT of its last heartbeat; None before the first.
         armed: whether its motors are armed.
-        has_receiver: whether a GNSS receiver is connected to it; None where it has not said.
-        uptime_ms: how long it has run; None where it has not said.
+        has_receiver: whether a GNSS receiver is connected to it; None if not reported.
+        uptime_ms: how long it has run; None if not reported.
         gnss: the last three-dimensional fix of that receiver; None before the first.
         heard_ns: arrival of its last heartbeat on ``time.monotonic_ns``; None before the first.
     """
@@ -171,7 +173,7 @@ class MavlinkTelemetry:
         self._unix_offset_ns: int | None = None
         self._stale_stamps = 0
         self._has_velocity = True
-        self._home_down_m = 0.0  # of its home below its origin
+        self._home_down_m = 0.0  # how far its home is below its origin
         self.origin: NedOrigin | None = None
         self.has_receiver: bool | None = None
         self.uptime_ms: int | None = None
@@ -196,7 +198,7 @@ class MavlinkTelemetry:
             self._clock.add_request(now_ns)
 
     def unix_ns(self, time_ns: int) -> int:
-        """Nanoseconds since 1970 of a local time, by the autopilot's UTC or, where it has none, this machine's."""
+        """Nanoseconds since 1970 of a local time, by the autopilot's UTC or, if it has none, this machine's."""
         offset_ns = self._unix_offset_ns
         return time_ns + (time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns)
 
@@ -205,16 +207,16 @@ class MavlinkTelemetry:
 
         Args:
             time_ns: on ``time.monotonic_ns``.
-            own_velocity: whether the autopilot's velocity counts where no other camera's odometry states one.
+            own_velocity: whether to use the autopilot's velocity if no other camera's odometry states one.
         """
         with self._lock:
             attitude = self._attitude.at(time_ns)
             told = self._velocity.at(time_ns) if self._has_velocity and own_velocity else None
             velocity = told or (None, None, None)
             roll, pitch, heading = attitude or (None, None, None)
-            # By another camera's odometry, where there is one: it does not depend on the fixes.
+            # From another camera's odometry, if there is one: it does not depend on the fixes.
             east, north, up, _ = self._vision.at(time_ns) or (*velocity, 0.0)
-            *_, sigma = self._vision.nearest(time_ns) or (0.0,)  # 0 is not stated: nothing to interpolate
+            *_, sigma = self._vision.nearest(time_ns) or (0.0,)  # 0 means not stated: nothing to interpolate
             return VehicleState(
                 roll_deg=roll,
                 pitch_deg=pitch,
@@ -236,7 +238,7 @@ class MavlinkTelemetry:
     def _down_m(self, time_ns: int) -> float | None:
         """Distance below the origin; without a position ArduPilot states only the height above home.
 
-        A fix is what it waits for then, so that one without a height would never be sent.
+        ArduPilot is then waiting for a fix; requiring a position would mean that none is ever sent.
         """
         down_m, relative_m = scalar(self._down.at(time_ns)), scalar(self._relative.at(time_ns))
         if down_m is not None or relative_m is None:
@@ -263,14 +265,14 @@ class MavlinkTelemetry:
             self._set_origin(message)
         elif kind == "RANGEFINDER":  # has no stamp
             self._add_range(arrival_ns, message.distance)
-        elif kind in ("VISION_SPEED_ESTIMATE", "ODOMETRY"):  # stamped by a clock that nobody else has
+        elif kind in ("VISION_SPEED_ESTIMATE", "ODOMETRY"):  # stamped by a clock that no other message uses
             if has_failed(message, self._bridge_component):
                 self._vision.clear()
             seen = vision_velocity(message, self._attitude.at(arrival_ns), self._bridge_component)
             if seen is not None:
                 self._vision.add(arrival_ns, *seen)
         elif kind in ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"):
-            # Where it knows no velocity it goes on to report one, of zero.
+            # If it knows no velocity, it still reports one, of zero.
             self._has_velocity = bool(message.flags & _VELOCITY_KNOWN) and not message.flags & _CONSTANT_POSITION
         elif kind == "GPS_RAW_INT":
             self._set_gnss(message, arrival_ns)
@@ -349,7 +351,7 @@ class MavlinkTelemetry:
             self._range.add(time_ns, range_m)
 
     def _set_gnss(self, message: Any, arrival_ns: int) -> None:
-        """Store the receiver's position; its stamp has no clock in common with the others."""
+        """Store the receiver's position; its stamp shares no clock with the others."""
         self.has_receiver = message.fix_type != mavlink.GPS_FIX_TYPE_NO_GPS
         if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
             stated_m = message.h_acc * 1e-3

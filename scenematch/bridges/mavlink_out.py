@@ -1,6 +1,6 @@
-"""Messages to the autopilot: a fix in, the fields of a MAVLink message out, as each firmware interprets them.
+"""Messages to the autopilot: turn a fix into the fields of a MAVLink message, as each firmware interprets them.
 
-Converts to radians, NED and 1e-7 degrees. Stamps are of capture.
+Converts to radians, NED and 1e-7 degrees. Stamps are capture times.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ SENSOR_ID = 1
 """Sensor id in GLOBAL_POSITION_SENSOR; PX4 fuses the one that EKF2_AGP0_ID names, and 0 means none."""
 
 _GPS_EPOCH_S, _LEAP_S, _WEEK_MS = 315964800, 18, 604_800_000
-# There is no sky in a fix, and no value for unknown. What arming checks and estimators read stands for the
-# accuracy: a metre of sigma is a dilution of 1 and 10 satellites.
+# A fix has no satellites, and the message no value for unknown. The fields that arming checks and estimators read
+# express the accuracy: a metre of sigma becomes a dilution of 1 and 10 satellites.
 _DILUTION_PER_M, _MIN_DILUTION = 1.0, 0.5
 _MAX_GPS_ID = 3
 _NO_VELOCITY = mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
@@ -44,10 +44,10 @@ class MavlinkOptions:
 
     Attributes:
         firmware: ardupilot or px4.
-        message: one of :data:`MESSAGES` of the firmware; empty for its default.
+        message: one of the firmware's :data:`MESSAGES`; empty for its default.
         max_sigma_m: upper bound of a fix's sigma; ArduPilot would clamp a larger one and trust the fix too much.
-        max_age_ms: upper bound of the time since capture; ArduPilot's estimator buffers no more.
-        gps_id: receiver that GPS_INPUT poses as; 0 is the autopilot's first, 1 its second.
+        max_age_ms: upper bound of the time since capture; ArduPilot's estimator buffers no longer.
+        gps_id: number of the receiver that GPS_INPUT emulates; 0 is the autopilot's first, 1 its second.
 
     Raises:
         OptionError: a name is unknown, or a number is out of range.
@@ -74,7 +74,7 @@ class MavlinkOptions:
             raise OptionError(f"gps_id: expected with gps_input only, got {self.kind}")
         if self.max_sigma_m > 100.0:
             raise OptionError(
-                f"max_sigma_m: expected at most 100, where ArduPilot clamps, got {self.max_sigma_m:g}"
+                f"max_sigma_m: expected at most 100 (ArduPilot clamps there), got {self.max_sigma_m:g}"
             )
 
     @property
@@ -90,16 +90,16 @@ class MavlinkOptions:
 
 @dataclass(frozen=True, slots=True)
 class FixReport:
-    """A fix with everything else that a message carries.
+    """A fix and everything else that a message carries.
 
     Attributes:
         fix: the position fix.
         captured_ns: capture time of its frame on ``time.monotonic_ns``.
         age_ms: time since capture.
         vehicle: vehicle state at capture.
-        origin: origin of the autopilot's NED frame; None where it has none.
-        velocity: velocity from the last fixes; None where they do not give one.
-        reset_counter: steps by one where the position was acquired afresh, modulo 256.
+        origin: origin of the autopilot's NED frame; None if it has none.
+        velocity: velocity from the last fixes; None if they give none.
+        reset_counter: incremented when the position was acquired again, modulo 256.
         unix_ns: capture time in nanoseconds since 1970.
     """
 
@@ -114,7 +114,7 @@ class FixReport:
 
 
 def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
-    """Reason for which a fix is not sent, or None where it is sent."""
+    """Why a fix is not sent, or None if it is sent."""
     vehicle, fix = report.vehicle, report.fix
     numbers = (fix.lat_deg, fix.lon_deg, *fix.covariance_m2.ravel(), *(fix.attitude_sigma_deg or ()))
     if not all(map(math.isfinite, numbers)):
@@ -130,7 +130,7 @@ def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
             return "no height"
         if None in (vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg):
             return "no attitude"
-    # ArduPilot uses these velocities unconditionally: with none known, it would use zero.
+    # ArduPilot uses these velocities unconditionally: an unknown one would count as zero.
     reads_velocity = options.firmware == "ardupilot" and options.kind != "vision_position_estimate"
     return "no velocity" if reads_velocity and report.velocity is None else None
 
@@ -145,7 +145,7 @@ def fix_message(report: FixReport, options: MavlinkOptions) -> Any:
 
 
 def heartbeat_message() -> Any:
-    """Heartbeat of an onboard computer that is no autopilot."""
+    """Heartbeat of an onboard computer that is not an autopilot."""
     kind, no_autopilot = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
     return mavlink.MAVLink_heartbeat_message(kind, no_autopilot, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
 
@@ -180,18 +180,18 @@ def acknowledgement_message(command: int, *, accepted: bool) -> Any:
 
 
 def stamp_on_ground_ns(now_ns: int) -> int:
-    """Stamp of what is sent before take-off, older than any fix.
+    """Stamp of messages sent before take-off, older than any fix.
 
-    ArduPilot takes the quickest message for undelayed, which must be a fix.
+    ArduPilot assumes that the quickest message has no delay; that message must be a fix.
     """
     return max(now_ns - round(MAX_DELAY_MS * 1e6), 0)
 
 
 def no_position_message(now_ns: int) -> Any:
-    """ODOMETRY that says: the camera works, and knows no position.
+    """ODOMETRY that reports a working camera without a position.
 
-    ArduPilot does not arm unless something has come from its visual odometry within 0.3 s, and on the ground a
-    camera sees nothing. By its quality the message is not used for navigation.
+    ArduPilot arms only if visual odometry sent something in the last 0.3 s, and on the ground a camera sees
+    nothing. The message's quality keeps it out of navigation.
     """
     nan, stamp_us = math.nan, stamp_on_ground_ns(now_ns) // 1000
     return mavlink.MAVLink_odometry_message(
@@ -204,12 +204,12 @@ def no_position_message(now_ns: int) -> Any:
 def pose_covariance(fix: Fix, *, with_attitude: bool = False) -> list[float]:
     """Upper triangle, row by row, of the (6, 6) covariance of north, east, down, roll, pitch and yaw.
 
-    ArduPilot combines the three position variances into one scalar. The height comes from another sensor, and a
-    large variance of it would dominate: it gets the horizontal one.
+    ArduPilot combines the three position variances into one scalar. The height comes from another sensor and its
+    large variance would dominate, so it gets the horizontal one.
 
     Args:
         fix: with its covariance.
-        with_attitude: whether its own attitude is sent; the autopilot's, sent back, counts for little.
+        with_attitude: whether to send the fix's attitude; the autopilot's own, sent back, gets little weight.
 
     Returns:
         21 values in m^2, rad^2 and their products.
@@ -225,7 +225,7 @@ def pose_covariance(fix: Fix, *, with_attitude: bool = False) -> list[float]:
 
 
 def _measured_attitude(report: FixReport) -> Attitude | None:
-    """The attitude of the fix where it solved the whole pose and the camera does not hang on a gimbal."""
+    """The attitude of the fix, if it solved the whole pose and the camera is not on a gimbal."""
     is_whole = report.fix.attitude_covariance_deg2 is not None and report.vehicle.holder is None
     return report.fix.attitude if is_whole else None
 
@@ -241,7 +241,7 @@ def _angles(report: FixReport) -> tuple[float, float, float]:
 
 
 def _ned(report: FixReport, firmware: str) -> tuple[float, float, float]:
-    """North, east and down of the origin in metres; down is the vehicle's, since a map's datum differs."""
+    """North, east and down from the origin in metres; down is the vehicle's, since a map's datum differs."""
     assert report.origin is not None  # checked by withhold_reason
     assert report.vehicle.down_m is not None
     return (*north_east_m(report.fix.lat_deg, report.fix.lon_deg, report.origin, firmware), report.vehicle.down_m)
@@ -278,12 +278,12 @@ def _odometry(report: FixReport, firmware: str) -> Any:
         covariance,
         report.reset_counter,
         mavlink.MAV_ESTIMATOR_TYPE_VISION,
-        0,  # quality unknown: the covariance expresses it
+        0,  # quality unknown: the covariance states it
     )
 
 
 def _body_velocity(velocity: GroundVelocity, vehicle: VehicleState) -> list[float]:
-    """Velocity in m/s along the body's axes, by the autopilot's own attitude, with which it is turned back."""
+    """Velocity in m/s along the body's axes, by the autopilot's own attitude, which it uses to rotate it back."""
     assert vehicle.roll_deg is not None  # checked by withhold_reason
     assert vehicle.pitch_deg is not None
     assert vehicle.heading_deg is not None
@@ -313,13 +313,13 @@ def _gps_input(report: FixReport, gps_id: int) -> Any:
 def repeated_receiver_message(gnss: GnssFix, vehicle: VehicleState, gps_id: int, times_ns: tuple[int, int]) -> Any:
     """GPS_INPUT that repeats the position of the autopilot's own receiver, for a vehicle that stands still.
 
-    ArduPilot does not arm unless each receiver has a fix, and on the ground a camera sees nothing.
+    ArduPilot arms only if each receiver has a fix, and on the ground a camera sees nothing.
 
     Args:
         gnss: the receiver's position.
         vehicle: its height.
-        gps_id: receiver that the message poses as.
-        times_ns: its stamps, on the monotonic clock and since 1970: older than any fix.
+        gps_id: number of the receiver that the message emulates.
+        times_ns: its timestamps on the monotonic clock and since 1970, older than any fix.
     """
     return _receiver(gps_id, times_ns, gnss, vehicle, None)
 
@@ -363,7 +363,7 @@ def _global_position_sensor(report: FixReport) -> Any:
         0,
         0,
         SENSOR_ID,
-        # By MAVLink's definition this stamp is of sending; the time since capture is a field of its own.
+        # MAVLink defines this stamp as the time of sending; the time since capture is a separate field.
         report.captured_ns // 1000 + age_us,
         age_us,
         mavlink.GLOBAL_POSITION_SRC_VISION,

@@ -1,4 +1,4 @@
-"""What the bridge asks an autopilot for: its telemetry and its origin, and to take one where it has none."""
+"""Requests to an autopilot: for its telemetry and its origin, and to accept an origin if it has none."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from scenematch.bridges.vehicle import NedOrigin
 
 _ORIGIN_TIMEOUT_NS = 3_000_000_000  # after which an origin is set on an autopilot that reports none
 _ORIGIN_TIMEOUT_GNSS_NS = 60_000_000_000  # the same while its GNSS receiver may still get a first fix
-_RECEIVER_FOUND_MS = 20_000  # after its start, by when an autopilot has found its receiver: ArduPilot takes 9 s
+_RECEIVER_FOUND_MS = 20_000  # after boot, by when an autopilot has found its receiver: ArduPilot takes 9 s
 _PERIOD_NS, _PERIOD_WITH_ORIGIN_NS = 1_000_000_000, 10_000_000_000
 
 
 class AutopilotRequests:
-    """The requests to one autopilot, and when they are due.
+    """Schedules the requests to one autopilot.
 
     Args:
         system_id: MAVLink system id of the vehicle.
-        options: which message is sent to which firmware.
+        options: which message to send to which firmware.
         origin: NED origin to set on an autopilot that reports none; None sets none.
-        with_gimbal: whether the attitude of its gimbal is asked for, too.
+        with_gimbal: whether to request its gimbal's attitude too.
     """
 
     def __init__(
@@ -37,11 +37,11 @@ class AutopilotRequests:
         self._last_ns = 0
 
     def restart(self, now_ns: int) -> None:
-        """Ask at once: the vehicle is heard for the first time, or again."""
+        """Ask at once: the vehicle is heard for the first time or again."""
         self._without_origin_ns, self._last_ns = now_ns, 0
 
     def due(self, telemetry: MavlinkTelemetry, now_ns: int) -> list[Any]:
-        """The messages to send now; to be called often while the vehicle is connected."""
+        """The messages to send now; call it often while the vehicle is connected."""
         if telemetry.origin is not None:
             self._without_origin_ns = now_ns
         if now_ns - self._last_ns < (_PERIOD_WITH_ORIGIN_NS if telemetry.origin else _PERIOD_NS):
@@ -55,7 +55,7 @@ class AutopilotRequests:
         return [*intervals, command_message(self._system_id, *asked), *self._origin_to_set(telemetry, now_ns)]
 
     def _origin_to_set(self, telemetry: MavlinkTelemetry, now_ns: int) -> list[Any]:
-        """An autopilot with a receiver sets its origin itself, in a better place, when that has a fix."""
+        """An autopilot with a receiver sets a better origin itself once the receiver has a fix."""
         if self._origin is None or self._options.kind == "gps_input":
             return []
         receiver, uptime_ms = telemetry.has_receiver, telemetry.uptime_ms

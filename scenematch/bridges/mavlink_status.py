@@ -1,4 +1,4 @@
-"""What a MAVLink bridge has done: its counters, and the line that reports them."""
+"""Status of a MAVLink bridge: its counters, and the line that reports them."""
 
 from __future__ import annotations
 
@@ -42,13 +42,15 @@ class MavlinkStatus:
         """The same in one line."""
         reasons = ", ".join(f"{why} {n}" for why, n in {**self.withheld, **self.refused}.items()) or "nothing"
         heard = "autopilot heard" if self.connected else "no autopilot"
-        slow = f" (below {MIN_RATE_HZ:g} Hz an estimator may let go)" if self.rate_hz < MIN_RATE_HZ else ""
+        slow = (
+            f" (below {MIN_RATE_HZ:g} Hz an estimator may stop using them)" if self.rate_hz < MIN_RATE_HZ else ""
+        )
         age = "" if self.least_age_ms is None else f", least age {self.least_age_ms:.0f} ms"
         return f"{heard}; sent {self.sent}, {self.rate_hz:.1f} Hz{slow}{age}; not sent: {reasons}"
 
 
 class MavlinkCounters:
-    """The counters while they count."""
+    """The running counters."""
 
     def __init__(self) -> None:
         self._sent_ns: deque[int] = deque(maxlen=256)
@@ -76,7 +78,7 @@ class MavlinkCounters:
         self._refused[reason] += 1
 
     def status(self, *, connected: bool, dropped: int) -> MavlinkStatus:
-        """The counters so far, with packets that the present link dropped."""
+        """The counters so far, including packets that the present link dropped."""
         since_ns = time.monotonic_ns() - round(_RATE_SPAN_S * 1e9)
         rate_hz = sum(sent >= since_ns for sent in list(self._sent_ns)) / _RATE_SPAN_S
         return MavlinkStatus(

@@ -1,4 +1,4 @@
-"""What the pilot is told on the ground station: fixes begin, stop or are refused in a row, the map is in doubt."""
+"""Notices to the pilot's ground station: fixes begin, stop or are refused in a row, the map is in doubt."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Notice = tuple[int, str]
 
 
 class PilotNotices:
-    """Turns what becomes of the frames into notices, a new one where something changes."""
+    """Turns the outcomes of frames into notices, a new one for each change."""
 
     def __init__(self) -> None:
         self._sending = False
@@ -32,7 +32,7 @@ class PilotNotices:
         return [_notice(INFO, "fixes begin")] if began else []
 
     def not_sent(self, cause: str) -> None:
-        """A frame gave no fix, or one that was withheld."""
+        """A frame gave no fix, or its fix was withheld."""
         self._cause = cause.replace("_", " ")
         self._refused_in_a_row += 1
 
@@ -41,7 +41,7 @@ class PilotNotices:
         return self._repeated("doubted", CRITICAL, f"map doubted, {distance_m:.0f} m off; confirm or land", now_s)
 
     def due(self, now_s: float) -> list[Notice]:
-        """What is to be said after a time without a fix; called often."""
+        """Notices about a time without a fix; call it often."""
         last_s = self._last_sent_s
         if last_s is None or now_s - last_s < _STOPPED_S:
             return []

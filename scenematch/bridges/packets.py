@@ -1,4 +1,4 @@
-"""MAVLink packets from untrusted bytes; malformed, wrongly signed and unrelated ones are dropped."""
+"""Parse MAVLink packets from untrusted bytes; drop malformed, wrongly signed and unrelated ones."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from engine.errors import OptionError
 V1, V2 = 0xFE, 0xFD
 AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 BRIDGE_COMPONENT = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
-"""Component of the vehicle that the bridge is where it is given no other."""
+"""Default component id of the bridge."""
 
 # A companion computer is another component; `vision_in` leaves out the autopilot's and the bridge's own.
 _FROM_ANY_COMPONENT = (mavlink.MAVLINK_MSG_ID_ODOMETRY, mavlink.MAVLINK_MSG_ID_VISION_SPEED_ESTIMATE)
 _SIGNED, _SIGNATURE_BYTES = 0x01, 13
 _MAX_BUFFER_BYTES = 65536  # of a stream that never completes a packet
-_MAX_FAILED = 64  # false start bytes in a datagram after which the rest is discarded: a flood must stay cheap
+_MAX_FAILED = 64  # false start bytes in a datagram, after which the rest is discarded to keep a flood cheap
 _SIGNING_EPOCH_S = 1420070400  # 1 January 2015, the epoch of signature time stamps
 _MAX_STREAM_AGE = 60 * 100_000  # of a new signed stream's first stamp, in units of 10 us
 
@@ -51,12 +51,12 @@ def signing_time() -> int:
 
 
 class PacketEncoder:
-    """Encodes messages as packets, signed where there is a key.
+    """Encodes messages as packets, signed if there is a key.
 
     Args:
-        system_id: MAVLink system id of the vehicle, of which the bridge is a component.
+        system_id: MAVLink system id of the vehicle to which the bridge belongs.
         key: 32-byte signing key, or None.
-        component_id: that component.
+        component_id: component id of the bridge.
     """
 
     def __init__(self, system_id: int, key: bytes | None = None, component_id: int = BRIDGE_COMPONENT) -> None:
@@ -78,10 +78,10 @@ class PacketDecoder:
     """Extracts the messages of one autopilot, and the velocities of its companion computers, from bytes.
 
     Args:
-        system_id: MAVLink system id whose messages are kept.
-        message_ids: ids of the messages that are kept.
+        system_id: MAVLink system id of the messages to keep.
+        message_ids: ids of the messages to keep.
         is_stream: whether a packet may continue in the next bytes.
-        key: 32-byte signing key; where given, packets that are not signed with it are dropped.
+        key: 32-byte signing key; if given, other packets are dropped.
 
     Attributes:
         dropped: number of malformed or wrongly signed packets so far.
@@ -98,7 +98,7 @@ class PacketDecoder:
         self.dropped = 0
 
     def feed(self, data: bytes) -> list[Any]:
-        """Add bytes; returns the messages that they complete."""
+        """Add bytes; returns the messages they complete."""
         self._buffer += data
         messages: list[Any] = []
         at = failed = 0
@@ -135,7 +135,7 @@ class PacketDecoder:
         return min(found, default=len(self._buffer))
 
     def _size(self, at: int) -> int | None:
-        """Length in bytes of the packet that begins here; None where its header is incomplete."""
+        """Length in bytes of the packet that begins here; None if its header is incomplete."""
         if at + 3 > len(self._buffer):
             return None
         payload = self._buffer[at + 1]
@@ -154,20 +154,20 @@ class PacketDecoder:
         return number in self._message_ids and (from_vehicle or number == mavlink.MAVLINK_MSG_ID_COMMAND_LONG)
 
     def _decode(self, packet: bytes) -> Any:
-        """The message, or None where the packet is invalid or its type unknown."""
+        """The message, or None if the packet is invalid or its type unknown."""
         if packet[0] == V2 and packet[2] & ~_SIGNED:
             return None  # incompatibility flags that this decoder does not support
         try:
             message = self._mavlink.decode(bytearray(packet))
-        except Exception:  # untrusted bytes: whatever the decoder raises, they are no message
+        except Exception:  # untrusted bytes: whatever the decoder raises, they are not a message
             return None
         return None if isinstance(message, mavlink.MAVLink_unknown) else message
 
     def _is_signed(self, packet: bytes, key: bytes) -> bool:
         """Whether the signature is valid and newer than the last one of its stream.
 
-        pymavlink stores a packet's time stamp before it checks the signature, so that a forged packet could block
-        the stream; here the signature is checked first.
+        pymavlink stores a packet's time stamp before it checks the signature, so a forged packet could block the
+        stream. This function checks the signature first.
         """
         if packet[0] != V2 or not packet[2] & _SIGNED:
             return False

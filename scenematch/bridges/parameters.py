@@ -16,18 +16,18 @@ Parameter = tuple[str, float, str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterOptions:
-    """For whom a parameter file is.
+    """What a parameter file is for.
 
     Attributes:
         firmware: ardupilot or px4.
         message: the message that the bridge sends.
-        takeoff: "none" without GNSS, or "gnss": ArduPilot begins with its receiver and is switched over in flight.
-        gps_id: receiver that GPS_INPUT poses as.
+        takeoff: "none" without GNSS, or "gnss": ArduPilot takes off with its receiver and switches over in flight.
+        gps_id: number of the receiver that GPS_INPUT emulates.
         delay_ms: time from capture to arrival at the autopilot.
         max_sigma_m: upper bound of the sigma of the fixes that are sent.
 
     Raises:
-        OptionError: the delay is out of range, or the take-off is none that the message allows.
+        OptionError: the delay is out of range, or the message does not allow the take-off.
     """
 
     firmware: str

@@ -24,16 +24,16 @@ CapturedImage = tuple[NDArray[np.uint8], int]
 
 
 def first_picture(camera_source: str) -> NDArray[np.uint8]:
-    """The first picture of a camera, which is closed again.
+    """Open a camera, take its first picture and close it.
 
     Args:
-        camera_source: as of :func:`scenematch.bridges.camera_stream.capture`.
+        camera_source: see :func:`scenematch.bridges.camera_stream.capture`.
 
     Returns:
         (H, W, 3) RGB uint8.
 
     Raises:
-        TelemetryError: the camera does not open, or gives no picture for a while.
+        TelemetryError: the camera does not open, or delivers no picture for a while.
     """
     until = time.monotonic() + _FIRST_PICTURE_S
     with closing(capture(camera_source)) as pictures:
@@ -52,18 +52,18 @@ def replay(
 ) -> Generator[CapturedImage, None, None]:
     """Replay a folder of images or a video in real time.
 
-    The flight is opened by this call: a video's times take seconds to read, and the autopilot flies meanwhile.
+    This call opens the flight, because reading a video's times takes seconds in which the autopilot flies.
 
     Args:
         frames: folder of images, or video.
-        telemetry: telemetry.csv or a log, whose stamps set the pace; None uses the subtitles beside a video, the
-            EXIF of photographs, else ``rate_hz``.
-        rate_hz: images per second where there are no stamps.
-        every: one image in so many is played, at its own time.
-        wait: called when the first image has been read; the replay starts when it returns.
+        telemetry: telemetry.csv or a log that times the replay; None uses the subtitles beside a video, the EXIF
+            of photographs, else ``rate_hz``.
+        rate_hz: images per second if there are no stamps.
+        every: replay every Nth image, at its own time.
+        wait: called once the first image has been read; the replay starts when it returns.
 
     Returns:
-        Of :data:`CapturedImage`, each at its time.
+        :data:`CapturedImage`, each at its time.
 
     Raises:
         TelemetryError: an image or the telemetry cannot be read.

@@ -1,7 +1,8 @@
-"""The ROS bridge: images and telemetry go into the engine, poses, fixes and diagnostics come out.
+"""The ROS bridge: feed images and telemetry to the engine; publish poses, fixes and diagnostics.
 
-Imports no ROS: it accesses only the fields of messages, which ros1.py and ros2.py transport. A pose is never
-published without its covariance; a refusal is published in the diagnostics only. Stamps are of capture.
+It does not import ROS: it only accesses the fields of messages, which ros1.py and ros2.py transport. A pose is
+never
+published without its covariance; a refusal is published in the diagnostics only. Stamps are capture times.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ OUTPUTS = {
 }
 """Message type of each topic that is published."""
 
-_ATTITUDE_WAIT_S = 0.05  # that a picture waits for the attitude after its capture
+_ATTITUDE_WAIT_S = 0.05  # that a picture waits for the next attitude
 _MAX_SILENCE_S = 2.0  # without an image, before the diagnostics report it
 _OK, _WARN, _ERROR = 0, 1, 2
 
@@ -48,7 +49,7 @@ Handler = Callable[[Any], None]
 
 
 class RosNode(Protocol):
-    """A node of ROS 1 or ROS 2, as the bridge uses it.
+    """A node of ROS 1 or ROS 2, as seen by the bridge.
 
     Attributes:
         messages: constructs the messages of this ROS.
@@ -57,7 +58,7 @@ class RosNode(Protocol):
     messages: MessageFactory
 
     def now_ns(self) -> int:
-        """ROS time in nanoseconds, simulated where the node is so configured."""
+        """ROS time in nanoseconds, simulated if the node is configured so."""
 
     def wait_for(self, topic: str, msgtype: str, timeout_s: float) -> Any:
         """Wait for the next message of a topic; None after the timeout."""
@@ -107,7 +108,7 @@ class RosBridge:
     Args:
         node: publishes messages and gives the time.
         site: the map.
-        make_navigator: as in :class:`engine.navigation.live.Live`.
+        make_navigator: see :class:`engine.navigation.live.Live`.
         options: frame and origin of the poses.
         start: prior position at the start of the flight.
         live: deadlines of the frames.
@@ -132,13 +133,13 @@ class RosBridge:
         self._live = self._start_live()
         self._held = _Held()
         self._image_topic = ""
-        self._odometry_error = ""  # of the last one
-        self._said: set[str] = set()  # in the terminal, each once
+        self._odometry_error = ""  # from the last one
+        self._said: set[str] = set()  # printed to the terminal, each once
         self._last_ns: int | None = None
         self._last_image_s = time.monotonic()
         self._fixes = self._unusable = self._restarts = 0
         self._refused: Counter[str] = Counter()
-        self._counts_before = Counts()  # of pipelines that have been replaced
+        self._counts_before = Counts()  # of replaced pipelines
 
     def close(self) -> None:
         """Answer the frame in progress and stop."""
@@ -168,7 +169,7 @@ class RosBridge:
         return {name: handler for name, handler in handlers.items() if name}
 
     def on_imu(self, message: Any) -> None:
-        """Store an attitude; a picture that waits for it goes on."""
+        """Store an attitude, and submit the picture that waited for it."""
         self.telemetry.imu(message)
         self._held.release(lambda captured_ns: not self.telemetry.waits_for_attitude(captured_ns))
 
@@ -183,7 +184,7 @@ class RosBridge:
             self._odometry_error = ""
 
     def on_image(self, message: Any) -> None:
-        """Submit the newest picture, once the attitude of its capture is known; one without a stamp is of now."""
+        """Submit the newest picture once its attitude is known; one without a stamp counts as captured now."""
         now_ns = self._node.now_ns()
         captured_ns = stamp_ns(message) or now_ns
         self._last_image_s = time.monotonic()
@@ -207,7 +208,7 @@ class RosBridge:
         if self.telemetry.waits_for_attitude(captured_ns):
             self._held.hold(captured_ns, submit)
         else:
-            self._held.drop()  # an older picture, which this one overtook
+            self._held.drop()  # an older picture, overtaken by this one
             submit()
 
     def _submit(self, image: NDArray[np.uint8], captured_ns: int, arrived_ns: int) -> None:
@@ -217,15 +218,17 @@ class RosBridge:
             self._unusable += 1
             self._diagnose(captured_ns, _ERROR, str(error), {})
             return
-        with contextlib.suppress(StateError):  # closed meanwhile
-            self._live.submit(frame, captured_ns=min(captured_ns, arrived_ns))  # a stamp ahead counts as of now
+        with contextlib.suppress(StateError):  # closed in the meantime
+            self._live.submit(
+                frame, captured_ns=min(captured_ns, arrived_ns)
+            )  # a stamp in the future counts as now
 
     def _start_live(self) -> Live:
         make, options = self._make_navigator, self._live_options
         return Live(make, self.deliver, self._start, options, self._node.now_ns)
 
     def _restart(self) -> None:
-        """Start over, since the time went back: another run of a simulator, or a bag from its beginning."""
+        """Start over because time went back: a simulator or a bag was restarted."""
         self._held.drop()
         self._live.close()
         self._counts_before = self.status.counts
@@ -265,14 +268,17 @@ class RosBridge:
             self._watch(answer)
 
     def check_input(self) -> None:
-        """Publish an error where no images arrive; to be called once a second."""
+        """Publish an error if no images arrive; call it once a second."""
         silence_s = time.monotonic() - self._last_image_s
         if silence_s > _MAX_SILENCE_S:
-            self._say("no picture", f"no picture on {self._image_topic}: does anything publish it, of that type?")
+            self._say(
+                "no picture",
+                f"no picture on {self._image_topic}: does anything publish this topic with this type?",
+            )
             self._diagnose(self._node.now_ns(), _ERROR, f"no picture for {silence_s:.0f} s", {})
 
     def _say(self, cause: str, text: str) -> None:
-        """A line in the terminal, once for each cause; the diagnostics have it each time."""
+        """Print a line once for each cause; the diagnostics repeat it each time."""
         if cause not in self._said:
             self._said.add(cause)
             _log.warning("%s (more in /diagnostics)", text)
@@ -287,20 +293,20 @@ class RosBridge:
 
 
 def _known(frame: Frame) -> dict[str, str]:
-    """What of a frame's telemetry was there: a topic by another name is silent."""
+    """The telemetry that a frame had: a misnamed topic would go unnoticed."""
     values = {"attitude": frame.heading_deg, "height": frame.height_agl_m, "velocity": frame.east_velocity_mps}
     return {name: "unknown" if value is None else "known" for name, value in values.items()}
 
 
 class _Held:
-    """At most one picture that waits for the attitude of its capture, and for no longer than a while."""
+    """Holds at most one picture until its attitude arrives, for a limited time."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._waiting: tuple[int, Callable[[], None], threading.Timer] | None = None
 
     def hold(self, captured_ns: int, submit: Callable[[], None]) -> None:
-        """Keep a picture; one that still waited is submitted as it is."""
+        """Hold a picture; one that was still waiting is submitted as it is."""
         self.release(lambda _: True)
         timer = threading.Timer(_ATTITUDE_WAIT_S, self.release, [lambda waiting_ns: waiting_ns == captured_ns])
         timer.daemon = True
@@ -309,7 +315,7 @@ class _Held:
         timer.start()
 
     def release(self, may_go: Callable[[int], bool]) -> None:
-        """Submit the picture, where its capture's time passes."""
+        """Submit the picture if ``may_go`` accepts its capture time."""
         with self._lock:
             waiting = self._waiting
             if waiting is None or not may_go(waiting[0]):

@@ -1,4 +1,4 @@
-"""The ROS 1 node of the bridge, by rospy. On loopback, unless ROS_IP or ROS_HOSTNAME is set."""
+"""The bridge's ROS 1 node, using rospy. It stays on loopback unless ROS_IP or ROS_HOSTNAME is set."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Node:
     """A node; implements :class:`scenematch.bridges.ros.RosNode`.
 
     Args:
-        name: name of the node, the prefix of its topics.
+        name: name of the node and prefix of its topics.
         arguments: NAME:=VALUE for ROS, such as remaps, ``__name`` and ``__ns``.
 
     Raises:
@@ -47,7 +47,7 @@ class Node:
         }
 
     def now_ns(self) -> int:
-        """ROS time in nanoseconds, simulated where the node is so configured."""
+        """ROS time in nanoseconds, simulated if the node is configured so."""
         return int(self._rospy.Time.now().to_nsec())
 
     def wait_for(self, topic: str, msgtype: str, timeout_s: float) -> Any:

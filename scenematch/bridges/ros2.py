@@ -1,4 +1,4 @@
-"""The ROS 2 node of the bridge, by rclpy. Discovery stays on this machine unless the environment sets it."""
+"""The bridge's ROS 2 node, using rclpy. Discovery stays on this machine unless the environment says otherwise."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Node:
     """A node; implements :class:`scenematch.bridges.ros.RosNode`.
 
     Args:
-        name: name of the node, the prefix of its topics.
+        name: name of the node and prefix of its topics.
         arguments: for ROS, from ``--ros-args`` on: remaps, parameters, a namespace.
 
     Raises:
         BackendError: rclpy is not installed.
-        OptionError: the arguments are none of ROS.
+        OptionError: ROS does not accept the arguments.
     """
 
     def __init__(self, name: str, arguments: Sequence[str] = ()) -> None:
@@ -41,7 +41,7 @@ class Node:
         except ImportError as error:
             raise BackendError(f"bridge: expected rclpy to be importable (see docs/ros.md): {error}") from None
         try:
-            # rclpy's own handlers would end its context in another thread, while this one publishes by it.
+            # rclpy's own handlers would end its context in another thread while this one still publishes.
             rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
             self._node = rclpy.create_node(name)
         except RuntimeError as error:  # rclpy's errors are
@@ -62,10 +62,10 @@ class Node:
         }
 
     def parameter(self, name: str, default: Any) -> Any:
-        """The value of a ROS parameter of the default's type; YAML makes integers of some numbers and texts.
+        """The value of a ROS parameter in the default's type; YAML turns some numbers and texts into integers.
 
         Raises:
-            OptionError: it is of another type.
+            OptionError: it has another type.
         """
         value, kind = self._node.declare_parameter(name, default, self._any_type).value, type(default)
         if type(value) is kind:
@@ -76,7 +76,7 @@ class Node:
         raise OptionError(f"{name}: expected {expected}, got {value!r}")
 
     def now_ns(self) -> int:
-        """ROS time in nanoseconds, simulated where the node is so configured."""
+        """ROS time in nanoseconds, simulated if the node is configured so."""
         return int(self._node.get_clock().now().nanoseconds)
 
     def wait_for(self, topic: str, msgtype: str, timeout_s: float) -> Any:
@@ -88,7 +88,7 @@ class Node:
             try:
                 self._rclpy.spin_once(self._node, timeout_sec=0.2)
             except self._shutdown_error:
-                raise KeyboardInterrupt from None  # ended from outside, not timed out
+                raise KeyboardInterrupt from None  # shut down from outside, not timed out
         self._node.destroy_subscription(subscription)
         return received[0] if received else None
 
@@ -116,7 +116,7 @@ class Node:
                     every_second()
 
     def _subscribe(self, topic: str, msgtype: str, handler: Handler) -> Any:
-        """Best effort with a short queue also hears reliable publishers, and never waits for old messages."""
+        """Best effort with a short queue also receives from reliable publishers, and skips old messages."""
         try:
             return self._node.create_subscription(find_class(msgtype), topic, handler, self._qos)
         except self._name_error:

@@ -1,4 +1,4 @@
-"""What the ROS bridge hears: the names of its topics, and the recent telemetry on ROS time."""
+"""Inputs of the ROS bridge: the names of its topics, and the recent telemetry on ROS time."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from scenematch.files.ros.messages import (
 __all__ = ["RESTART_NS", "RosTelemetry", "RosTopics"]
 
 RESTART_NS = 1_000_000_000
-"""A stamp that much older than the last one: a simulator or a bag was restarted."""
-_ATTITUDE_COMES_NS = 300_000_000  # age of the newest attitude up to which another is expected
+"""A stamp this much older than the last means that a simulator or a bag was restarted."""
+_ATTITUDE_COMES_NS = 300_000_000  # largest age of the newest attitude at which another is expected
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,21 +31,21 @@ class RosTopics:
     """Names of the topics that the bridge subscribes to; an empty name disables one.
 
     Attributes:
-        image: sensor_msgs/Image, or CompressedImage where the name ends with ``/compressed``.
-        camera_info: sensor_msgs/CameraInfo, used where no calibration file is given.
-        imu: sensor_msgs/Imu, whose orientation is the attitude.
-        compass: std_msgs/Float64, degrees clockwise from north, for an Imu whose heading has another origin; it
-            has no stamp, and takes precedence.
+        image: sensor_msgs/Image, or CompressedImage if the name ends with ``/compressed``.
+        camera_info: sensor_msgs/CameraInfo, used if no calibration file is given.
+        imu: sensor_msgs/Imu; its orientation is the attitude.
+        compass: std_msgs/Float64, degrees clockwise from north, for an Imu whose heading is not from north; it has
+            no stamp and takes precedence.
         height: std_msgs/Float64, metres above take-off.
         range: sensor_msgs/Range along the body's down axis; takes precedence over the height.
-        velocity: geometry_msgs/TwistStamped, east and north in m/s; used where the last half second has no
-            odometry.
-        odometry: another camera's odometry, whose twist is along the body.
+        velocity: geometry_msgs/TwistStamped, east and north in m/s; used if there was no odometry in the last half
+            second.
+        odometry: another camera's odometry, with its twist along the body.
         odometry_type: its message, one of :data:`scenematch.files.ros.messages.ODOMETRY_TYPES`: Odometry,
             TwistWithCovarianceStamped or TwistStamped.
 
     Raises:
-        OptionError: the message of the odometry is another.
+        OptionError: the odometry has another message type.
     """
 
     image: str = bags.IMAGE
@@ -70,7 +70,7 @@ class RosTopics:
 
 
 class RosTelemetry:
-    """Recent telemetry on ROS time. May be read from another thread than those that update it."""
+    """Recent telemetry on ROS time. May be read and updated from different threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -84,7 +84,7 @@ class RosTelemetry:
             self._add(self._attitude, stamp_ns(message), *attitude)
 
     def waits_for_attitude(self, time_ns: int) -> bool:
-        """Whether the attitude at a ROS time is still to come: it arrives, and its newest is older than that."""
+        """Whether the attitude at a ROS time is still expected: attitudes arrive, and the newest is older."""
         with self._lock:
             last_ns = self._attitude.last_ns
         return last_ns is not None and last_ns < time_ns <= last_ns + _ATTITUDE_COMES_NS
@@ -109,7 +109,7 @@ class RosTelemetry:
         self._add(self._velocity, stamp_ns(message), linear.x, linear.y)
 
     def odometry(self, message: Any, now_ns: int) -> None:
-        """Store the velocity along the body of another odometry; one without a stamp is of now.
+        """Store the velocity along the body of another odometry; one without a stamp counts as now.
 
         Raises:
             TelemetryError: its velocity is not along the body.
@@ -126,7 +126,9 @@ class RosTelemetry:
             heading_deg = yaw_deg if heading_deg is None else heading_deg
             east_mps, north_mps = self._velocity.at(time_ns) or (None, None)
             along_body = self._odometry.at(time_ns)
-            *_, stated_mps = self._odometry.nearest(time_ns) or (0.0,)  # 0 is not stated: nothing to interpolate
+            *_, stated_mps = self._odometry.nearest(time_ns) or (
+                0.0,
+            )  # 0 means not stated: nothing to interpolate
             slant_m, height_m = scalar(self._range.at(time_ns)), scalar(self._height.at(time_ns))
         above_m = height_m
         if slant_m is not None:  # the beam is fixed to the body, so it tilts with it

@@ -1,4 +1,4 @@
-"""Messages that the ROS nodes publish: the pose of a fix, the diagnostics and the image of its window."""
+"""Build the messages that the ROS nodes publish: a fix's pose, the diagnostics and the image of its window."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class RosOptions:
     """Frame, origin and consumer of the poses.
 
     Attributes:
-        frame_id: of the poses, which are east-north-up about the origin.
+        frame_id: frame of the poses, which are east-north-up about the origin.
         firmware: one of :data:`FIRMWARES`.
-        origin: of the poses; None for the map's. For an autopilot it must be that of its estimator.
+        origin: origin of the poses; None for the map's. For an autopilot it must be its estimator's.
 
     Raises:
         OptionError: the firmware is unknown.
@@ -61,7 +61,7 @@ def pose(
     site: OrthoMap,
     options: RosOptions,
 ) -> Any:
-    """A fix as geometry_msgs/PoseWithCovarianceStamped: east, north and up of the origin in metres.
+    """A fix as geometry_msgs/PoseWithCovarianceStamped: east, north and up from the origin in metres.
 
     Up is the vehicle's height above take-off, else above the ground, else the fix's above the map's ground. The
     orientation is the attitude that the method measured, else the vehicle's.
@@ -88,7 +88,7 @@ def pose(
 
 
 def position_en_m(fix: Fix, frame: LocalFrame, options: RosOptions) -> tuple[float, float]:
-    """East and north of the origin in metres: in its tangent plane, or in the projection of the firmware."""
+    """East and north from the origin in metres: in its tangent plane, or in the firmware's projection."""
     origin = options.origin
     if options.firmware == "none":
         if origin is None:
@@ -106,14 +106,14 @@ def pose_covariance(
 ) -> NDArray[np.float64]:
     """Covariance of east, north, up and the rotations about them, as ROS orders a pose.
 
-    An autopilot combines the position variances into one scalar, in which a large variance of the height, its own
-    anyway, would dominate: it gets the horizontal one.
+    An autopilot combines the position variances into one scalar, which a large variance of the height would
+    dominate. It uses its own height anyway, so the height gets the horizontal variance.
 
     Args:
         fix: with its covariance.
         firmware: one of :data:`FIRMWARES`.
         knows_up: whether the pose has a height.
-        angles: roll, pitch and heading in degrees; an unknown one is None. Those of a fix have its own covariance.
+        angles: roll, pitch and heading in degrees; None if unknown. Angles of a fix use the fix's covariance.
 
     Returns:
         (6, 6) in m^2 and rad^2.

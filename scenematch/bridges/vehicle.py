@@ -16,11 +16,11 @@ __all__ = ["NedOrigin", "VehicleState", "north_east_m"]
 ANGLES = (True, True, True)
 """Roll, pitch and heading are all angles, see :class:`RecentValues`."""
 ANGLE_VARIANCE = math.radians(10.0) ** 2
-"""Variance in rad^2 of the vehicle's own attitude where that is sent: large, since it is sent back."""
+"""Variance in rad^2 of the vehicle's own attitude if it is sent back: large, so that it has little weight."""
 MOUNT_VARIANCE = math.radians(1.0) ** 2
-"""Of each angle between camera and autopilot, which a fix does not measure: adds to that of its attitude."""
+"""Variance of each angle between camera and autopilot, which a fix does not measure; added to its attitude's."""
 
-_STALE_NS = 500_000_000  # largest distance of a sample in time from a capture that it describes
+_STALE_NS = 500_000_000  # largest time between a sample and a capture that it describes
 _MAX_SAMPLES = 128  # of each quantity
 _ARDUPILOT_M_PER_1E7_DEG = 0.011131884502145034
 _PX4_EARTH_M = 6371000.0
@@ -46,13 +46,13 @@ class VehicleState:
         east_velocity_mps: velocity over ground.
         north_velocity_mps: velocity over ground.
         up_velocity_mps: positive in a climb.
-        velocity_sigma_mps: standard deviation of the velocity, per axis, where its source states one.
+        velocity_sigma_mps: standard deviation of the velocity, per axis, if its source states one.
         height_agl_m: height above the ground by the rangefinder, else the clearance that the autopilot reports,
             else the height above home.
         alt_amsl_m: height above mean sea level.
         down_m: distance below the autopilot's origin.
-        holder: attitude of the body that the camera's mount is about, where that is not the vehicle but behind a
-            gimbal; None is the vehicle's own.
+        holder: attitude of the body that the camera's mount refers to, if it is behind a gimbal; None is the
+            vehicle's own attitude.
     """
 
     roll_deg: float | None = None
@@ -68,7 +68,7 @@ class VehicleState:
     holder: Attitude | None = None
 
     def frame(self, image: NDArray[np.uint8], captured_ns: int) -> Frame:
-        """The frame of an image (H, W, 3) or (H, W) uint8 that was captured at this time."""
+        """The frame for an image (H, W, 3) or (H, W) uint8 captured at this time."""
         own = (self.heading_deg, self.roll_deg, self.pitch_deg)
         held = self.holder
         return Frame(
@@ -88,7 +88,7 @@ class RecentValues:
     ::
 
         vehicle = RecentValues((True, True, True))  # the first three values are angles
-        vehicle.add(time_ns, roll_deg, pitch_deg, heading_deg, height_agl_m)  # as the autopilot states them
+        vehicle.add(time_ns, roll_deg, pitch_deg, heading_deg, height_agl_m)  # as the autopilot reports them
         roll_deg, pitch_deg, heading_deg, height_agl_m = vehicle.at(exposure_ns)
 
     Args:
@@ -100,14 +100,14 @@ class RecentValues:
         self._samples: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_MAX_SAMPLES)
 
     def add(self, time_ns: int, *values: float) -> None:
-        """Add a sample; it is dropped where it is not finite or not newer than the last."""
+        """Add a sample; it is dropped if it is not finite or not newer than the last."""
         newer = not self._samples or time_ns > self._samples[-1][0]
         if newer and all(map(math.isfinite, values)):
             self._samples.append((time_ns, values))
 
     @property
     def last_ns(self) -> int | None:
-        """Time of the newest sample; None where there is none."""
+        """Time of the newest sample; None if there is none."""
         return self._samples[-1][0] if self._samples else None
 
     def clear(self) -> None:
@@ -120,7 +120,7 @@ class RecentValues:
         return near[1] if near is not None and abs(near[0] - time_ns) <= _STALE_NS else None
 
     def at(self, time_ns: int) -> tuple[float, ...] | None:
-        """Values interpolated at a time; the nearest sample where one side is missing, None beyond 0.5 s."""
+        """Values interpolated at a time; the nearest sample if one side is missing, None beyond 0.5 s."""
         before = next((s for s in reversed(self._samples) if s[0] <= time_ns), None)
         after = next((s for s in self._samples if s[0] >= time_ns), None)
         near = [s for s in (before, after) if s is not None and abs(s[0] - time_ns) <= _STALE_NS]

@@ -1,4 +1,4 @@
-"""The velocity of another camera's odometry, as a companion computer sends it to the autopilot by MAVLink."""
+"""Read the velocity of another camera's odometry that a companion computer sends to the autopilot by MAVLink."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scenematch.files.velocities import velocity_sigma_mps
 Array = NDArray[np.float64]
 
 _OVER_GROUND = (mavlink.MAV_FRAME_LOCAL_NED,)
-_OF_BODY = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)  # the latter was its name before
+_OF_BODY = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)  # the latter is its former name
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FAILED = -1  # quality
 
@@ -23,16 +23,16 @@ _FAILED = -1  # quality
 def vision_velocity(
     message: Any, attitude_deg: tuple[float, ...] | None, bridge_component: int
 ) -> tuple[float, float, float, float] | None:
-    """East, north and up in m/s, and one standard deviation per axis, 0 where it is not stated.
+    """East, north and up in m/s, and one standard deviation per axis, 0 if it is not stated.
 
     Args:
         message: VISION_SPEED_ESTIMATE or ODOMETRY.
-        attitude_deg: roll, pitch and heading of the vehicle, by which a velocity along its body is turned.
-        bridge_component: component of the vehicle that the bridge itself is.
+        attitude_deg: roll, pitch and heading of the vehicle, used to rotate a velocity along its body.
+        bridge_component: component id of the bridge itself.
 
     Returns:
-        None where the message has no such velocity: of another estimator than a camera's, the autopilot's or the
-        bridge's own, in another frame, failed, of an absurd size, or of an unbounded variance.
+        None if the message has no such velocity: it is not from a camera, or is the autopilot's or the bridge's
+            own, in another frame, failed, absurdly large, or of unbounded variance.
     """
     if not _is_by_camera(message, bridge_component) or has_failed(message, bridge_component):
         return None
@@ -51,17 +51,17 @@ def vision_velocity(
 
 
 def has_failed(message: Any, bridge_component: int) -> bool:
-    """Whether another camera's ODOMETRY says that it has failed, so that what it said last holds no more."""
+    """Whether another camera's ODOMETRY reports failure, which invalidates its last message."""
     if message.get_type() != "ODOMETRY" or message.quality != _FAILED:
         return False
     return _is_by_camera(message, bridge_component)
 
 
 def _is_by_camera(message: Any, bridge_component: int) -> bool:
-    """Whether it is of another camera's odometry: not the autopilot's, nor the bridge's own.
+    """Whether it is another camera's odometry: neither the autopilot's nor the bridge's own.
 
-    An autopilot also passes on what it was sent, the bridge's fixes included, as a component of its own; a router
-    may pass them back unchanged. The bridge's ODOMETRY is of type VISION: another type is not its own.
+    An autopilot also forwards what it receives, including the bridge's fixes, under its own component; a router
+    may return them unchanged. The bridge's own ODOMETRY has type VISION.
     """
     if message.get_srcComponent() == AUTOPILOT_COMPONENT:
         return False
@@ -73,7 +73,7 @@ def _is_by_camera(message: Any, bridge_component: int) -> bool:
 
 
 def _turn(frame: int, attitude_deg: tuple[float, ...] | None) -> Array | None:
-    """To east, north, up from the frame of a velocity; None where that is not known."""
+    """Rotation from a velocity's frame to east, north, up; None if unknown."""
     if frame in _OVER_GROUND:
         return _ENU_FROM_NED
     if frame not in _OF_BODY or attitude_deg is None:

@@ -1,4 +1,4 @@
-"""Checks: whether the inputs of a flight fit each other, and where on a map fixes are available."""
+"""Checks: whether a flight's inputs agree, and where on a map fixes are available."""
 
 from scenematch.check.diagnose import diagnose
 from scenematch.check.findings import Diagnosis, Finding

@@ -1,4 +1,4 @@
-"""Availability of fixes over a map and along a route: their probability, and the reason where it is low.
+"""Availability of fixes over a map and along a route: their probability, and why it is low.
 
 A logistic rule, fitted on simulated towns and on farmland, turns the statistics of
 :mod:`scenematch.check.self_match` into a probability, see ``docs/audit.md``.
@@ -38,14 +38,14 @@ class Flag(enum.IntEnum):
     OUTSIDE = 8
 
 
-# Reasons why a cell is not suitable, in this order; WEAK where none of these is effective.
+# Reasons why a cell is not suitable, in this order; WEAK if none of these applies.
 FLAT_TEXTURE = 3.0
 REPEATED_RIVAL = 0.5
 UNSTABLE_SCORE = 0.58
 
 
 def fix_probability(texture: ArrayLike, score: ArrayLike, lead: ArrayLike) -> Array:
-    """Probability of a fix: logistic in the statistics that decide on NCC's fixes.
+    """Probability of a fix: a logistic function of the statistics that decide NCC's fixes.
 
     Args:
         texture: (...,) see :class:`scenematch.check.self_match.SelfMatchStatistics`, as the others.
@@ -60,7 +60,7 @@ def fix_probability(texture: ArrayLike, score: ArrayLike, lead: ArrayLike) -> Ar
 
 
 def regressors(texture: ArrayLike, score: ArrayLike, lead: ArrayLike) -> Array:
-    """Regressors of :func:`fix_probability`: base-2 logarithms, clipped where more does not help.
+    """Regressors of :func:`fix_probability`: base-2 logarithms, clipped beyond the point of benefit.
 
     Args:
         texture: (...,) above 0.
@@ -76,7 +76,7 @@ def regressors(texture: ArrayLike, score: ArrayLike, lead: ArrayLike) -> Array:
 
 
 WEIGHTS = np.array([-16.41, 1.7, 1.89, 1.04])
-"""Of the logistic rule: constant, texture, score, lead; fitted by ``python -m bench.accuracy.audit --fit``."""
+"""Logistic weights (constant, texture, score, lead), fitted by ``python -m bench.accuracy.audit --fit``."""
 
 
 # ---------------------------------------------------------------------------------------------------- audits
@@ -151,7 +151,7 @@ def gather(plan: AuditPlan, measured: Iterable[SelfMatchStatistics]) -> Audit:
     statistics = SelfMatchStatistics(**found)
     own = fix_probability(statistics.texture, statistics.score, statistics.lead)
     effective = own
-    if plan.other is not None:  # a real change in place of the simulated one
+    if plan.other is not None:  # a real change instead of the simulated one
         later = fix_probability(statistics.texture, statistics.other_score, statistics.other_lead)
         effective = np.where(np.isnan(later), own, np.minimum(own, later))
     inside_map = np.zeros(plan.cells, np.bool_)
@@ -265,7 +265,7 @@ def _stretches(
     for first, end in edges.reshape(-1, 2):
         part = slice(first, end)
         lat, lon = site.frame.geodetic_from_enu(*en_m[[first, end - 1]].T)
-        reasons = flags[part][flags[part] != Flag.GOOD]  # between cells the nearest one may still be good
+        reasons = flags[part][flags[part] != Flag.GOOD]  # between cells, the nearest may still be good
         worst = Flag(int(np.bincount(reasons).argmax())) if reasons.size else Flag.WEAK
         length_m = float(along_m[end - 1] - along_m[first])
         ends_deg = (float(lat[0]), float(lon[0]), float(lat[1]), float(lon[1]))

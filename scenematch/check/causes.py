@@ -1,4 +1,4 @@
-"""Causes: the single change of telemetry or calibration that makes them fit what the pictures show."""
+"""Causes: find the single change in telemetry or calibration that makes them agree with the pictures."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from scenematch.check.findings import Array, Finding, TelemetrySeries
 from scenematch.check.ground_motion import optical_centre, velocity
 from scenematch.check.sightings import Sighting
 
-_OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
+_OUTLIER = 9.0  # chi-square at which a difference is capped
 _MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
-_GAIN, _GAIN_SHARE = 0.6, 0.5  # by which a change must lessen it, the lesser of the two
+_GAIN, _GAIN_SHARE = 0.6, 0.5  # a change must reduce it by the lesser of the two
 _PENALTY = {"discrete": 0.15, "offset": 0.25, "shift": 0.3, "rotation": 0.5}
 _LEAST = 3
 _ANGLES = ("roll", "pitch", "heading")
-# An offset below both, in shares of the height and in sigmas, is named only where single pictures contradict it.
+# An offset below both, as a share of the height and in sigmas, is named only if single pictures contradict it.
 _LEAST_HEIGHT_SHARE, _LEAST_HEIGHT_SIGMAS = 0.04, 5.0
 _SHIFTS_S = np.concatenate([np.arange(-3.0, -0.07, 0.05), np.arange(0.1, 3.01, 0.05)])
 _FEET = 0.3048
 IN_CALIBRATION = " in the calibration"
-"""Ends a cure that is a line of a file, which not every flight has."""
+"""Ends a cure that is a line in a file; not every flight has one."""
 
 
 def findings(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: float) -> list[Finding]:
-    """What does not fit; the telemetry's attitude, height, velocity and the map are tried one after the other.
+    """Find what does not agree; tests the telemetry's attitude, height and velocity, and then the map.
 
     Args:
         series: of the whole flight.
-        seen: the poses of some of its pictures.
+        seen: poses of some of its pictures.
         map_sigma_m: georeferencing accuracy of the map.
     """
     if len(seen) < _LEAST:
         return []
     attitude = _attitude(series, seen)
-    # By a clock that is late places lie off forwards as well.
+    # A late clock also shifts places forwards.
     is_late = attitude is not None and attitude.cause == "clock"
     turning = None if is_late else optical_centre(series, seen)
     tries = (
@@ -57,7 +57,7 @@ def findings(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: flo
 
 
 def is_known(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[str, ...]:
-    """What of the telemetry was known at enough of the sightings to be compared."""
+    """The telemetry known at enough sightings to be compared."""
     index = [s.index for s in seen]
     tilt_is_known = np.isfinite(series.angles_deg[index, :2]).any()
     angles = {"attitude": series.angles_deg} if tilt_is_known else {"heading": series.angles_deg[:, 2:]}
@@ -72,14 +72,14 @@ def is_known(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[str, ..
 
 
 def _cost(measured_deg: Array, told_deg: Array) -> float:
-    """Mean chi-square of a component, each limited."""
+    """Mean chi-square of a component, with each value capped."""
     chi = (wrap_difference_deg(measured_deg - told_deg) / SIGMA_DEG) ** 2
     known = np.isfinite(chi)
     return float(np.minimum(chi, _OUTLIER)[known].mean()) if known.any() else 0.0
 
 
 def _signed(angles: Array) -> Array:
-    """Angles of which the heading is what it was before it was wrapped into [0, 360) as if in degrees."""
+    """Angles with the heading as it was before it was wrapped into [0, 360) as if in degrees."""
     heading = np.where(angles[:, 2] > 2.0 * math.pi + 1e-3, angles[:, 2] - 360.0, angles[:, 2])
     return np.column_stack([angles[:, :2], heading])
 
@@ -94,7 +94,7 @@ _DISCRETE: tuple[tuple[str, str, str, Callable[[Array], Array]], ...] = (
      lambda a: a * [180.0 / math.pi, 180.0 / math.pi, 1.0]),
     ("degrees", "the angles were multiplied by 57.3, as if they had been in radians",
      "look at the conversion of the telemetry", np.radians),
-    ("swapped", "roll and pitch are in each other's place",
+    ("swapped", "roll and pitch are swapped",
      "--correct roll_deg=pitch_deg --correct pitch_deg=roll_deg",
      lambda a: a[:, [1, 0, 2]]),
     ("sign", "roll and pitch have the other sign", "--correct roll_deg=-roll_deg --correct pitch_deg=-pitch_deg",
@@ -132,12 +132,12 @@ def _attitude(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | No
     if cost < as_told - min(_GAIN, _GAIN_SHARE * as_told):
         return finding
     suspected = _listed(contradicted or _ANGLES)
-    text = f"{suspected} of the telemetry and of the pictures differ, and no single change would make them fit"
+    text = f"{suspected} of the telemetry and of the pictures differ, and no single change would make them agree"
     return Finding("attitude", text, f"look at {suspected}: the unit, the sign, the clock")
 
 
 def _contradicted(series: TelemetrySeries, seen: Sequence[Sighting], fields: Sequence[str]) -> list[str]:
-    """Those of the fields that too many pictures contradict."""
+    """The fields that too many pictures contradict."""
     return [one.field for one in contradictions(series, seen) if one.field in fields and is_alarming(one)]
 
 
@@ -155,7 +155,7 @@ def _turned_heading(measured: Array, angles: Array) -> tuple[float, Finding]:
 
 
 def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, Finding]:
-    """One rotation between the telemetry's body and the one that the pictures show: the camera hangs otherwise."""
+    """One rotation between the telemetry's body and the pictures': the camera is mounted differently."""
     known = np.isfinite(angles).all(axis=1)
     if known.sum() < _LEAST:
         return math.inf, Finding("mount", "", "")
@@ -173,15 +173,15 @@ def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, 
         turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         hung = np.linalg.matrix_power(turned, quarter // 90 % 4) @ mount
         names = [name for name in MOUNTS if np.allclose(mount_rotation(name), hung, atol=1e-6)]
-        text = f"the camera is turned by {quarter % 360} degrees against its mount"
+        text = f"the camera is turned by {quarter % 360} degrees from its mount"
         cure = f"--mount {names[0]}" if names else _mount_line(hung)
         return float(chi.mean()) + _PENALTY["discrete"], Finding("mount", text, cure, float(quarter), sigma_deg)
-    if tilt_deg < 1.0:  # about the vertical alone: reported as a heading
+    if tilt_deg < 1.0:  # only about the vertical: reported as a heading
         return math.inf, Finding("mount", "", "")
     axis = (mount @ np.array([0.0, 0.0, 1.0]), median @ mount @ np.array([0.0, 0.0, 1.0]))
     forward_deg = math.degrees(math.atan2(axis[1][0], axis[1][2]) - math.atan2(axis[0][0], axis[0][2]))
     text = (
-        f"the camera hangs {tilt_deg:.1f} degrees off its mount ({forward_deg:+.1f} towards the nose), "
+        f"the camera is tilted {tilt_deg:.1f} degrees from its mount ({forward_deg:+.1f} towards the nose), "
         "or roll and pitch are off by that, or the principal point"
     )
     cure = _mount_line(median @ mount)
@@ -228,7 +228,7 @@ def _median_angle(angles_deg: Array) -> tuple[float, float]:
 
 
 def _middle_rotation(turns: Sequence[Array]) -> Array:
-    """Of rotations with a few outliers: the mean of those nearest to the one that is nearest to all."""
+    """Robust mean of rotations: the mean of those nearest to the one that is nearest to all."""
     apart = np.array([[_rotation_deg(a.T @ b) for b in turns] for a in turns])
     near = np.argsort(apart[int(np.argmin(np.median(apart, axis=1)))])[: max(_LEAST, (3 * len(turns)) // 4)]
     u, _, vt = np.linalg.svd(np.mean([turns[k] for k in near], axis=0))
@@ -262,14 +262,14 @@ def _height(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None
     if cost(height) < _MISFIT or (is_small and not _contradicted(series, seen, ("height",))):
         return None
     if min(by_offset, by_factor) > cost(height) - _GAIN:
-        text = "the height does not fit the pictures, and no offset or factor would make it"
+        text = "the height does not agree with the pictures, and no offset or factor would make it"
         return Finding("height", text, "look at the telemetry's height")
     if abs(factor / _FEET - 1.0) < 0.04:
         text = "the height is in feet"
         return Finding("height_feet", text, '--correct "height_agl_m=0.3048*height_agl_m"', factor)
     side = "low" if off_m > 0.0 else "high"
     if by_factor < by_offset - 0.3:
-        text = f"heights are to be multiplied by {factor:.3f}, or the focal length divided by it"
+        text = f"multiply heights by {factor:.3f}, or divide the focal length by it"
         return Finding("focal", text, f'--correct "height_agl_m={factor:.3f}*height_agl_m"', factor, 0.01)
     text = (
         f"the height reads {abs(off_m):.1f} m too {side} (above sea level, above another ground?), "
@@ -290,7 +290,7 @@ def _place(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: float
         return None
     middle = np.median(off[known], axis=0)
     if not np.isfinite(series.angles_deg[index, :2]).any():
-        # Who knows of no tilt may give positions of what the picture's middle shows.
+        # A source unaware of tilt may give the positions of what the picture's centre shows.
         shown = np.array([_shown_m(s, series.mount) for s in seen]) - reference_m
         middle = min(middle, np.median(shown[known], axis=0), key=np.linalg.norm)
     sigma_m = math.hypot(float(np.median(series.reference_sigma_m[index][known])), map_sigma_m)
@@ -298,13 +298,13 @@ def _place(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: float
         return None
     text = (
         f"the map shows places {np.hypot(*middle):.1f} m ({middle[0]:+.1f} east, {middle[1]:+.1f} north) "
-        "from where the other positions are"
+        "from the other positions"
     )
     return Finding("map", text, "look at the map's georeference, or at the datum of the positions",
                    float(np.hypot(*middle)), sigma_m)  # fmt: skip
 
 
 def _shown_m(seen: Sighting, mount: Array) -> Array:
-    """(2,) east and north of what the picture's middle shows, on level ground."""
+    """(2,) east and north of what the picture's centre shows, on level ground."""
     axis = enu_from_body(*attitude_deg(seen)) @ mount[:, 2]
     return seen.en_m + axis[:2] / max(-float(axis[2]), 0.1) * seen.height_agl_m

@@ -1,4 +1,4 @@
-"""Contradictions: at how many pictures a field of the telemetry is more than three standard deviations off."""
+"""Contradictions: count the pictures at which a telemetry field is off by more than three standard deviations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scenematch.check.ground_motion import leg_differences
 from scenematch.check.sightings import Sighting
 
 SIGMA_DEG = np.array([1.2, 1.2, 1.5])
-"""Of roll, pitch and heading by features alone, against the telemetry's."""
+"""Standard deviations of roll, pitch and heading by features alone, against the telemetry's."""
 _HEIGHT_SHARE, _HEIGHT_M = 0.02, 1.5  # of a height by features alone
 _SIGMAS = 3.0
 # None of gazebo-a1's 160 placed pictures contradicts right telemetry: fewer than 1.9 % do (95 % confidence).
@@ -22,7 +22,7 @@ _ALARM = 3
 
 
 def contradictions(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[Contradiction, ...]:
-    """How many pictures contradict each field of the telemetry; fields that are not known are left out.
+    """How many pictures contradict each telemetry field; unknown fields are left out.
 
     Args:
         series: of the whole flight.
@@ -43,7 +43,7 @@ def contradictions(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[C
 
 
 def is_alarming(one: Contradiction) -> bool:
-    """Whether that many pictures are no accident."""
+    """Whether that many pictures are more than chance."""
     return one.pictures >= _ALARM
 
 

@@ -1,4 +1,4 @@
-"""From the telemetry and the pictures of a flight to what does not fit among its inputs."""
+"""Compare a flight's telemetry with its pictures to find errors in its inputs."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from scenematch.check.sightings import sight
 Array = NDArray[np.float64]
 
 LOOKED_AT = 16
-_SPEED_MPS = 5.0  # by which a position grows uncertain with the time to the next that is known
-_MAX_SIGMA_M = 300.0  # of a prior; beyond, the whole map is searched where it can be
-# Nanoseconds in the units that stamps are given in by mistake, and the intervals between pictures that are usual.
+_SPEED_MPS = 5.0  # growth of a position's uncertainty with the time to the nearest known one
+_MAX_SIGMA_M = 300.0  # of a prior; beyond it the whole map is searched if possible
+# Nanoseconds per unit that is mistaken for them, and the usual intervals between pictures.
 _UNITS = {"microseconds": 1e3, "milliseconds": 1e6, "seconds": 1e9}
 _USUAL_NS = (5e6, 2e10)
 _FROZEN_SHARE = 0.1
 
 
 class Telemetry(Protocol):
-    """What is said of one picture: a :class:`engine.values.Frame` or a row of telemetry.csv."""
+    """What is known about one picture: a :class:`engine.values.Frame` or a row of telemetry.csv."""
 
     @property
     def timestamp_ns(self) -> int | None:
@@ -48,19 +48,19 @@ def diagnose(
     start: Prior | None = None,
     reference: Sequence[Prior | None] | None = None,
 ) -> Diagnosis:
-    """Compare what a flight's telemetry says with what its pictures show by themselves.
+    """Compare a flight's telemetry with what its pictures show.
 
     Args:
         telemetry: of every picture, in the order of capture.
         picture: reads the picture of an index; some thirty are read.
         site: the map.
         camera: the calibration.
-        priors: positions that came with the pictures, by another source; None where they have none.
-        start: where the flight begins; None where that is not known.
-        reference: positions that the map is held against; None takes ``priors``.
+        priors: positions of the pictures from another source; None if they have none.
+        start: where the flight begins; None if unknown.
+        reference: positions to check the map against; None uses ``priors``.
 
     Returns:
-        Diagnosis: what does not fit, the strongest first.
+        Diagnosis: what does not agree, strongest first.
     """
     count = len(telemetry)
     priors = [None] * count if priors is None else list(priors)
@@ -84,7 +84,7 @@ def diagnose(
 
 
 def _searched(k: int, priors: Sequence[Prior | None], time_s: Array, site: OrthoMap) -> Prior | None:
-    """Where a picture is looked for: about the position that is known nearest to it in time."""
+    """Where to look for a picture: around the known position nearest in time."""
     known = [j for j, prior in enumerate(priors) if prior is not None]
     if not known:
         return None
@@ -122,14 +122,14 @@ def _series(
 
 
 def _unit(telemetry: Sequence[Telemetry]) -> tuple[str, float]:
-    """The unit that the stamps are in, and the nanoseconds in it."""
+    """The unit of the timestamps, and its length in nanoseconds."""
     stamps = np.array([row.timestamp_ns for row in telemetry if row.timestamp_ns is not None], np.float64)
     if len(stamps) < 3:
         return "nanoseconds", 1.0
     interval = float(np.median(np.diff(stamps)))
     if not 0.0 <= interval < _USUAL_NS[0]:
         return "nanoseconds", 1.0
-    interval = float(np.mean(np.diff(stamps)))  # of seconds most are 0
+    interval = float(np.mean(np.diff(stamps)))  # in seconds most are 0
     for unit, factor in _UNITS.items():
         if _USUAL_NS[0] <= interval * factor <= _USUAL_NS[1]:
             return unit, factor
@@ -147,7 +147,7 @@ def _stamps(telemetry: Sequence[Telemetry]) -> Finding | None:
 def _frozen(
     chosen: Sequence[int], frames: Sequence[Frame], picture: Callable[[int], Frame], count: int
 ) -> Finding | None:
-    """Each picture that was looked at is compared with the next one of the flight."""
+    """Compare each sampled picture with the flight's next one."""
     repeated = looked = 0
     for k, frame in zip(chosen, frames, strict=True):
         if k + 1 < count:

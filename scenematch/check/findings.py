@@ -1,4 +1,4 @@
-"""Findings of a diagnosis, and the telemetry that it compares with the pictures."""
+"""Findings of a diagnosis, and the telemetry it compares with the pictures."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that does not fit, and the change that would make it fit.
+    """An error in the inputs, and the change that would fix it.
 
     Attributes:
         cause: one word: "radians", "degrees", "swapped", "sign", "heading", "heading_convention", "mount",
             "height", "height_feet", "focal", "clock", "velocity", "stamps", "frozen", "mirrored", "map"; or
-            "attitude" where none of the changes explains what does not fit.
+            "attitude" if none of the changes explains the disagreement.
         text: a sentence with the figures.
         cure: the option to try, or what to look at.
-        value: of the error in the unit of the text; None where it has none.
+        value: size of the error in the unit of the text; None if it has none.
         sigma: standard deviation of the value.
     """
 
@@ -33,12 +33,12 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """How many placed pictures contradict one field of the telemetry, by more than three standard deviations.
+    """How many located pictures contradict a telemetry field by more than three standard deviations.
 
     Attributes:
         field: "roll", "pitch", "heading", "height" or "velocity".
-        pictures: that contradict it; of the velocity the ways from one picture to the next.
-        compared: pictures at which it was known.
+        pictures: number that contradict it; for the velocity, displacements between consecutive pictures.
+        compared: number of pictures at which it was known.
     """
 
     field: str
@@ -48,14 +48,14 @@ class Contradiction:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What was found of a flight's inputs.
+    """The errors found in a flight's inputs.
 
     Attributes:
-        findings: the strongest first; empty where everything fits.
-        looked_at: pictures that were looked at.
-        seen: of them, those whose pose the picture showed by itself.
-        compared: what of the telemetry was known and held against them.
-        contradicted: by how many pictures, for each field of the telemetry that was known.
+        findings: strongest first; empty if everything agrees.
+        looked_at: number of pictures examined.
+        seen: number of them that gave a pose without telemetry.
+        compared: telemetry fields that were known and compared with them.
+        contradicted: for each known field, how many pictures contradict it.
     """
 
     findings: list[Finding]
@@ -67,7 +67,7 @@ class Diagnosis:
 
 @dataclass(frozen=True, slots=True)
 class TelemetrySeries:
-    """What the telemetry says at every picture of a flight; NaN where it says nothing.
+    """The telemetry at every picture of a flight; NaN if unknown.
 
     Attributes:
         time_s: (N,) of the pictures.

@@ -1,4 +1,4 @@
-"""Ground motion between sightings against the velocity: unit, axes, and places that move with the heading."""
+"""Compare ground motion between sightings with the velocity: unit, axes, offsets that turn with the heading."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from engine.geo import wrap_difference_deg
 from scenematch.check.findings import Array, Finding, TelemetrySeries
 from scenematch.check.sightings import Sighting
 
-_OUTLIER = 9.0  # chi-square beyond which a difference counts as so much
+_OUTLIER = 9.0  # chi-square at which a difference is capped
 _MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
-_GAIN = 0.6  # by which a change must lessen it
+_GAIN = 0.6  # by which a change must reduce it
 _LEAST = 3
 _VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": 0.3048}
-# Of places that move with the heading: by how much they lessen the cost, to which share, and what is named at all.
+# For offsets that turn with the heading: minimum reduction of the cost, its share, and the least offset reported.
 _TURNING_GAIN, _TURNING_RATIO, _TURNING_SIGMAS, _TURNING_LEAST_DEG = 0.35, 2.5, 4.0, 1.2
 _LEAST_COST = 0.1
-# Legs that show them: the vehicle turns at all, as the telemetry says, and tilts about as usual at both ends.
+# Legs that show them: the vehicle turns, the telemetry agrees, and the tilt at both ends is usual.
 _TURN_DEG, _TURN_OFF_DEG, _TILT_OFF_DEG = 15.0, 10.0, 8.0
 _MAX_LEG_S, _MIN_LEG_M = 120.0, 4.0
 _VELOCITY_SIGMA_MPS, _LEG_SIGMA_M, _ACCELERATION_MPS2 = 0.7, 2.0, 2.0
@@ -30,11 +30,11 @@ _VELOCITY_SIGMA_MPS, _LEG_SIGMA_M, _ACCELERATION_MPS2 = 0.7, 2.0, 2.0
 
 @dataclass(frozen=True, slots=True)
 class _Leg:
-    """The way between two sightings.
+    """The displacement between two sightings.
 
     Attributes:
-        first: where it begins.
-        last: where it ends.
+        first: its first sighting.
+        last: its last sighting.
         moved_m: (2,) east and north by the sightings.
         reckoned_m: (2,) the same by the velocity.
         sigma_m: of their difference, per axis.
@@ -48,22 +48,22 @@ class _Leg:
 
     @property
     def off(self) -> Array:
-        """(2,) the difference, in sigmas."""
+        """(2,) difference in sigmas."""
         return (self.moved_m - self.reckoned_m) / self.sigma_m
 
     @property
     def turn_deg(self) -> float:
-        """Of the heading, by the sightings; from -180 up to 180."""
+        """Change of heading by the sightings, from -180 up to 180."""
         return wrap_difference_deg(self.last.attitude.heading_deg - self.first.attitude.heading_deg)
 
     @property
     def turned(self) -> Array:
-        """(2, 2) what an offset forward and to the right adds to the difference, in sigmas a metre."""
+        """(2, 2) effect of an offset forward and to the right on the difference, in sigmas per metre."""
         return (_heading_rotation(self.last) - _heading_rotation(self.first)) / self.sigma_m
 
 
 def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
-    """The unit, the axes and the sign of a velocity that does not fit the ways between sightings."""
+    """Find a wrong unit, axis or sign of a velocity that does not agree with the sightings."""
     legs = _legs(series, seen)
     if len(legs) < _LEAST:
         return None
@@ -73,7 +73,7 @@ def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | Non
     def cost(expected: Array) -> float:
         return _limited((moved - expected) / sigma)
 
-    tried = [(cost(reckoned[:, ::-1]), "the velocity's east and north are in each other's place",
+    tried = [(cost(reckoned[:, ::-1]), "the velocity's east and north are swapped",
               "--correct east_velocity_mps=north_velocity_mps --correct north_velocity_mps=east_velocity_mps"),
              (cost(-reckoned), "the velocity has the other sign",
               "--correct east_velocity_mps=-east_velocity_mps "
@@ -98,13 +98,13 @@ def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | Non
     if cost(reckoned) < _MISFIT:
         return None
     if best > cost(reckoned) - _GAIN:
-        text = "velocity and stamps do not fit the ways between the pictures, and no single change would make them"
+        text = "velocity and timestamps do not fit the motion between pictures, and no single change would help"
         return Finding("velocity", text, "look at the velocity and the stamps")
     return Finding("velocity", text, cure, factor)
 
 
 def leg_differences(series: TelemetrySeries, seen: Sequence[Sighting]) -> Array:
-    """(N,) by how many standard deviations each way between two pictures differs from that of the velocity."""
+    """(N,) difference of each displacement from the velocity's, in standard deviations."""
     legs = _legs(series, seen)
     return np.array([np.abs(leg.off).max() for leg in legs] if len(legs) >= _LEAST else [], np.float64)
 
@@ -122,7 +122,7 @@ def _heading_rotation(seen: Sighting) -> Array:
 
 
 def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
-    """Places that are off forwards or to the right: at every turn of the vehicle they move."""
+    """Find places that are off forwards or to the right: they move whenever the vehicle turns."""
     tilts_deg = np.array([(one.attitude.roll_deg, one.attitude.pitch_deg) for one in seen])
     off_deg = np.abs(tilts_deg - np.median(tilts_deg, axis=0)).max(axis=1)
     usual = [one for one, tilt_off_deg in zip(seen, off_deg, strict=True) if tilt_off_deg < _TILT_OFF_DEG]
@@ -134,7 +134,7 @@ def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding
     aside_m, information = _common_offset(rows, off, turning)
     as_told, best = _limited(off), _limited(off - rows @ aside_m)
     height_m = float(np.median([one.height_agl_m for one in seen]))
-    # Legs are mostly better known than is assumed of them.
+    # Most legs are more accurate than assumed.
     sigma_m = math.sqrt(max(best, _LEAST_COST) * float(np.trace(np.linalg.inv(information))))
     size_m = float(np.hypot(*aside_m))
     aside_deg = math.degrees(math.atan2(size_m, height_m))
@@ -146,22 +146,22 @@ def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding
 
 
 def _limited(left: Array) -> float:
-    """Mean chi-square of what is left, each limited."""
+    """Mean chi-square of the residuals, each capped."""
     return float(np.minimum(left**2, _OUTLIER).mean())
 
 
 def _turns_as_told(series: TelemetrySeries, leg: _Leg) -> bool:
-    """Whether the telemetry confirms the turn: to a false sighting and back, both legs would show one offset."""
+    """Whether the telemetry confirms the turn: legs to and from a false sighting would show the same offset."""
     first_deg, last_deg = series.angles_deg[[leg.first.index, leg.last.index], 2].tolist()
     off_deg: float = wrap_difference_deg(leg.turn_deg - (last_deg - first_deg))
-    return abs(off_deg) < _TURN_OFF_DEG  # not where it is unknown
+    return abs(off_deg) < _TURN_OFF_DEG  # not if it is unknown
 
 
 def _common_offset(rows: Array, off: Array, turning: NDArray[np.bool_]) -> tuple[Array, Array]:
     """The offset that most legs share, and its information (2, 2).
 
-    One leg that turns shows it, and the best of these is averaged with all legs that agree: an offset of many
-    sigmas is an outlier of each leg before it is known.
+    A single leg with a turn shows it, and the best is averaged with all legs that agree: until it is known, an
+        offset of many sigmas makes every leg an outlier.
     """
     shown = np.linalg.solve(rows[turning], off[turning][..., None])[..., 0]
     offset_m = min(shown, key=lambda one: _limited(off - rows @ one))
@@ -175,7 +175,7 @@ def _named(aside_m: Array, sigma_m: float, height_m: float, series: TelemetrySer
     size_m = float(np.hypot(*aside_m))
     off_px = series.focal_px / height_m * (series.mount.T @ [*aside_m, 0.0])[:2]
     text = (
-        f"places lie {aside_m[0]:+.1f} m forward and {aside_m[1]:+.1f} m right of where they are, whichever way "
+        f"places lie {aside_m[0]:+.1f} m forward and {aside_m[1]:+.1f} m right of their true place, whichever way "
         "the vehicle heads: the optical centre is off, or the camera's mount and the attitude alike"
     )
     cure = f"look at the calibration: cx and cy would be {-off_px[0]:+.0f} and {-off_px[1]:+.0f} px other"

@@ -1,4 +1,4 @@
-"""Plan of an audit: a grid of cells over a map, a part of it or a route, and the view of a frame there."""
+"""Plan an audit: a grid of cells over a map, a part of it or a route, and a frame's view there."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from engine.window import level_for
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Larger templates take more time and change little: the audit then uses a coarser level.
+# Larger templates take longer and change little, so the audit then uses a coarser level.
 _MAX_TEMPLATE_PX = 320
 _CELLS_PER_AUDITED = 250  # of the grid under a part, which bounds its memory for a long corridor
-_MARGIN_STEPS = 1.5  # least half width of a corridor, so that cells surround every position on it
+_MARGIN_STEPS = 1.5  # smallest half width of a corridor, so that cells surround every position on it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditOptions:
-    """Assumptions about the flights that the audit is for.
+    """Assumptions about the flights to audit for.
 
     Attributes:
         prior_sigma_m: standard deviation of the position before a match.
-        spacing: of the cells, as a share of the frame's footprint.
+        spacing: distance of the cells, as a share of the frame's footprint.
         max_cells: upper bound on the number of audited cells; the spacing grows accordingly.
         ncc: settings of the NCC method.
     """
@@ -49,12 +49,12 @@ class AuditOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapPart:
-    """The part of a map that is audited: around a position, along what the camera sees on a route, or both.
+    """The part of a map to audit: around a position, along the ground seen from a route, or both.
 
     Attributes:
         around: latitude and longitude in degrees, and a radius in metres.
         route: (N, 2) latitude and longitude of waypoints.
-        corridor_m: half width about what is seen on the route; None is the longer side of a frame.
+        corridor_m: half width around the ground seen from the route; None is the longer side of a frame.
 
     Raises:
         OptionError: neither is given, or a distance is not above 0.
@@ -120,7 +120,7 @@ class AuditPlan:
 
     @property
     def exclusion_px(self) -> float:
-        """Rivals nearer than this are the peak itself, in pixels of the level."""
+        """Rivals closer than this belong to the peak itself, in pixels of the level."""
         return self.options.ncc.exclusion_m / (self.site.gsd_m_per_px * 2.0**self.level)
 
     @cached_property
@@ -176,7 +176,7 @@ class AuditPlan:
             center_px: (2,) its middle, in pixels of the map.
 
         Returns:
-            bool: True where all of it is.
+            bool: True if all of it is.
         """
         (rows, columns), (x, y) = self.site.level_shape(self.level), self.corner_px(center_px)
         return 0 <= x <= columns - self.shape[1] and 0 <= y <= rows - self.shape[0]
@@ -197,7 +197,7 @@ def plan_audit(
         camera: of the flights.
         height_agl_m: of the flights, above 0.
         options: settings.
-        other: map of the same ground at another date, by which stale cells are found.
+        other: map of the same ground at another date, used to find stale cells.
         part: of the map; None is all of it.
 
     Raises:
@@ -286,7 +286,7 @@ def _near(
 ) -> tuple[Window, Mask]:
     """The window of the map under a part, and which cells (rows, columns) of a grid on it belong to the part.
 
-    The cells are ``step_px`` wide, or wider where there would be more than ``max_cells``.
+    The cells are ``step_px`` wide, or wider if there would be more than ``max_cells``.
     """
     gsd_m = site.gsd_m_per_px
     reach_m = part.corridor_m or max(view.footprint_px) * 2.0**level * gsd_m
@@ -310,7 +310,7 @@ def _near(
             audited |= _within(some, window, cells)
         count = np.count_nonzero(audited)
         if count == 0:
-            raise OptionError(f"part: expected one on the map {site.name}, got one beside it")
+            raise OptionError(f"part: expected one on the map {site.name}, got one off it")
         if count <= max_cells or step_px >= max(window.width_px, window.height_px):
             return window, audited
         step_px *= max(1.02, math.sqrt(count / max_cells))
@@ -323,7 +323,7 @@ def _window_of(discs: Array, site: OrthoMap) -> Window:
     low = np.clip(np.floor((xy - reach).min(axis=0)), 0, size)
     high = np.clip(np.ceil((xy + reach).max(axis=0)) + 1, 0, size)
     if not (high > low).all():  # NaN fails too
-        raise OptionError(f"part: expected one on the map {site.name}, got one beside it")
+        raise OptionError(f"part: expected one on the map {site.name}, got one off it")
     (x0, y0), (width, height) = low.astype(int).tolist(), (high - low).astype(int).tolist()
     return Window(x0, y0, width, height)
 

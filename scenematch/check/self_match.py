@@ -1,7 +1,7 @@
-"""Self-match: statistics of a map by correlating it with patches of its own that were changed.
+"""Self-match: correlate a map with altered patches of itself and compute statistics.
 
-At every audited cell the patch that the camera would see is changed by noise, other ground and small errors of the
-telemetry, and correlated with the window that a prior allows.
+At every audited cell, the patch that the camera would see is altered by noise, changed ground and small telemetry
+errors, and correlated with the window that a prior allows.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Pictures = NDArray[np.float32]
 
-# The change of a patch, the same at every cell.
+# The alteration of a patch, the same at every cell.
 _DRAWS = 2
 _TURN_DEG, _SCALE, _SHIFT_PX = 1.0, 1.01, 0.4  # residual errors of telemetry and level
 _NOISE_SD = 3.0  # grey levels, of the sensor
@@ -53,7 +53,7 @@ class SelfMatchStatistics:
         stability: NCC of the patch with itself, blurred, rotated and scaled a little.
         sharpness: curvature of the unchanged peak along its flattest direction, per square pixel.
         score: NCC of the changed patch at its own position, in sigmas.
-        lead: that less its best rival, in sigmas.
+        lead: ``score`` minus its best rival, in sigmas.
         other_score: ``score`` of a patch of another date's map, unchanged; NaN without one.
         other_lead: ``lead`` of the same.
     """
@@ -72,9 +72,9 @@ class SelfMatchStatistics:
 
 
 def measure_self_match(plan: AuditPlan) -> Iterator[SelfMatchStatistics]:
-    """Yield the statistics of each audited cell, row by row, by all cores.
+    """Yield the statistics of each audited cell, row by row, using all cores.
 
-    A large map is read on demand, and by one core.
+    A large map is read on demand, using one core.
     """
     options = plan.options.ncc
     prepared = PreparedMap(plan.site, CPU, options.enhance_radius_px, options.score)
@@ -191,7 +191,7 @@ def _sharpness(scores: Pictures, x: int, y: int) -> float:
 
 
 def _seen_on(other: OrthoMap, plan: AuditPlan, extent: Window) -> Gray | None:
-    """The same ground (h, w) on another map, or None where that does not cover it."""
+    """The same ground (h, w) on another map, or None if that does not cover it."""
     (height, width), scale = plan.shape, 2.0**plan.level
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float64)
     full = plan.site.full_from_level(corners + np.array([extent.x0, extent.y0]), plan.level)

@@ -1,4 +1,4 @@
-"""Sightings: poses that pictures show by themselves, without any telemetry."""
+"""Sightings: find the poses of pictures without any telemetry."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from engine.values import Attitude, Fix, Frame, Prior
 
 Array = NDArray[np.float64]
 
-_ENOUGH_SHARE = 0.25  # of the pictures; with fewer the search goes on
+_ENOUGH_SHARE = 0.25  # of the pictures; with fewer, the search continues
 _LEAST = 4
-_PROBED = 5  # pictures by which a change is tried
+_PROBED = 5  # pictures used to try a change
 _HEIGHT_FACTORS = (1.0, 0.88, 1.14, 0.77, 1.3)
-_MOST_S = 15.0  # that the search for height and turn may take
+_MOST_S = 15.0  # longest search for height and turn
 _TURNS_DEG = (0, 8, -8, 16, -16, 24, -24, 32, -32, 40, -40)
 
 
@@ -46,11 +46,11 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the pictures showed.
+    """The sightings of a flight's pictures.
 
     Attributes:
         sightings: in the order of the pictures.
-        mirrored: whether they were seen in mirrored pictures only.
+        mirrored: whether only mirrored pictures gave them.
     """
 
     sightings: list[Sighting]
@@ -62,7 +62,7 @@ def sight(frames: Sequence[Frame], priors: Sequence[Prior | None], site: OrthoMa
 
     Args:
         frames: a few, from all over the flight.
-        priors: where each may be; None is anywhere on the map.
+        priors: where each may be; None means anywhere on the map.
         site: the map.
         camera: the calibration.
     """
@@ -105,13 +105,13 @@ def _by_features(matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequenc
 def _by_correlation(
     matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]
 ) -> list[Sighting]:
-    """By the height and the turn with which most of a few pictures are found, refined to a whole pose."""
+    """Use the height and turn at which most of a few pictures match, then refine to whole poses."""
     if not matcher.site.has_surface:  # refinement needs one
         return []
     usable = [
         k for k, frame in enumerate(frames) if frame.height_agl_m is not None and frame.heading_deg is not None
     ]
-    usable = [k for k in usable if priors[k] is not None]  # of the whole map each would be a search of its own
+    usable = [k for k in usable if priors[k] is not None]  # each would search the whole map
     probed = usable[:: max(1, len(usable) // _PROBED)][:_PROBED]
     best: tuple[int, float, float] = (0, 1.0, 0.0)
     until_s = time.monotonic() + _MOST_S
@@ -146,7 +146,7 @@ def _changed(frame: Frame, height_factor: float, turn_deg: float) -> Frame:
 
 
 def _sighting(index: int, fix: Fix, site: OrthoMap) -> Sighting | None:
-    """Of a fix that measured its whole pose."""
+    """The sighting of a fix that measured its whole pose."""
     if fix.attitude is None or fix.up_m is None:
         return None
     height_m = fix.up_m - site.ground_at(np.array(fix.map_xy_px))

@@ -10,7 +10,7 @@ __all__ = ["main"]
 
 def main() -> None:
     """Entry point of ``scenematch``: exit 0 done, 1 a run that could not be finished, 2 wrong usage."""
-    # Decoders inside OpenCV write to standard error on their own; what is wrong is said in our one line.
+    # Decoders inside OpenCV write to standard error themselves; our own line reports the error.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from scenematch.cli.app import run

@@ -1,4 +1,4 @@
-"""The typer application: its commands by name, and how their errors end."""
+"""The typer application: its commands by name, and how errors are reported."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ app = typer.Typer(
     help="Position fixes for a drone without GNSS: a downward camera matched against a georeferenced map.",
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},  # commands inherit it
+    context_settings={"help_option_names": ["-h", "--help"]},  # inherited by all commands
 )
-map_app = typer.Typer(help="A map: facts, audit, fetching.")
-bridge_app = typer.Typer(help="Live, beside an autopilot.")
+map_app = typer.Typer(help="Inspect, audit or fetch a map.")
+bridge_app = typer.Typer(help="Send live fixes to an autopilot or to ROS.")
 
 # In the order of the help.
 app.command(cls=Command)(demo.demo)
@@ -61,21 +61,21 @@ bridge_app.command("ros", cls=Command)(bridge.ros)
 app.add_typer(map_app, name="map")
 app.add_typer(bridge_app, name="bridge")
 
-# typer brings its own copy of click, or depends on click: what it raises is found by descent, not by import.
+# typer brings its own copy of click, or depends on click: its errors are found by class, not by import.
 _UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
 INTERRUPTED = 130
 
 
 @cache
 def command() -> Any:
-    """All commands as one, built once a process: reading their signatures takes a tenth of a second."""
+    """All commands as one, built once per process: reading their signatures takes a tenth of a second."""
     return get_command(app)
 
 
 def run(arguments: list[str]) -> int:
     """Run the command line and return its exit code.
 
-    What is wrong is one line on standard error and, with --json, an object on standard output as well.
+    An error is one line on standard error and, with --json, also an object on standard output.
     """
     given = arguments
     if arguments[:2] == ["bridge", "ros"]:
@@ -100,13 +100,13 @@ def run(arguments: list[str]) -> int:
 
 
 def _usage(error: Any) -> str:
-    """What was wrong with the command line, and where help is."""
+    """What was wrong with the command line, and where to find help."""
     where = error.ctx.command_path if error.ctx is not None else "scenematch"
     return f"{error.format_message().rstrip('.')} (see {where} --help)"
 
 
 def _usage_argument(error: Any) -> str | None:
-    """The argument that is wrong, missing or unknown; None where it is something else."""
+    """The argument that is wrong, missing or unknown; None if something else is wrong."""
     parameter = getattr(error, "param", None)
     return getattr(error, "option_name", None) if parameter is None else typed_name(parameter)
 

@@ -1,4 +1,4 @@
-"""Arguments as they were typed: what a run says of ``start``, the user reads of ``--start``."""
+"""Arguments as the user typed them: an error about ``start`` is shown as one about ``--start``."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _MADE_OF: Mapping[str, Sequence[str]] = MappingProxyType(
         "--correct": ("columns", "angles", "heading_offset_deg", "height_offset_m", "offset_s"),
     }
 )
-"""Arguments that one option gives, by that option."""
+"""Arguments that one option sets together, by that option."""
 
 
 class Command(TyperCommand):
-    """A command whose parameters have the names of the arguments that it passes on, or an option like them."""
+    """A command whose parameters are named after the arguments that it passes on, or have an option named so."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the options into the help, a section for each panel; rich draws none, for it takes a while."""
+        """Write the options into the help, one section per panel; rich is not used because it is slow to load."""
         panels: dict[str, list[Any]] = {}
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
@@ -65,19 +65,19 @@ def _names(parameter: Any) -> dict[str, str]:
 
 
 def name_settings(table: str, names: Iterable[str]) -> None:
-    """Let errors name what a table of the settings gives as ``--settings`` sets it; options count more."""
+    """Let errors name the settings of a table as ``--settings`` sets them; options take precedence."""
     typed = {name: f"--settings {table}.{name}" for name in names}
     _typed.set(typed | {f"{table}.{name}": text for name, text in typed.items()} | dict(_typed.get()))
 
 
 def typed_name(parameter: Any) -> str:
-    """What is typed for a parameter of a command: its long option, or the name of its place."""
+    """What the user types for a parameter: its long option, or the name of the positional argument."""
     option = next((name for name in parameter.opts if name.startswith("--")), None)
     return option or str(parameter.metavar or parameter.name.upper())
 
 
 def ros_arguments_last(arguments: list[str]) -> list[str]:
-    """The arguments of `bridge ros`, those of ROS last: NAME:=VALUE, and from `--ros-args` to a `--`."""
+    """The arguments of `bridge ros` with those for ROS last: NAME:=VALUE, and from `--ros-args` to a `--`."""
     own, others, in_ros = [], [], False
     for argument in arguments:
         if argument == "--ros-args":
@@ -91,14 +91,14 @@ def ros_arguments_last(arguments: list[str]) -> list[str]:
 
 
 def as_typed(text: str) -> str:
-    """A text for a person with its arguments in backquotes as they were typed."""
+    """A text for a person, with the arguments in backquotes shown as they were typed."""
     return rename_quoted(text, _typed.get(), quote="")
 
 
 def error_as_typed(error: EngineError) -> str:
     """The message of an error with its arguments as they were typed.
 
-    What is wrong within a map or a calibration stays a matter of the file.
+    An error inside a map or a calibration still names the file.
     """
     if isinstance(error, MapError | CalibrationError):
         return as_typed(str(error))
@@ -109,10 +109,10 @@ def argument_of(text: str) -> str | None:
     """The argument that an error is about, as it was typed: by its name, or by the file or folder that it holds.
 
     Args:
-        text: message of the error; what stands before its first colon and space is the subject.
+        text: message of the error; the part before its first colon and space is the subject.
 
     Returns:
-        The option or the name of the place, several of them joined by ", "; None where no argument is at fault.
+        The option or positional argument, several joined by ", "; None if no argument is at fault.
     """
     subject, names = text.partition(": ")[0], _typed.get()
     parts = [names.get(part, part) for part in subject.split(", ")]
@@ -123,7 +123,7 @@ def argument_of(text: str) -> str | None:
 
 
 def urls_as_typed(text: str, arguments: Sequence[str]) -> str:
-    """A text with the URLs among the arguments as they were typed; a path has one slash where they have two."""
+    """A text with URLs shown as they were typed; paths had turned their two slashes into one."""
     for argument in arguments:
         url = argument.partition("=")[2] if argument.startswith("--") else argument
         if "://" in url and str(Path(url)) != url:

@@ -1,6 +1,6 @@
-"""How results look: tables for people on a terminal, JSON for programs. Everything but results goes to stderr.
+"""Print results: tables for people on a terminal, JSON for programs. Everything but results goes to stderr.
 
-rich is imported by what draws with it: neither help nor a pipe of JSON does.
+rich is imported only to draw with it: help and piped JSON do not need it.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _DRAWN_EVERY_S = 0.1
-_PIPE_WIDTH = 500  # where nobody looks at a terminal, nothing is folded
+_PIPE_WIDTH = 500  # without a terminal nothing is folded
 
 
 def say(text: str) -> None:
-    """One line for a person, on standard error; never folded."""
-    line = " ".join(part.strip() for part in text.splitlines())  # spaces stay: they may be those of a path
+    """Print one line for a person on standard error, never folded."""
+    line = " ".join(part.strip() for part in text.splitlines())  # inner spaces stay: a path may have them
     print(line.strip(), file=sys.stderr, flush=True)
 
 
 def next_step(command: str, *, as_json: bool = False, hint: str = "") -> None:
-    """What a person may do next: one command, on standard error, and never where a program reads.
+    """Suggest the next command to a person, on standard error; never to a program.
 
     Args:
-        command: without the program's name; what the user has yet to choose is in capitals.
+        command: without the program's name; what the user must still choose is in capitals.
         as_json: whether the results went to a program.
-        hint: what is to be done before it, such as a file to open.
+        hint: what to do before it, such as a file to open.
     """
     if not as_json:
         say(f"next: {f'{hint}; ' if hint else ''}scenematch {command}")
 
 
 def quoted(value: object) -> str:
-    """A value as a shell takes it for one word."""
+    """Quote a value so that a shell takes it as one word."""
     return shlex.quote(str(value))
 
 
 def options(**values: object) -> str:
-    """Options with their values as they are typed, those that are None left out: ``log_offset_s=2``."""
+    """Options with their values as the user types them, without those that are None: ``log_offset_s=2``."""
     given = ((name, value) for name, value in values.items() if value is not None)
     return " ".join(f"--{name.replace('_', '-')} {quoted(value)}" for name, value in given)
 
@@ -79,7 +79,7 @@ class _ConsoleProgress(Progress):
         if bars is None:
             from rich.progress import Progress as Bars
 
-            # Without a thread that draws: beside other threads no workers are forked (engine.runtime.workers).
+            # No drawing thread: workers are not forked while other threads run (engine.runtime.workers).
             bars = self._bars[description] = Bars(console=_errors(), transient=True, auto_refresh=False)
             bars.add_task(description)
             bars.start()
@@ -95,7 +95,7 @@ class _ConsoleProgress(Progress):
 
 
 PROGRESS = _ConsoleProgress()
-"""What runs report to. A task that is never updated shows nothing, as all of them do in a pipe."""
+"""What runs report progress to. A task that is never updated shows nothing; in a pipe none does."""
 
 
 def print_json(value: Any) -> None:
@@ -119,7 +119,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]
 
 
 def print_pairs(title: str, pairs: Iterable[tuple[str, str]]) -> None:
-    """Names and values for people on standard output, one a line; a long value is folded under itself."""
+    """Print names and values for people on standard output, one per line; a long value is folded under itself."""
     from rich.table import Table
     from rich.text import Text
 
@@ -148,7 +148,7 @@ def _print(title: str, table: Table) -> None:
 
 
 def facts(values: Mapping[str, Any], as_json: bool, title: str) -> None:
-    """Names and values, one a line."""
+    """Print names and values, one per line."""
     if as_json:
         print_json(values)
     else:
@@ -158,7 +158,7 @@ def facts(values: Mapping[str, Any], as_json: bool, title: str) -> None:
 def _text(value: Any, name: str) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, float):  # of a latitude, 7 decimals are a centimetre
+    if isinstance(value, float):  # 7 decimals of a latitude are a centimetre
         return f"{value:.7f}" if name.endswith(("lat_deg", "lon_deg", "bounds_deg")) else f"{value:.6g}"
     if isinstance(value, (list, tuple)):
         return ", ".join(_text(item, name) for item in value)

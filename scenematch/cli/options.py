@@ -1,4 +1,4 @@
-"""Options that several commands share, what they name, and how they are typed again for the next command."""
+"""Options that several commands share, the objects they build, and how to print them for the next command."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ CameraOption = Annotated[
     typer.Option(
         "--camera",
         metavar="FILE",
-        help="Calibration file; else a bag's or a topic's own, or EXIF.",
+        help="Calibration file (default: from the bag, the topic or EXIF).",
         rich_help_panel=INPUT,
     ),
 ]
@@ -55,7 +55,7 @@ HfovOption = Annotated[
     typer.Option(
         "--hfov-deg",
         metavar="DEG",
-        help="Horizontal field of view, without --camera.",
+        help="Horizontal field of view, instead of --camera.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -64,7 +64,7 @@ MountOption = Annotated[
     typer.Option(
         "--mount",
         metavar="NAME",
-        help="nadir, nadir-right, nadir-tail, nadir-left (where the top of the picture points), forward-45.",
+        help="nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -73,7 +73,7 @@ TelemetryOption = Annotated[
     typer.Option(
         "--telemetry",
         metavar="FILE",
-        help="telemetry.csv, or a log: .BIN, .ulg, .SRT, bag; else a video's .SRT, or EXIF.",
+        help="telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the video's .SRT, or EXIF).",
         rich_help_panel=INPUT,
     ),
 ]
@@ -82,7 +82,7 @@ TruthOption = Annotated[
     typer.Option(
         "--truth",
         metavar="FILE",
-        help="truth.csv, a log or photographs; else the one beside the telemetry.",
+        help="truth.csv, a log or photographs (default: truth.csv beside the telemetry).",
         rich_help_panel=INPUT,
     ),
 ]
@@ -91,7 +91,7 @@ CorrectOption = Annotated[
     typer.Option(
         "--correct",
         metavar="NAME=VALUE",
-        help="Correct the telemetry as check says: heading_offset_deg=3, roll_deg=-pitch_deg; repeated.",
+        help="Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -100,20 +100,20 @@ StartOption = Annotated[
     typer.Option(
         "--start",
         metavar="LAT,LON[,SIGMA_M]",
-        help="Where the flight begins; else the telemetry's first position, or anywhere on the map.",
+        help="Where the flight begins (default: the telemetry's first position, or anywhere on the map).",
         rich_help_panel=INPUT,
     ),
 ]
 MethodOption = Annotated[
     str | None,
-    typer.Option("--method", metavar="auto|ncc|sift|learned", help="auto: ncc, and sift where ncc refuses."),
+    typer.Option("--method", metavar="auto|ncc|sift|learned", help="auto: ncc, then sift if ncc refuses."),
 ]
 DeviceOption = Annotated[
     str | None,
     typer.Option(
         "--device",
         metavar="auto|cpu|cuda",
-        help="Where tensors live; auto unless given.",
+        help="Device to compute on (default: auto).",
         rich_help_panel=EXPERT,
     ),
 ]
@@ -122,15 +122,15 @@ SettingsOption = Annotated[
     typer.Option(
         "--settings",
         metavar="FILE|NAME=VALUE",
-        help="Settings as `doctor --settings` lists them; repeated.",
+        help="Settings as `doctor --settings` lists them; repeatable.",
         rich_help_panel=EXPERT,
     ),
 ]
 OutOption = Annotated[
     Path,
-    typer.Option("--out", metavar="DIR", help="Output folder, created by this run.", rich_help_panel=OUTPUT),
+    typer.Option("--out", metavar="DIR", help="Output folder to create.", rich_help_panel=OUTPUT),
 ]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace results that exist.", rich_help_panel=OUTPUT)]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing results.", rich_help_panel=OUTPUT)]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Results as JSON on standard output.", rich_help_panel=OUTPUT)
 ]
@@ -139,7 +139,7 @@ RerunOption = Annotated[
     typer.Option(
         "--rerun",
         metavar="FILE.rrd|HOST:PORT",
-        help="Record the live view, or show it in a viewer of rerun that listens; both if repeated.",
+        help="Record the live view to a file, or show it in a running rerun viewer; repeat for both.",
         rich_help_panel=OUTPUT,
     ),
 ]
@@ -153,7 +153,7 @@ class MapOptions:
     surface: SurfaceOption = None
 
     def map_input(self, settings: Settings) -> MapInput:
-        """The map with what the settings say of it."""
+        """The map combined with its settings."""
         from scenematch.runs.map_input import MapInput
 
         rest = table(settings, "input").of(MapInput)
@@ -169,7 +169,7 @@ class CameraOptions:
     mount: MountOption = None
 
     def camera_input(self, settings: Settings) -> CameraInput:
-        """The camera with what the settings say of it."""
+        """The camera combined with its settings."""
         from scenematch.runs.cameras import CameraInput
 
         rest = table(settings, "input").of(CameraInput)
@@ -185,7 +185,7 @@ class FlightOptions(CameraOptions, MapOptions):
     truth: TruthOption = None
 
     def files(self, settings: Settings, correct: Sequence[str] | None = None) -> FlightFiles:
-        """The files with what the settings say of them."""
+        """The files combined with their settings."""
         from scenematch.files.corrections import Corrections
         from scenematch.runs.inputs import FlightFiles
 
@@ -201,7 +201,7 @@ class FlightOptions(CameraOptions, MapOptions):
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose parameters of the types above are replaced by their fields, one option each."""
+    """Replace a command's parameters of the types above by their fields, one option each."""
     hints = get_type_hints(command, include_extras=True)
     groups: dict[str, type[Any]] = {
         name: kind for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)
@@ -231,7 +231,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def read_settings(texts: Sequence[str] | None) -> Settings:
-    """The settings that were given, with their threads of torch and OpenCV in use."""
+    """Read the given settings, and apply their number of threads to torch and OpenCV."""
     from scenematch.runs.settings import Settings
 
     name_settings("learned", ["weights"])
@@ -241,14 +241,14 @@ def read_settings(texts: Sequence[str] | None) -> Settings:
 
 
 def use_threads(count: int = 1) -> None:
-    """Threads of torch and OpenCV."""
+    """Set the number of threads of torch and OpenCV."""
     from engine.runtime.threads import set_threads
 
     set_threads(count)
 
 
 def table(settings: Settings, name: str, **given: Any) -> Any:
-    """A table of the settings; an error of one of its settings names it so."""
+    """A table of the settings; an error in one of them names it as ``--settings`` does."""
     from importlib import import_module
 
     from scenematch.runs.settings import TABLES
@@ -263,7 +263,7 @@ def live_view(rerun: Sequence[str] | None) -> LiveViewTarget:
     """Where the live view goes: into a file, to a viewer, or both.
 
     Raises:
-        OptionError: there are two files, or two viewers.
+        OptionError: more than one file or viewer was given.
     """
     from engine.errors import OptionError
     from scenematch.runs.live_viewing import LiveViewTarget
@@ -278,7 +278,7 @@ def live_view(rerun: Sequence[str] | None) -> LiveViewTarget:
 
 
 def flight_options(files: FlightFiles, *, settings: Sequence[str] | None = None, start: str | None = None) -> str:
-    """The files of a flight with all that was given of them, as options of `check` and `track` are typed."""
+    """The files of a flight with their settings, typed as options of `check` and `track`."""
     from scenematch.runs.settings import InputSettings
 
     values = files.flat()
@@ -296,7 +296,7 @@ def flight_options(files: FlightFiles, *, settings: Sequence[str] | None = None,
 def after_track(
     files: FlightFiles, out: Path, fixes: int, *, settings: Sequence[str] | None = None, start: str | None = None
 ) -> str:
-    """What comes after a track: its export, or if it has no fix, what shows why."""
+    """The next command after a track: its export, or if it has no fix, a check."""
     if fixes:
         return f"export {console.quoted(out)} --format geojson"
     return f"check {flight_options(files, settings=settings, start=start)}"

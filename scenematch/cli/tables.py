@@ -1,4 +1,4 @@
-"""How the results of runs look as tables for people."""
+"""Print the results of runs as tables for people."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from scenematch.runs.map_audit import MapAudit
 
 COLUMNS = ("RMS m", "p50 ms", "p95 ms", "fixed", "false", "NEES", "up m")
-"""Of a table of runs, beside their names."""
+"""Columns of a table of runs, after the name."""
 _SUMMARY = (
     ("frames", "frames", "{}"),
     ("fixes", "fixes", "{}"),
@@ -28,14 +28,14 @@ _SUMMARY = (
 
 
 def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Path) -> None:
-    """The figures of a track, and where its files are."""
+    """Print the figures of a track, and where its files are."""
     if as_json:
         console.print_json(summary)
         return
-    hidden = {"false_fixes"} if summary.get("scored_fixes") == 0 else set()  # 0 of nothing reads as a result
+    hidden = {"false_fixes"} if summary.get("scored_fixes") == 0 else set()  # 0 of 0 would read as a result
     shown_rows = [row for row in _SUMMARY if row[1] not in hidden]
     known = [(name, form, summary[key]) for name, key, form in shown_rows if summary.get(key) is not None]
-    # A wild value keeps to its column.
+    # An extreme value must fit its column.
     pairs = [(name, form.replace(".2f", ".1e" if abs(v) >= 1e5 else ".2f").format(v)) for name, form, v in known]
     if summary.get("rms_m") is None:
         pairs += _stated(summary)
@@ -52,7 +52,7 @@ def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Pa
 
 
 def _stated(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What a track without truth says of itself, which is no measurement of its accuracy."""
+    """What a track says about itself without truth; this does not measure its accuracy."""
     pairs, motion = [], summary.get("motion_consistency")
     if summary.get("stated_sigma_median_m") is not None:
         median_m, p95_m = summary["stated_sigma_median_m"], summary["stated_sigma_p95_m"]
@@ -64,7 +64,7 @@ def _stated(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def print_comparison(results: Mapping[str, Mapping[str, Any]], title: str) -> None:
-    """The table, a run a row."""
+    """The table, one row per run."""
     rows = [(name, *_cells(summary)) for name, summary in results.items()]
     console.print_table(title, ("run", *COLUMNS), rows)
 
@@ -83,7 +83,7 @@ def print_paper_table(results: Mapping[str, Mapping[str, Any]], seed: int) -> No
 
 
 def _cells(summary: Mapping[str, Any]) -> tuple[str, ...]:
-    """The figures of :data:`COLUMNS`; what is unknown is a dash."""
+    """The figures of :data:`COLUMNS`; a dash if unknown."""
     latency = summary["latency_ms"]
 
     def shown(value: float | None, form: str) -> str:
@@ -101,7 +101,7 @@ def _cells(summary: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def print_audit(result: MapAudit, title: str) -> None:
-    """What an audit found, and the poor stretches of its route."""
+    """Print what an audit found, and the poor stretches of its route."""
     audit, route = result.audit, result.route
     plan = audit.plan
     footprint = " x ".join(f"{n * 2.0**plan.level * plan.site.gsd_m_per_px:.0f}" for n in plan.view.footprint_px)

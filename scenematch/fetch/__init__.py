@@ -1,1 +1,1 @@
-"""Maps fetched from servers that the user names, by GDAL: tiles, WMS and WMTS, and heights by files."""
+"""Fetch maps by GDAL from servers that the user names: tiles, WMS and WMTS, and files of heights."""

@@ -1,4 +1,4 @@
-"""Coordinate systems that services offer: their codes, and which one suits a place."""
+"""Coordinate systems of services: parse their codes, and choose one for a place."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _DEGREES = ("CRS:84", "OGC:CRS84", "EPSG:4326")
 
 
 def chosen_name(argument: str, asked: str | None, offered: Sequence[str], what: str) -> str:
-    """A name among those that a service offers: the one that was asked for, else the only one.
+    """Choose a name that a service offers: the requested one, else the only one.
 
     Raises:
-        OptionError: it is not offered, or none was asked for and several are.
+        OptionError: it is not offered, or several are and none was requested.
     """
     if asked is None and len(offered) == 1:
         return offered[0]
@@ -30,7 +30,7 @@ def chosen_name(argument: str, asked: str | None, offered: Sequence[str], what: 
 
 
 def code_of(name: str) -> str:
-    """EPSG:N of the ways in which services write it; others as they are."""
+    """EPSG:N from any spelling that services use; other codes unchanged."""
     parts = name.strip().split(":")
     if parts[0].lower() == "urn" and len(parts) >= 4:  # urn:ogc:def:crs:EPSG:6.18:3857, or with the version empty
         authority = parts[4]
@@ -67,7 +67,7 @@ def is_known(code: str) -> bool:
 
 
 def _reaches(code: str, place: Place) -> bool:
-    """Whether a coordinate system is one for a place, by the area that its authority states."""
+    """Whether a coordinate system covers a place, by the area that its authority states."""
     if not is_known(code):
         return False
     area = crs_of(code).area_of_use
@@ -80,13 +80,13 @@ def _reaches(code: str, place: Place) -> bool:
 
 
 def chosen_crs(asked: str | None, offered: Sequence[str], place: Place) -> str:
-    """The code of a coordinate system that is offered: the one asked for, else one in metres at the place.
+    """Choose an offered coordinate system: the requested one, else one in metres at the place.
 
-    The UTM zone comes first, then Web Mercator, then any other but degrees; only what PROJ knows, and what is made
-    for that part of the Earth.
+    Prefers the UTM zone, then Web Mercator, then any other except degrees; only those that PROJ knows and that
+    cover that part of the Earth.
 
     Raises:
-        OptionError: the one that was asked for is not offered, or none is that will do.
+        OptionError: the requested one is not offered, or none is suitable.
     """
     codes = [code_of(name) for name in offered]
     if asked is not None or not codes:
@@ -101,6 +101,6 @@ def chosen_crs(asked: str | None, offered: Sequence[str], place: Place) -> str:
         listed = ", ".join(codes[:20]) + (f" and {len(codes) - 20} more" if len(codes) > 20 else "")
         raise OptionError(
             f"crs: expected one for {place.lat_deg:g},{place.lon_deg:g} that PROJ knows, got {listed}; "
-            "one of them is used where it is asked for"
+            "name one of them to use it"
         )
     return chosen

@@ -1,4 +1,4 @@
-"""What is read of a map server: a raster that GDAL opens, and the part of it that becomes the map."""
+"""What to read from a map server: a raster that GDAL opens, and the part that becomes the map."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 FINE_ENOUGH = 1.02
-"""Levels of tiles are so seldom as fine as asked that this much coarser counts as such."""
+"""Tile levels rarely have the requested resolution; one coarser by this factor still counts as fine enough."""
 TILE_PX = 256
 
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """How a server is asked.
+    """How to send requests to a server.
 
     Attributes:
         timeout_s: of a request.
-        cache: folder of what was fetched.
+        cache: folder of fetched data.
     """
 
     timeout_s: float
     cache: Path
 
     def elements(self) -> dict[str, Any]:
-        """What GDAL's descriptions of services have in common."""
+        """Elements common to GDAL's descriptions of services."""
         return {
             "BandsCount": 4,
             "ZeroBlockHttpCodes": "204,404,410",
@@ -53,15 +53,15 @@ class Grid:
         kind: "XYZ", "WMS" or "WMTS".
         level: the zoom level; of a WMS or WMTS the coordinate system.
         source: what GDAL opens.
-        overview: of the source's levels, None the finest.
+        overview: index of the source's overview; None is the finest level.
         offset_px: column and row of the map in it.
         size_px: width and height of the map.
-        tile_px: width and height of what is asked for at a time.
+        tile_px: width and height of one request.
         corner: x and y of the north-western corner of the map.
         step: size of a pixel in x and y.
         crs: of the map.
         gsd_m_per_px: on the ground, in the middle.
-        states: what the server says of itself, by name.
+        states: the server's statements about itself, by name.
     """
 
     kind: str
@@ -79,7 +79,7 @@ class Grid:
 
     @property
     def tiles(self) -> int:
-        """How many pictures are asked for, of a WMTS about."""
+        """Number of pictures to request; approximate for a WMTS."""
         (width, height), (across, down) = self.size_px, self.tile_px
         return math.ceil(width / across) * math.ceil(height / down)
 
@@ -133,7 +133,7 @@ def part_of(
 
 
 def reason_of(error: BaseException) -> str:
-    """What GDAL says was wrong, in one line: rasterio hides it behind a cause of causes."""
+    """GDAL's error in one line: rasterio hides it in a chain of causes."""
     texts = [" ".join(str(error).split())]
     while error.__cause__ is not None:
         error = error.__cause__

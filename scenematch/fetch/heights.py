@@ -1,7 +1,7 @@
-"""Surface models fetched for a map: the part under it of a file, or of files by degrees as Copernicus GLO-30 has.
+"""Fetch surface models for a map: cut them from one file, or from one-degree files like Copernicus GLO-30's.
 
-The heights are copied in their own grid, not resampled: the engine reads a surface in any grid. Of remote files,
-cloud-optimised GeoTIFFs, only the part is read, by ranges of bytes.
+Heights are copied in their own grid without resampling, since the engine reads any grid. From remote files
+(cloud-optimised GeoTIFFs) only the needed byte ranges are read.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 NODATA = -32768.0
 GLO30, GLO30_DATUM = "Copernicus_DSM", "EPSG:3855"
-"""Part of the names of Copernicus' files, whose heights are above the geoid EGM2008."""
+"""Part of the names of Copernicus' files; their heights are above the geoid EGM2008."""
 GLO30_SLOPE_SIGMA_DEG = 0.5
 """Two heights of GLO-30 differ by less than 2 m from the truth in 90 % (its specification): 1.2 m over 150 m."""
 _MARGIN_PX = 2
@@ -45,8 +45,8 @@ class Heights:
         heights_m: (H, W) float32, NaN where unknown.
         corner: x and y of the north-western corner.
         step: size of a pixel in x and y.
-        crs: compound where the vertical datum is known.
-        datum: name of the vertical datum; None where it is unknown.
+        crs: compound if the vertical datum is known.
+        datum: name of the vertical datum; None if it is unknown.
     """
 
     heights_m: NDArray[np.float32]
@@ -57,15 +57,15 @@ class Heights:
 
 
 def files_for(template: str, bounds_deg: Bounds) -> list[str]:
-    """The files or addresses that a source of heights has for an area.
+    """The files or URLs of a source of heights for an area.
 
     Args:
-        template: one file or URL, or many with ``{lat}`` and ``{lon}`` in place of the degrees of their
-            south-western corner, as N48 and E016.
+        template: one file or URL, or many, with ``{lat}`` and ``{lon}`` for the degrees of their south-western
+            corner, such as N48 and E016.
         bounds_deg: west, south, east, north.
 
     Raises:
-        OptionError: a placeholder is unknown or missing, or the URL is none.
+        OptionError: a placeholder is unknown or missing, or the URL is invalid.
     """
     names = set(PLACEHOLDER.findall(template))
     stray = set("{}") & set(PLACEHOLDER.sub("", template))
@@ -93,14 +93,14 @@ def read_part(
     """Heights under a map.
 
     Args:
-        files: local ones, or URLs; of several those that are not there are gaps, such as the sea.
+        files: local files or URLs; if there are several, missing ones are gaps such as the sea.
         map_bounds: of the map, in its CRS.
         map_crs: its CRS.
-        datum: code of the vertical datum; None is the files' own, else EGM2008 for those named as GLO-30's.
+        datum: code of the vertical datum; None uses the files' own, else EGM2008 for names like GLO-30's.
         timeout_s: of a server, without a byte.
 
     Raises:
-        OptionError: the datum is no vertical one in metres, or contradicts that of the files.
+        OptionError: the datum is not vertical in metres, or contradicts the files'.
         MapError: no file has heights there, or one cannot be read.
     """
     import rasterio
@@ -110,7 +110,7 @@ def read_part(
         "GDAL_HTTP_MAX_RETRY": 3,
         "GDAL_HTTP_RETRY_DELAY": 2,
         "GDAL_HTTP_CONNECTTIMEOUT": math.ceil(timeout_s),
-        "GDAL_HTTP_LOW_SPEED_TIME": math.ceil(timeout_s),  # without a byte; the whole may take longer
+        "GDAL_HTTP_LOW_SPEED_TIME": math.ceil(timeout_s),  # without a byte; the whole transfer may take longer
         "GDAL_HTTP_LOW_SPEED_LIMIT": 1,
         "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",  # no requests for side files
     }
@@ -125,7 +125,7 @@ def read_part(
 
 
 def _opened(file: str) -> Any:
-    """The dataset of a file of heights; None where it is not there."""
+    """Open a file of heights; None if it does not exist."""
     import rasterio
     from rasterio.errors import RasterioError
 
@@ -142,7 +142,7 @@ def _opened(file: str) -> Any:
         reason = reason_of(error)
     if reason.endswith(("HTTP response code: 404", "HTTP response code: 410")):
         return None
-    raise MapError(f"{shown(file)}: cannot be read as a GeoTIFF by ranges of bytes: {shown(reason)}")
+    raise MapError(f"{shown(file)}: cannot be read as a GeoTIFF in byte ranges: {shown(reason)}")
 
 
 def _joined(datasets: Mapping[str, Any], map_bounds: Bounds, map_crs: CRS, datum: str | None) -> Heights:
@@ -212,10 +212,10 @@ def _compound(horizontal: CRS, vertical: CRS) -> CRS:
 
 
 def _vertical(name: str, own: str | None, datum: str | None) -> CRS | None:
-    """The vertical CRS to state of a file that states none.
+    """The vertical CRS for a file that states none.
 
     Raises:
-        OptionError: the datum is no vertical one in metres, or the file states its own.
+        OptionError: the datum is not vertical in metres, or the file states its own.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -239,7 +239,7 @@ def write_heights(heights: Heights, out: Path, tags: Mapping[str, object]) -> No
     """Write a tiled, losslessly compressed GeoTIFF of heights.
 
     Args:
-        heights: they.
+        heights: the heights.
         out: the file, replaced in one step.
         tags: metadata items.
 

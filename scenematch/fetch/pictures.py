@@ -1,4 +1,4 @@
-"""Pictures of a server into one GeoTIFF, one request at a time; what was fetched is kept until it is complete."""
+"""Download a server's pictures into one GeoTIFF, one request at a time; keep them until it is complete."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from scenematch.fetch.grid import Grid, reason_of
 from scenematch.fetch.urls import shown
 
 ATTEMPTS = 5
-"""How often a picture is asked for before the fetch ends."""
+"""Attempts per picture before the fetch fails."""
 FIRST_WAIT_S = 2.0
-"""Before the second attempt; doubled for each further one."""
+"""Pause before the second attempt; doubled for each further one."""
 _OPAQUE = 128
-"""Alpha from which a pixel is valid, as where maps are read."""
+"""Least alpha of a valid pixel, as when maps are read."""
 _BLOCK_PX = 256
-_CACHED = re.compile(r"[0-9a-f]{32}")  # names that GDAL gives to what it keeps
+_CACHED = re.compile(r"[0-9a-f]{32}")  # names of GDAL's cached files
 _STATUS = re.compile(r"HTTP status code: (\d+), error: (.*?)\.?(?: Add the HTTP|$)")
 _BUSY = re.compile(r"HTTP status code: (429|5\d\d)|timed? ?out|reset by peer|Empty reply", re.IGNORECASE)
 
@@ -41,16 +41,16 @@ def fetch_pictures(
     """Write a tiled, losslessly compressed GeoTIFF with a mask of where the server has pictures.
 
     Args:
-        grid: what is wanted.
+        grid: the raster to fetch.
         out: the file, replaced in one step.
         tags: metadata items.
         url: of the server, for messages.
-        cached: how many pictures an earlier fetch has left, which are read without a pause.
+        cached: number of pictures left by an earlier fetch, which are read without a pause.
         pause_s: between two requests.
-        say: takes one line for a person, when a server has to be waited for.
+        say: receives one line for a person while waiting for a server.
 
     Yields:
-        For each picture how many of its pixels have data.
+        For each picture, its number of pixels with data.
 
     Raises:
         MapError: the server refuses or sends something else, or the file cannot be written.
@@ -78,10 +78,10 @@ def fetch_pictures(
 def _copied(
     source: Any, file: Any, grid: Grid, pause_s: Callable[[int], float], url: str, say: Callable[[str], None]
 ) -> Iterator[int]:
-    """Copy picture by picture; how many pixels of each have data.
+    """Copy picture by picture; yields each one's number of pixels with data.
 
     Raises:
-        MapError: none has.
+        MapError: none has data.
     """
     from rasterio.windows import Window
 
@@ -104,7 +104,7 @@ def _copied(
 
 
 def _read(source: Any, window: Any, url: str, say: Callable[[str], None]) -> NDArray[np.uint8]:
-    """(4, h, w) red, green, blue and alpha; a server that is busy is asked again."""
+    """(4, h, w) red, green, blue and alpha; a busy server is asked again."""
     from rasterio.errors import RasterioError
 
     for attempt in range(ATTEMPTS):
@@ -121,7 +121,7 @@ def _read(source: Any, window: Any, url: str, say: Callable[[str], None]) -> NDA
 
 
 def _told(reason: str) -> str:
-    """What GDAL says was wrong, for a person."""
+    """GDAL's error, for a person."""
     status = _STATUS.search(reason)
     if status is None:
         if "not recognized" in reason:
@@ -130,7 +130,7 @@ def _told(reason: str) -> str:
     code, text = status.groups()
     if code == "0":
         return shown(text)
-    more = ": it does not let you in (a key that is missing or wrong, or terms that forbid this)"
+    more = ": access denied (the key is missing or wrong, or its terms forbid this)"
     return f"the server answers {code}{more if code in ('401', '403') else ''}"
 
 
@@ -148,12 +148,12 @@ def _profile(grid: Grid) -> dict[str, Any]:
 
 
 def kept_pictures(folder: Path) -> list[Path]:
-    """What an earlier fetch has left in a folder."""
+    """Files that an earlier fetch left in a folder."""
     return [file for file in folder.rglob("*") if file.is_file() and _CACHED.fullmatch(file.name)]
 
 
 def remove_pictures(folder: Path, *, all_of_them: bool) -> None:
-    """Remove what was kept in a folder if wanted, and the folders that are empty."""
+    """Remove the cached files if requested, and empty folders."""
     for file in kept_pictures(folder) if all_of_them else ():
         file.unlink()
     for inner in sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True):

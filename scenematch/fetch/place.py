@@ -1,4 +1,4 @@
-"""The place that a map is wanted of, in the coordinate system of a server."""
+"""The place to map, in a server's coordinate system."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Place:
         """The edges of the square in a CRS.
 
         Raises:
-            OptionError: the CRS does not reach there, or the square crosses its edge.
+            OptionError: the CRS does not cover it, or the square crosses its edge.
         """
         from pyproj import CRS, Transformer
 
@@ -40,7 +40,7 @@ class Place:
         half = self.radius_m
         to_degrees = Transformer.from_crs(plane, 4326, always_xy=True)
         west, _, east, _ = to_degrees.transform_bounds(-half, -half, half, half)
-        if not west < east < west + 180.0:  # in metres, its edges would be those of the whole Earth
+        if not west < east < west + 180.0:  # in metres, it would span the whole Earth
             raise OptionError(
                 f"around: expected a square that does not cross 180 degrees east, got {self.lat_deg:g},"
                 f"{self.lon_deg:g} with `radius_m` {half:g}"
@@ -67,22 +67,22 @@ class Place:
         return found[0], found[1]
 
     def gsd_m_per_px(self, step: tuple[float, float], crs: CRS) -> float:
-        """Metres on the ground per pixel, the mean of both axes, of pixels of so many units of the CRS."""
+        """Metres on the ground per pixel, averaged over both axes, for a pixel size in units of the CRS."""
         metres = self.metres_per_unit(crs)
         return math.sqrt(step[0] * metres[0] * step[1] * metres[1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
-    """What the user wants of a server.
+    """What the user requests from a server.
 
     Attributes:
         place: where.
-        gsd_m_per_px: as coarse as the map may be; of a WMS its pixels.
-        max_tiles: as many pieces as may be asked for.
-        layer: of a service; None is the only one that there is.
-        crs: of a service; None is one that it offers, in metres where it can be.
-        image_format: of a service; None is PNG where it can be.
+        gsd_m_per_px: coarsest acceptable resolution; for a WMS the exact one.
+        max_tiles: largest number of requests.
+        layer: of a service; None is its only one.
+        crs: of a service; None is one that it offers, in metres if possible.
+        image_format: of a service; None is PNG if possible.
     """
 
     place: Place

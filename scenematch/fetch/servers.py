@@ -1,7 +1,7 @@
 """Map servers as rasters that GDAL opens: tiles by a template, WMS and WMTS, on the grid that suits a place.
 
-GDAL asks for the pictures. What is asked here is which layer, coordinate system and level: of a service by the
-capabilities in which it describes itself.
+GDAL requests the pictures. This module chooses layer, coordinate system and level, from the service's
+capabilities.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from scenematch.fetch.xyz import is_template, plan_xyz
 
 
 def plan(url: str, wanted: Wanted, tile_px: int, access: Access) -> Grid:
-    """What is to be asked for; a service is asked for its capabilities first.
+    """Plan the requests; a service is first asked for its capabilities.
 
     Raises:
-        OptionError: the address or what was asked for cannot be, or there are more pieces than allowed.
-        MapError: the server refuses, or describes itself as no service that is read.
+        OptionError: the address or the request is invalid, or there are more pieces than allowed.
+        MapError: the server refuses, or is not a supported service.
     """
     if is_template(url):
         grid = plan_xyz(url, wanted, tile_px, access)

@@ -14,9 +14,9 @@ from scenematch.fetch.crs import chosen_name
 from scenematch.fetch.urls import shown, user_agent
 
 FORMATS = ("image/png", "image/jpeg", "image/webp")
-"""Of pictures that are read, the first that is offered is asked for: PNG loses nothing and can be transparent."""
+"""Supported formats, best first: PNG is lossless and can be transparent."""
 OWN_WORDS = ("service", "request", "version", "layer", "layers", "format", "styles", "crs", "srs")
-"""Parameters of addresses that are set here; others, such as a key, are the user's."""
+"""URL parameters set here; others, such as a key, are the user's."""
 _ROOTS = ("WMS_Capabilities", "WMT_MS_Capabilities", "Capabilities")  # of WMS 1.3.0, 1.1.1, and WMTS
 _STATED = ("Title", "Fees", "AccessConstraints")
 
@@ -25,7 +25,7 @@ def capabilities(url: str, timeout_s: float) -> Xml.Element:
     """The document in which a service describes itself.
 
     Raises:
-        MapError: there is none, or it is of no service that is read.
+        MapError: there is none, or the service is not supported.
     """
     asked = url
     if not url.partition("?")[0].lower().endswith(".xml"):
@@ -38,7 +38,7 @@ def capabilities(url: str, timeout_s: float) -> Xml.Element:
         with error:
             raise MapError(f"{shown(asked)}: the server answers {error.code} {error.reason}") from None
     except (URLError, OSError, HTTPException, ValueError) as error:
-        raise MapError(f"{shown(asked)}: cannot be asked: {shown(str(getattr(error, 'reason', error)))}") from None
+        raise MapError(f"{shown(asked)}: cannot reach it: {shown(str(getattr(error, 'reason', error)))}") from None
     except Xml.ParseError:
         root = None
     if root is None or root.tag.rpartition("}")[2] not in _ROOTS:
@@ -47,16 +47,16 @@ def capabilities(url: str, timeout_s: float) -> Xml.Element:
 
 
 def chosen_format(asked: str | None, elements: Iterable[Xml.Element]) -> str:
-    """The format of the pictures: the one that was asked for, else the first of :data:`FORMATS`."""
+    """The format of the pictures: the requested one, else the first of :data:`FORMATS`."""
     offered = [(e.text or "").strip() for e in elements]
     readable = [name for name in offered if name.split(";")[0].strip() in FORMATS]
     if asked is None and readable:
         return min(readable, key=lambda name: (FORMATS.index(name.split(";")[0].strip()), len(name)))
-    return chosen_name("image_format", asked, readable, "a format that the server offers and that is read")
+    return chosen_name("image_format", asked, readable, "a supported format that the server offers")
 
 
 def with_query(url: str, values: Mapping[str, str], *, without: Sequence[str] = ()) -> str:
-    """A URL with further query parameters; those of the same names, in any case, and ``without`` leave it."""
+    """A URL with more query parameters; those of the same names, in any case, and ``without`` are removed."""
     parts = urlsplit(url)
     dropped = {name.lower() for name in (*values, *without)}
     kept = [pair for pair in parse_qsl(parts.query, keep_blank_values=True) if pair[0].lower() not in dropped]
@@ -66,15 +66,15 @@ def with_query(url: str, values: Mapping[str, str], *, without: Sequence[str] = 
 
 
 def query_value(url: str, name: str) -> str | None:
-    """The value of a query parameter, by its name in any case; None where it is missing or empty."""
+    """The value of a query parameter, by its name in any case; None if it is missing or empty."""
     return next((value for key, value in parse_qsl(urlsplit(url).query) if key.lower() == name.lower()), None)
 
 
 def text_of(element: Xml.Element, tag: str) -> str:
-    """The text of a child in one line, empty where there is none."""
+    """A child's text in one line, empty if there is none."""
     return " ".join((element.findtext(f"{{*}}{tag}") or "").split())
 
 
 def stated(service: Xml.Element | None) -> dict[str, str]:
-    """What a service says of itself and of its use."""
+    """A service's statements about itself and its terms of use."""
     return {} if service is None else {name: text for name in _STATED if (text := text_of(service, name))}

@@ -1,4 +1,4 @@
-"""Addresses of servers: which are refused, and what of them is shown."""
+"""URLs of servers: check them, and hide their secrets in messages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from urllib.parse import unquote, urlsplit
 from engine.errors import OptionError
 
 PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
-"""What stands in braces in a template of addresses."""
+"""Placeholders in braces in a URL template."""
 _SECRET = re.compile(
     r"key|token|secret|pass|pwd|signature|auth|credential|session|ticket|login|user"
     r"|^(sig|tk|ak|sk|pw|code|gkt|jwt|sid|hmac|(app|client)[-_]?(id|code))$",
@@ -20,7 +20,7 @@ _USER = re.compile(r"(?<=://)[^/?#]*@")
 
 
 def user_agent() -> str:
-    """How this product names itself to servers."""
+    """The user agent sent to servers."""
     try:
         return f"scenematch/{version('scenematch-engine')} (map fetch, run by its user)"
     except PackageNotFoundError:  # from a checkout
@@ -28,10 +28,10 @@ def user_agent() -> str:
 
 
 def shown(url: str) -> str:
-    """A URL, or text with one, without what must not be printed or stored.
+    """A URL, or text with one, without secrets that must not be printed or stored.
 
-    That is a user's name and password, and values of query parameters that look like keys. A key in the path
-    cannot be distinguished from the rest of it, and stays.
+    Secrets are user name, password, and values of query parameters that look like keys. A key in the path cannot
+    be recognised and stays.
     """
 
     def hidden(pair: re.Match[str]) -> str:
@@ -41,10 +41,10 @@ def shown(url: str) -> str:
 
 
 def check_url(argument: str, url: str) -> None:
-    """Refuse what is no web address.
+    """Refuse an invalid web address.
 
     Raises:
-        OptionError: it is of another scheme, has no host, a password in it, or what no URL has.
+        OptionError: it has another scheme, no host, a password, or invalid characters.
     """
     if any(character <= " " or character == "\x7f" for character in url):
         raise OptionError(f"{argument}: expected a URL without spaces (%20 is one), got {shown(url)!r}")

@@ -1,4 +1,4 @@
-"""WMS 1.1.1 and 1.3.0: a map drawn by the server on the grid that is asked for, in pieces."""
+"""WMS 1.1.1 and 1.3.0: a map that the server draws in pieces on the requested grid."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scenematch.fetch.services import OWN_WORDS, chosen_format, query_value, sta
 if TYPE_CHECKING:
     from pyproj import CRS
 
-_MAX_PX = 1024  # of a piece, if the server allows so much
+_MAX_PX = 1024  # of a piece, if the server allows it
 
 
 def plan_wms(root: Xml.Element, url: str, wanted: Wanted, access: Access) -> Grid:
@@ -55,10 +55,10 @@ def plan_wms(root: Xml.Element, url: str, wanted: Wanted, access: Access) -> Gri
 
 
 def _asked_layers(root: Xml.Element, asked: str | None) -> dict[str, Xml.Element]:
-    """The layers that were asked for by name, or the only one that has a name.
+    """The layers requested by name, or the only one that has a name.
 
     Raises:
-        OptionError: one is not there, or several are and none was asked for.
+        OptionError: one does not exist, or there are several and none was requested.
     """
     layers = {name: layer for layer in root.iterfind(".//{*}Layer") if (name := text_of(layer, "Name"))}
     leaves = [name for name, layer in layers.items() if layer.find("{*}Layer") is None]
@@ -67,14 +67,14 @@ def _asked_layers(root: Xml.Element, asked: str | None) -> dict[str, Xml.Element
 
 
 def _offered_crs(root: Xml.Element, layer: Xml.Element) -> list[str]:
-    """The codes that a layer states, and those around it, from which it inherits."""
+    """The codes of a layer, including those inherited from its parents."""
     around = [one for one in root.iterfind(".//{*}Layer") if any(inner is layer for inner in one.iter())]
     elements = [e for one in around for tag in ("CRS", "SRS") for e in one.iterfind(f"{{*}}{tag}")]
     return list(dict.fromkeys(code for element in elements for code in (element.text or "").split()))
 
 
 def _service(root: Xml.Element, url: str, code: str, names: str) -> dict[str, str]:
-    """How GDAL asks for a map; from 1.3.0 on in the order of axes that the authority gives."""
+    """GDAL's request for a map; from 1.3.0 on, axes are in the authority's order."""
     version = root.get("version", "1.3.0")
     new = version.startswith("1.3")
     north_first = new and code.startswith("EPSG:") and crs_of(code).axis_info[0].direction.lower() == "north"

@@ -49,7 +49,7 @@ def plan_wmts(root: Xml.Element, url: str, wanted: Wanted, access: Access) -> Gr
 
 
 def _matrix_sets(root: Xml.Element, layer: Xml.Element) -> dict[str, str]:
-    """The sets of levels of a layer by the code of their coordinate system; of each known one the first."""
+    """A layer's first tile matrix set for each known coordinate system."""
     linked = [text_of(link, "TileMatrixSet") for link in layer.iterfind("{*}TileMatrixSetLink")]
     sets: dict[str, str] = {}
     for one in root.iterfind("{*}Contents/{*}TileMatrixSet"):
@@ -60,7 +60,7 @@ def _matrix_sets(root: Xml.Element, layer: Xml.Element) -> dict[str, str]:
 
 
 def _extra_query(root: Xml.Element, url: str) -> str:
-    """What the user's address has in its query besides, such as a key: for the same host, and no other."""
+    """Other query parameters of the user's URL, such as a key: sent only to the same host."""
     elements = [*root.iterfind(".//{*}Operation[@name='GetTile']//{*}Get"), *root.iterfind(".//{*}ResourceURL")]
     hosts = {urlsplit(one.get(_HREF) or one.get("template", "")).netloc for one in elements} - {""}
     if not hosts <= {urlsplit(url).netloc}:

@@ -20,7 +20,7 @@ def is_template(url: str) -> bool:
 
 
 def check_template(url: str) -> None:
-    """Refuse a template that does not name a tile.
+    """Refuse a template that does not identify a tile.
 
     Raises:
         OptionError: a placeholder is unknown, or one is missing.

@@ -1,4 +1,4 @@
-"""Columns of other programs' telemetry: which of ours they are, by the settings, or guessed and asked."""
+"""Map other programs' telemetry columns to ours, by the settings or by a guess that the user must confirm."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from scenematch.files.stamps import STAMP_COLUMNS
 
 TABLE = "telemetry_columns"
-"""The table of a settings file in which columns are named."""
+"""The table of a settings file that names columns."""
 _LIKELY = {
     "frame": (
         "image", "img", "picture", "photo", "file", "filename", "file_name", "image_name", "image_file",
@@ -43,7 +43,7 @@ _TIME_UNITS = {
 
 
 def advice(missing: str, header: Sequence[str]) -> str:
-    """The question about a required column that is missing; blank where no column of the file is likely.
+    """Ask about a missing required column; blank if no column of the file is likely.
 
     Args:
         missing: the column, "timestamp_ns" or "frame".
@@ -52,17 +52,17 @@ def advice(missing: str, header: Sequence[str]) -> str:
     for name in header:
         ours = likely(name)
         if ours == missing or (missing == STAMP_COLUMNS[0] and ours in STAMP_COLUMNS):
-            return f': is it {name!r}? Say so in the settings, [{TABLE}] {ours} = "{name}"'
+            return f': is it {name!r}? If so, add to the settings, [{TABLE}] {ours} = "{name}"'
     return ""
 
 
 def question(header: Sequence[str], names: Mapping[str, str], columns: Sequence[str]) -> str | None:
-    """The question about columns that nobody reads and that are likely to be ours; None where there are none.
+    """Ask about unused columns that are likely to be ours; None if there are none.
 
     Args:
         header: the file's columns.
-        names: what the file calls a column, where that is said.
-        columns: those of ours that may be read.
+        names: the file's column names, if given.
+        columns: our columns that may be read.
     """
     known = {ours for ours in columns if names.get(ours, ours) in header}
     read = {names.get(ours, ours) for ours in columns}
@@ -74,11 +74,11 @@ def question(header: Sequence[str], names: Mapping[str, str], columns: Sequence[
     if not asked:
         return None
     texts = ", ".join(f'{ours} = "{name}"' for ours, name in asked.items())
-    return f"columns that are not read; are they these? Say so in the settings, [{TABLE}]: {texts}"
+    return f"unused columns; are they these? If so, add to the settings, [{TABLE}]: {texts}"
 
 
 def likely(name: str) -> str | None:
-    """Our column that a column of the file is likely to be; None where none is, or its unit is another."""
+    """Our column that the file's column probably is; None if none is, or its unit differs."""
     words = [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word]
     found = "_".join(word for word in words if word not in _UNITS)
     ours = next((column for column, others in _LIKELY.items() if found in others), None)

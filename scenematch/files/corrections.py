@@ -1,4 +1,4 @@
-"""Corrections of telemetry that is wrong in a known way: units, signs, swapped columns, offsets, a clock."""
+"""Correct telemetry that is wrong in a known way: units, signs, swapped columns, offsets, a clock."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NUMBERS = tuple(f.name for f in fields(TelemetryRow) if f.name != "frame")
 _NUMBER = r"[0-9]+(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?"
 _RULE = re.compile(rf"(\w+)=([+-]?)(?:({_NUMBER})\*)?([A-Za-z]\w*)([+-]{_NUMBER})?")
 _OFFSETS = {"heading_offset_deg": 360.0, "height_offset_m": 1e4, "offset_s": 1e5}
-_MOST_RADIANS = 2.0 * math.pi + 1e-3  # of a heading; what is more was negative before it was wrapped
+_MOST_RADIANS = 2.0 * math.pi + 1e-3  # of a heading; a larger one was negative before wrapping
 _INTERPOLATED = (
     *_ANGLES, "height_agl_m", "alt_amsl_m", "east_velocity_mps", "north_velocity_mps", "lat_deg", "lon_deg",
 )  # fmt: skip
@@ -27,18 +27,18 @@ _INTERPOLATED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corrections:
-    """What is done to every row of the telemetry, in this order.
+    """Corrections of every telemetry row, in this order.
 
     Attributes:
         angles: unit of roll, pitch and heading, "degrees" or "radians".
-        columns: "NAME=[-][FACTOR*]NAME[+OFFSET]", each of the rows as they were: "roll_deg=-pitch_deg",
+        columns: "NAME=[-][FACTOR*]NAME[+OFFSET]", each computed from the original row: "roll_deg=-pitch_deg",
             "height_agl_m=0.3048*height_agl_m".
         heading_offset_deg: added to the heading.
         height_offset_m: added to the height above ground.
         offset_s: added to the telemetry's times, but not to the pictures'.
 
     Raises:
-        OptionError: a value is none that can be.
+        OptionError: a value is invalid.
     """
 
     angles: str = "degrees"
@@ -69,7 +69,7 @@ class Corrections:
 
     @classmethod
     def from_facts(cls, values: Any) -> Corrections:
-        """From :meth:`facts`; None is the defaults."""
+        """From :meth:`facts`; None uses the defaults."""
         return cls() if values is None else cls(**{**values, "columns": tuple(values.get("columns", ()))})
 
     @classmethod
@@ -101,10 +101,10 @@ class Corrections:
         return [*(f"{name}={getattr(self, name)}" for name in names), *self.columns]
 
     def applied(self, rows: Sequence[TelemetryRow]) -> list[TelemetryRow]:
-        """The rows as they should have been.
+        """The corrected rows.
 
         Raises:
-            TelemetryError: a corrected value is none that can be; a height that is not above 0 becomes unknown.
+            TelemetryError: a corrected value is impossible; a height that is not above 0 becomes unknown.
         """
         rules = [_rule(text) for text in self.columns]
         out = [self._corrected(row, rules) for row in rows]
@@ -131,7 +131,7 @@ class Corrections:
             low, high = _LIMITS.get(name, (-math.inf, math.inf))
             if value is not None and not (math.isfinite(value) and low <= value <= high):
                 raise TelemetryError(
-                    f"frame {row.frame}: expected {name} of {low:g} to {high:g}, corrected it is {value:g}"
+                    f"frame {row.frame}: expected {name} of {low:g} to {high:g}, got {value:g} after correction"
                 )
         return row
 
@@ -157,7 +157,7 @@ def _rule(text: str) -> tuple[str, float, str, float]:
 
 
 def _scaled(row: TelemetryRow, name: str, factor: float, offset: float) -> float | None:
-    """A column times a factor and more; of a heading in radians the sign is restored that reading it took away."""
+    """A column scaled and shifted; restores the sign that reading removed from a heading in radians."""
     value: float | None = getattr(row, name)
     if value is None or (factor == 1.0 and offset == 0.0):
         return value
@@ -167,7 +167,7 @@ def _scaled(row: TelemetryRow, name: str, factor: float, offset: float) -> float
 
 
 def _shifted(rows: Sequence[TelemetryRow], offset_s: float) -> list[TelemetryRow]:
-    """The telemetry as it was at the pictures' times, its own being late or early; its ends are held."""
+    """The telemetry shifted in time to match the pictures; values are held constant at its ends."""
     time_s = np.array([row.timestamp_ns * 1e-9 for row in rows])
     columns: dict[str, Any] = {}
     for name in _INTERPOLATED:

@@ -1,10 +1,10 @@
-"""A finished track in the formats of other programs: GPX, GeoJSON and TUM.
+"""Write a finished track in the formats of other programs: GPX, GeoJSON and TUM.
 
 Convention:
-    GPX defines a height as one above the sea: it has none where that of the track is in another datum.
-    TUM and GeoJSON have the track's own heights, in the datum of the surface model.
+    GPX defines heights above the sea, so they are omitted if the track's are in another datum.
+    TUM and GeoJSON contain the track's own heights, in the datum of the surface model.
     A refused frame, and a crossing of the 180th meridian, end a segment. Stamps from September 2001 on are UTC;
-    earlier ones count from the start of the vehicle, and such a track is written without times of day.
+    earlier ones count from the start of the vehicle, and a track with those is written without times of day.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class PoseRow(TrackRow):
 
     @property
     def angles_deg(self) -> tuple[float, float, float] | None:
-        """Roll, pitch and heading, or None where one is unknown."""
+        """Roll, pitch and heading, or None if one is unknown."""
         if self.roll_deg is None or self.pitch_deg is None or self.heading_deg is None:
             return None
         return self.roll_deg, self.pitch_deg, self.heading_deg
@@ -67,7 +67,7 @@ def pose_rows(
 
     Args:
         rows: of track.csv.
-        notes: of notes.csv; those of frames that the track lacks do not count.
+        notes: of notes.csv; notes on frames that the track lacks are ignored.
         is_amsl: whether the heights of the track are above mean sea level.
     """
     by_frame = {note.frame: note for note in notes or ()}
@@ -94,7 +94,7 @@ def segments(rows: Iterable[PoseRow]) -> list[Segment]:
 
 
 def to_gpx(rows: Sequence[PoseRow]) -> str:
-    """The track as GPX 1.1: one ``trkseg`` per segment; elevations where they are known above the sea."""
+    """The track as GPX 1.1: one ``trkseg`` per segment; elevations if known above the sea."""
     parts = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<gpx version="1.1" creator="scenematch" xmlns="http://www.topografix.com/GPX/1/1">',
@@ -157,10 +157,9 @@ def _properties(row: PoseRow) -> dict[str, object]:
 def to_tum(rows: Sequence[PoseRow]) -> str:
     """The track as TUM, the format of evo: ``timestamp x y z qx qy qz qw`` in seconds and metres east, north, up.
 
-    The quaternion rotates the body (forward, left, up) to east, north, up, as in ROS. A program that reads TUM
-    takes each line for a whole pose, so that fixes without a height or without an attitude are left out beside
-    those with one (:func:`tum_rows`). Where no fix has one, all z are 0 or all quaternions unity, and the first
-    line says so.
+    The quaternion rotates the body (forward, left, up) to east, north, up, as in ROS. Programs that read TUM treat
+    each line as a full pose. If some fixes have a height or an attitude, those without are omitted
+    (:func:`tum_rows`); if none has, all z are 0 or all quaternions unity, and the first line says so.
 
     Raises:
         TelemetryError: a fix has no stamp.
@@ -186,7 +185,7 @@ def to_tum(rows: Sequence[PoseRow]) -> str:
 
 
 def tum_rows(rows: Sequence[PoseRow]) -> list[PoseRow]:
-    """The fixes that TUM holds: those with a height and an attitude, where any fix has one."""
+    """The fixes to write as TUM: those with a height and an attitude, if any fix has one."""
     kept = [row for segment in segments(rows) for row in segment]
     if any(row.up_m is not None for row in kept):
         kept = [row for row in kept if row.up_m is not None]

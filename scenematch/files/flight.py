@@ -38,7 +38,7 @@ class FlightFrame:
         name: file name of the image, or its index in a video or bag.
         frame: the image with its telemetry.
         prior: the position in the telemetry with its sigma, or None.
-        telemetry: the whole row, or None where the flight has no telemetry.
+        telemetry: the whole row, or None if the flight has no telemetry.
     """
 
     name: str
@@ -53,12 +53,12 @@ class Flight:
 
     Attributes:
         source: source of the images.
-        rows: the telemetry, one row per frame; empty where there is none.
-        height_sources: where a log or photographs were read, the source of each row's height, or empty.
+        rows: the telemetry, one row per frame; empty if there is none.
+        height_sources: if a log or photographs were read, the source of each row's height, or empty.
         names: names of the frames, in order.
         unused: number of images without a row of telemetry.
-        has_gimbal: whether the attitude is that of a gimbal, and says by itself where the camera looks.
-        remarks: what is doubtful about the telemetry, a sentence each.
+        has_gimbal: whether the attitude is a gimbal's and thus already states where the camera looks.
+        remarks: doubts about the telemetry, one sentence each.
     """
 
     source: FrameSource
@@ -130,7 +130,7 @@ def open_flight(
     columns: Mapping[str, str] = {},
     odometry_topic: str | None = None,
 ) -> Flight:
-    """Open a flight and check up front that its parts belong together.
+    """Open a flight and check that its parts belong together.
 
     Args:
         frames: a folder of images, a video, or a ROS bag.
@@ -138,13 +138,13 @@ def open_flight(
             None uses the bag's own telemetry, the .SRT beside a video, or the EXIF of photographs; without EXIF
             times the images come in natural order and without telemetry.
         camera: checked against the size of the first image.
-        clock: capture times of the frames, where the telemetry is a log.
-        image_topic: topic of a bag's images; None where there is only one.
-        columns: what a telemetry.csv calls a column, by its name in :data:`scenematch.files.telemetry.COLUMNS`.
-        odometry_topic: another odometry that the velocity is taken from, where the telemetry is a bag.
+        clock: capture times of the frames, if the telemetry is a log.
+        image_topic: topic of a bag's images; None if there is only one.
+        columns: column names of telemetry.csv, by our names in :data:`scenematch.files.telemetry.COLUMNS`.
+        odometry_topic: topic of another odometry that provides the velocity, if the telemetry is a bag.
 
     Returns:
-        The flight; no image but the first has been read.
+        The flight; only the first image has been read.
 
     Raises:
         TelemetryError: a file cannot be read, or a row names a frame that does not exist.
@@ -178,7 +178,7 @@ def open_flight(
 
 
 def _check_is_table(telemetry: Path) -> None:
-    """Metadata in a video is not read: no library for it is kept, light and made for every supported Python."""
+    """Refuse metadata inside a video: no maintained, light library reads it on every supported Python."""
     if telemetry.suffix.lower() in (*VIDEO_SUFFIXES, ".klv", ".360"):
         raise TelemetryError(
             f"{telemetry}: expected a table or a flight log, got a video's metadata (MISB KLV, GoPro GPMF), "
@@ -187,7 +187,7 @@ def _check_is_table(telemetry: Path) -> None:
 
 
 def subtitles_beside(frames: str | Path) -> Path | None:
-    """The .SRT of a video's name beside it, as DJI writes it; None where there is none."""
+    """The .SRT beside a video with the same name, as DJI writes it; None if there is none."""
     path = Path(frames)
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         return None
@@ -212,8 +212,8 @@ def write_flight_folder(
     """Write a flight folder: frames, telemetry.csv, truth.csv, camera.yaml, map.tif and dsm.tif.
 
     Args:
-        directory: the folder, created where it does not exist.
-        frames: file name (.jpg or .png) and stamped frame, consumed one at a time and before ``truth``.
+        directory: the folder, created if it does not exist.
+        frames: file name (.jpg or .png) and stamped frame, consumed one at a time before ``truth``.
         truth: the true states, in the order of time.
         camera: intrinsics and mount.
         ortho_rgb: map, (H, W, 3) or grey (H, W), uint8.
@@ -225,7 +225,7 @@ def write_flight_folder(
         slope_sigma_deg: slope accuracy that dsm.tif states, or None.
 
     Raises:
-        TelemetryError: a frame has no stamp, or a file cannot be written.
+        TelemetryError: a frame has no timestamp, or a file cannot be written.
         MapError: map.tif or dsm.tif cannot be written.
     """
     directory = Path(directory)

@@ -21,7 +21,7 @@ from engine.errors import TelemetryError
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Suffixes of image files, in lower or upper case."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".ts")
-"""Suffixes of videos beside which subtitles may lie, in lower or upper case."""
+"""Suffixes of videos that may have subtitles beside them, in lower or upper case."""
 
 
 class FrameSource(ABC):
@@ -103,7 +103,7 @@ class VideoFile(FrameSource):
         self.path = path
         self._reset()
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if count < 1:  # a stream that does not state its length
+        if count < 1:  # the stream does not state its length
             while self._capture.grab():
                 self._next += 1
             count = self._next
@@ -161,7 +161,7 @@ class VideoFile(FrameSource):
         success, image = self._capture.read() if self._next == index else (False, None)
         if not success or image is None:
             raise TelemetryError(
-                f"{self.path}: frame {index}: expected {len(self.names)} frames as the file says, "
+                f"{self.path}: frame {index}: expected {len(self.names)} frames as the file states, "
                 f"got no more than {self._next}"
             )
         self._next += 1
@@ -174,7 +174,7 @@ def open_frames(path: str | Path) -> FrameSource:
     """Open a folder of images, one image, or a video.
 
     Raises:
-        TelemetryError: there is no such path, the folder holds no images, or the file is no video.
+        TelemetryError: there is no such path, the folder holds no images, or the file is not a video.
     """
     path = Path(path)
     if path.is_dir():
@@ -196,7 +196,7 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
         (H, W, 3) uint8.
 
     Raises:
-        TelemetryError: the file is missing, empty, truncated or no image.
+        TelemetryError: the file is missing, empty, truncated or not an image.
     """
     from PIL import Image
 

@@ -1,4 +1,4 @@
-"""Writer of GeoTIFF files from an array and its affine transform."""
+"""Write GeoTIFF files from an array and its affine transform."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def write_geotiff(
         corner of the top-left pixel; the offset of half a pixel is applied here.
 
     Args:
-        path: the file, overwritten where it exists.
+        path: the file, overwritten if it exists.
         array: (H, W) or (H, W, 3) of uint8, uint16, int16, float32 or float64.
         pixel_to_crs: (2, 3) affine transform to units of the CRS.
         crs_epsg: EPSG code of the CRS.
@@ -38,7 +38,7 @@ def write_geotiff(
         tags: metadata items, such as :data:`engine.maps.rasters.GEOREFERENCE_TAG`.
 
     Raises:
-        ShapeError: an argument has another shape.
+        ShapeError: an argument has the wrong shape.
         DtypeError: the element type is not one of those above.
         OptionError: the affine transform is not finite, or is singular.
         MapError: the EPSG code is unknown, or the file cannot be written.

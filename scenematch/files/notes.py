@@ -1,4 +1,4 @@
-"""notes.csv: details of each frame that track.csv lacks, so that a report can be drawn again."""
+"""notes.csv: details of each frame that track.csv lacks, needed to redraw a report."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class FrameNote:
         stage: last stage of the search that the budget allowed.
         confidence: probability that the fix is correct.
         detail: one sentence with figures on why the frame was refused.
-        sigma_up_m: standard deviation of the height, where it was measured.
-        roll_deg: of the whole pose, where that was measured; positive right side down.
+        sigma_up_m: standard deviation of the height, if it was measured.
+        roll_deg: roll of the whole pose, if measured; positive right side down.
         pitch_deg: the same; positive nose up.
-        roll_sigma_deg: standard deviation of the roll, where it is known, as of the next two.
+        roll_sigma_deg: standard deviation of the roll, if known; so are the next two.
         pitch_sigma_deg: of the pitch.
         heading_sigma_deg: of the heading.
-        protection_level_m: radius beyond which the vehicle is with a probability of 1e-4 at most; None where none
-            holds.
+        protection_level_m: radius that contains the vehicle except with a probability of at most 1e-4; None if no
+            bound holds.
     """
 
     frame: str
@@ -67,7 +67,7 @@ def frame_note(name: str, result: Fix | NoFix, state: str) -> FrameNote:
     x0, y0 = (None, None) if result.window is None else (result.window.x0, result.window.y0)
     if isinstance(result, NoFix):
         return FrameNote(frame=name, state=state, window_x0_px=x0, window_y0_px=y0, detail=result.detail or None)
-    # Where no height was measured, roll and pitch are the telemetry's, or none.
+    # If no height was measured, roll and pitch are the telemetry's or unknown.
     tilt = None if result.up_m is None else result.attitude
     level_m = result.protection_level_m()
     roll_sigma_deg, pitch_sigma_deg, heading_sigma_deg = result.attitude_sigma_deg or (None, None, None)

@@ -1,8 +1,8 @@
-"""The camera by which photographs were taken, from what stands in them: EXIF and DJI's XMP.
+"""The camera of photographs, from their metadata: EXIF and DJI's XMP.
 
 Convention:
     A 35 mm equivalent focal length compares diagonals: f_px = f_35 / 43.27 mm * diagonal in pixels. Makers state
-    that of the whole sensor also where the picture is a part of it, as one of 16:9 is.
+        it for the whole sensor even if the picture is only part of it, as with 16:9.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ _FOCAL_MM, _FOCAL_35MM, _ZOOM, _WIDTH = 0x920A, 0xA405, 0xA404, 0xA002
 _PLANE_X, _PLANE_Y, _PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
-_WIDER_THAN_SENSORS = 1.6  # sensors are 4:3 or 3:2: a picture of 16:9 is a part of one
+_WIDER_THAN_SENSORS = 1.6  # sensors are 4:3 or 3:2: a 16:9 picture is cropped
 _SENSORS_3_2_MM = ((14.5, 17.0), (24.0, 48.0))  # diagonals: of 1 inch, and of APS-C to full frame; others are 4:3
 _SAME_FOCAL = 0.01
-_CONTRADICTION = 1.25  # between two focal lengths of one photograph: rounding and aspect make a tenth
+_CONTRADICTION = 1.25  # between two focal lengths of one photograph: rounding and aspect explain a tenth
 _FOCAL_RANGE = (0.2, 50.0)  # of a focal length, in widths of the picture
 
 
 @dataclass(frozen=True, slots=True)
 class PhotoCamera:
-    """A camera, and which tags said so.
+    """A camera, and the tags that describe it.
 
     Attributes:
         camera: mounted nadir.
@@ -43,7 +43,7 @@ class PhotoCamera:
 
 
 def photo_camera(paths: Sequence[Path]) -> PhotoCamera:
-    """The one camera of some photographs, without distortion unless they state it.
+    """The common camera of some photographs, without distortion unless they state it.
 
     ==========================================  =====================================================
     drone-dji:DewarpData                        focal lengths, principal point and distortion
@@ -56,7 +56,7 @@ def photo_camera(paths: Sequence[Path]) -> PhotoCamera:
         paths: the photographs, at least one.
 
     Raises:
-        CalibrationError: a photograph has none of these or contradicts itself, or they are not of one camera.
+        CalibrationError: a photograph has none of these or contradicts itself, or they are from different cameras.
         TelemetryError: one cannot be opened.
     """
     first = _camera_of(read_photo_tags(paths[0]))
@@ -112,13 +112,13 @@ def _ideal(tags: PhotoTags, focal_px: float) -> Camera:
 
 
 def _recorded_scale(tags: PhotoTags) -> float:
-    """Pixels of the stored picture to one of the recorded picture; 1 unless it was made smaller since."""
+    """Pixels of the stored picture per pixel of the recorded one; 1 unless it was scaled down."""
     recorded_px = tags.number(_WIDTH)
     return tags.size_px[0] / recorded_px if recorded_px and recorded_px > 0.0 else 1.0
 
 
 def _dewarp_camera(tags: PhotoTags) -> PhotoCamera | None:
-    """By DJI's own calibration, whose principal point counts from the picture's middle."""
+    """The camera by DJI's calibration, with the principal point relative to the picture's centre."""
     if not tags.dewarp:
         return None
     width_px, height_px = tags.size_px
@@ -134,7 +134,7 @@ def _dewarp_camera(tags: PhotoTags) -> PhotoCamera | None:
 
 def _calibrated_camera(tags: PhotoTags) -> PhotoCamera | None:
     focal_px, middle_px = tags.xmp.get("CalibratedFocalLength", 0.0), tags.xmp.get("CalibratedOpticalCenterX", 0.0)
-    if focal_px <= 0.0 or middle_px <= 0.0:  # the middle says of which width it is the focal length
+    if focal_px <= 0.0 or middle_px <= 0.0:  # the centre tells the width that the focal length refers to
         return None
     scale = tags.size_px[0] / (2.0 * middle_px)
     return PhotoCamera(_ideal(tags, focal_px * scale), "drone-dji:CalibratedFocalLength")
@@ -156,7 +156,7 @@ def _film_focal_px(tags: PhotoTags) -> float | None:
 
 
 def _sensor_diagonal_px(tags: PhotoTags, focal_35mm: float) -> float:
-    """Diagonal of the whole sensor, of which the picture is all or the part of another aspect."""
+    """Diagonal of the whole sensor; the picture is all of it or a crop of another aspect."""
     short_px, long_px = sorted(tags.size_px)
     focal_mm = tags.number(_FOCAL_MM) or 0.0
     diagonal_mm = focal_mm * _DIAGONAL_35MM / focal_35mm

@@ -1,8 +1,8 @@
-"""Photographs: what a camera and a drone wrote into them, EXIF and DJI's XMP; and the telemetry in it.
+"""Photographs: read the metadata of camera and drone, EXIF and DJI's XMP, and their telemetry.
 
 Convention:
-    Heights are above the take-off point, positions those of the receiver on board. A gimbal that wrote zeros only
-    is none, and a photograph that a viewer saved was turned by it: its heading and tilt are unknown.
+    Heights are above the take-off point; positions are from the onboard receiver. Gimbal angles of only zeros mean
+    no gimbal. A photograph saved by a viewer may have been rotated: its heading and tilt are unknown.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from scenematch.files.telemetry import TelemetryRow, take_off_sigma_m
 COMPASS_SIGMA_DEG = 3.0
 """Standard deviation of a heading by a drone's compass."""
 GIMBAL_SIGMA_DEG = 2.0
-"""Standard deviation of roll and of pitch as a gimbal states them: where it says 0.0 and -89.9 throughout a
-survey, poses by SIFT are up to 3 degrees off, 1.5 as root mean square."""
+"""Standard deviation of a gimbal's roll and pitch: in a survey with constant 0.0 and -89.9, poses by SIFT differ
+by up to 3 degrees, 1.5 RMS."""
 _VIEWERS = ("Photo Viewer", "Photo Gallery", "Picasa")
-"""Parts of the names of programs that save a photograph because it was turned, without turning what it says."""
+"""Parts of names of programs that rotate photographs without updating their metadata."""
 _SOFTWARE = 0x0131
 _GIMBAL = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
 _GPS_IFD, _EXIF_IFD = 0x8825, 0x8769
@@ -41,7 +41,7 @@ _XMP_DEWARP = re.compile(rb"drone-dji:DewarpData(?:=\"|>)[0-9-]{0,20};([-+0-9.,e
 
 @dataclass(frozen=True, slots=True)
 class PhotoTags:
-    """What stands in one photograph.
+    """The metadata of one photograph.
 
     Attributes:
         path: the file.
@@ -49,8 +49,8 @@ class PhotoTags:
         exif: tags of the camera by number.
         gps: tags of the position by number.
         xmp: numbers of DJI's XMP by name.
-        dewarp: DJI's DewarpData: fx, fy, cx, cy, k1, k2, p1, p2, k3; empty where there is none.
-        software: what wrote the file last.
+        dewarp: DJI's DewarpData: fx, fy, cx, cy, k1, k2, p1, p2, k3; empty if there is none.
+        software: program that last wrote the file.
     """
 
     path: Path
@@ -63,7 +63,7 @@ class PhotoTags:
 
     @property
     def was_turned(self) -> bool:
-        """Whether the picture may have been turned since it was taken: which side is its top is then unknown."""
+        """Whether the picture may have been rotated since it was taken; its top is then unknown."""
         return any(viewer in self.software for viewer in _VIEWERS)
 
     def number(self, tag: int) -> float | None:
@@ -108,7 +108,7 @@ def exif_telemetry(source: str | Path | Sequence[str | Path]) -> list[TelemetryR
 
 
 def photo_truth(folder: Path) -> list[Truth]:
-    """Where photographs were taken, by their own receiver; its heights are left out, a truth needs better ones.
+    """Truth from the photographs' receiver; without its heights, which are too inaccurate.
 
     Raises:
         TelemetryError: the folder cannot be read, or none of its photographs has a time and a position.
@@ -127,14 +127,14 @@ def photo_telemetry(paths: Sequence[Path]) -> tuple[list[TelemetryRow], list[str
     """Telemetry from photographs' EXIF and DJI's XMP.
 
     ==================================  =====================================================================
-    DateTimeOriginal, SubSec, Offset    timestamp_ns; UTC where there is no offset
+    DateTimeOriginal, SubSec, Offset    timestamp_ns; UTC if there is no offset
     GPSLatitude, GPSLongitude           the prior; GPSHPositioningError its sigma
     GPSAltitude                         alt_amsl_m
     GPSImgDirection                     heading_deg, where its reference is true north
     drone-dji:RelativeAltitude          height_agl_m, above the take-off point
     drone-dji:Gimbal*Degree             heading, roll and pitch of a body with the camera mounted nadir; three
                                         zeros are no gimbal
-    drone-dji:FlightYawDegree           heading_deg, where there are no gimbal angles
+    drone-dji:FlightYawDegree           heading_deg, if there are no gimbal angles
     ==================================  =====================================================================
 
     Args:
@@ -142,8 +142,8 @@ def photo_telemetry(paths: Sequence[Path]) -> tuple[list[TelemetryRow], list[str
 
     Returns:
         Rows in the order of time, named by file name; photographs without a capture time are omitted.
-        Photographs of the same second without sub-seconds are spaced evenly within it. And what is doubtful about
-        them, a sentence each.
+        Photographs in the same second without sub-seconds are spaced evenly within it. Also doubts about them, one
+        sentence each.
 
     Raises:
         TelemetryError: an image cannot be opened.
@@ -163,8 +163,8 @@ def _remarks(photos: Sequence[PhotoTags]) -> list[str]:
     turned = sum(tags.was_turned for tags in photos)
     zeros = sum(set(map(tags.xmp.get, _GIMBAL)) == {0.0} for tags in photos)
     remarks = {
-        "photographs that a viewer turned and saved, whose heading is unknown": turned,
-        "photographs without a gimbal's angles, whose heading is the flight's and tilt unknown": zeros,
+        "photographs rotated and saved by a viewer, so their heading is unknown": turned,
+        "photographs without gimbal angles, so their heading is the flight's and their tilt unknown": zeros,
     }
     return [f"{remark}: {count}" for remark, count in remarks.items() if count]
 
@@ -236,7 +236,7 @@ def _altitude_m(gps: Mapping[int, Any]) -> float | None:
 
 
 def _flight_heading(tags: PhotoTags) -> dict[str, float | None]:
-    """The heading of the vehicle, or the direction that the receiver noted, where it is from true north."""
+    """The vehicle's heading, or the receiver's direction if relative to true north."""
     heading_deg = _finite(tags.xmp.get("FlightYawDegree"))
     if heading_deg is None and tags.gps.get(16) == "T":
         heading_deg = _finite(tags.gps.get(17))
@@ -254,7 +254,7 @@ def _gimbal_attitude(xmp: Mapping[str, float]) -> dict[str, float | None] | None
 
 
 def gimbal_columns(roll_deg: float, pitch_deg: float, yaw_deg: float) -> dict[str, float | None] | None:
-    """Columns of telemetry by a gimbal's angles; None of one that wrote zeros only, as some models do without one.
+    """Telemetry columns from a gimbal's angles; all None if they are zero, as models without a gimbal write.
 
     Args:
         roll_deg: of the gimbal.
@@ -276,7 +276,7 @@ def gimbal_columns(roll_deg: float, pitch_deg: float, yaw_deg: float) -> dict[st
 def nadir_attitude(
     gimbal_roll_deg: float, gimbal_pitch_deg: float, gimbal_yaw_deg: float
 ) -> tuple[float, float, float]:
-    """Attitude of a body on which the gimbal's camera would be mounted nadir, the image's top to the nose.
+    """Attitude of a body with the gimbal's camera mounted nadir, the image's top towards the nose.
 
     DJI's angles rotate the camera's forward, right and down axes; a pitch of -90 degrees is nadir. The camera's
     forward is the body's down, its up the body's forward. The result is the same with a roll of 180 degrees, as

@@ -1,4 +1,4 @@
-"""Resampling: the time series of a flight log, interpolated at the frames' capture times.
+"""Resampling: interpolate the time series of a flight log at the frames' capture times.
 
 Convention:
     Stamps are nanoseconds on the log's clock. Between two samples a value is interpolated linearly, an angle along
@@ -25,7 +25,7 @@ from scenematch.files.truth import truth_from_telemetry
 MAX_SAMPLE_GAP_NS = 2_000_000_000
 """Largest interval between two samples that is interpolated."""
 END_HOLD_NS = 100_000_000
-"""How far the first and last sample are extrapolated as constants, since frames' stamps are rounded."""
+"""How far the first and last sample are held, since frames' timestamps are rounded."""
 UTC_FROM_NS = 10**18
 """Stamps from this value (September 2001) on count as UTC in nanoseconds since 1970."""
 HEIGHT_SOURCES = ("rangefinder", "terrain", "take-off")
@@ -63,9 +63,9 @@ class FlightLog:
         series: time series by the column of telemetry.csv that they fill; none is empty.
         heights: height above ground in metres by source, see :data:`HEIGHT_SOURCES`; the rangefinder's is along
             the body's down axis.
-        captures_ns: (N,) times of camera triggers; empty where none were logged.
-        utc_ns: offset that converts the log's clock to UTC; None where it is unknown.
-        frame_numbers: numbers of a video's frames, the first is 1, over time; None but for a video's subtitles.
+        captures_ns: (N,) times of camera triggers; empty if none were logged.
+        utc_ns: offset that converts the log's clock to UTC; None if it is unknown.
+        frame_numbers: numbers of a video's frames, the first is 1, over time; None except for a video's subtitles.
     """
 
     path: Path
@@ -82,7 +82,7 @@ class FlightLog:
         return int(min(s.stamps_ns[0] for s in all_series)), int(max(s.stamps_ns[-1] for s in all_series))
 
     def clock_shift_ns(self, stamp_ns: int) -> int:
-        """Offset in nanoseconds that converts stamps like ``stamp_ns``, UTC or not, to the log's clock.
+        """Offset in nanoseconds from timestamps like ``stamp_ns``, UTC or not, to the log's clock.
 
         Raises:
             TelemetryError: the stamp is UTC, the log's stamps are not, and the log has no GPS time.
@@ -90,7 +90,7 @@ class FlightLog:
         if stamp_ns < UTC_FROM_NS or self.span_ns[0] >= UTC_FROM_NS:
             return 0
         if self.utc_ns is None:
-            raise TelemetryError(f"{self.path}: expected GPS time, as the frames' stamps are UTC, got none")
+            raise TelemetryError(f"{self.path}: expected GPS time, since the frames' timestamps are UTC, got none")
         return -self.utc_ns
 
 
@@ -126,7 +126,7 @@ def make_log(
 
 
 def make_series(stamps_ns: ArrayLike, values: ArrayLike, valid: ArrayLike = True) -> TimeSeries | None:
-    """Create a series in the order of time, without invalid or non-finite samples; of equal stamps the first.
+    """Create a series in the order of time, of finite valid samples; keeps the first of equal timestamps.
 
     Args:
         stamps_ns: (N,) nanoseconds.
@@ -134,7 +134,7 @@ def make_series(stamps_ns: ArrayLike, values: ArrayLike, valid: ArrayLike = True
         valid: (N,) or one boolean.
 
     Returns:
-        The series, or None where no sample is left.
+        The series, or None if no sample is left.
     """
     with np.errstate(invalid="ignore"):  # damaged files may hold signalling NaNs
         stamps, numbers = np.asarray(stamps_ns, np.int64), np.asarray(values, np.float64)
@@ -146,7 +146,7 @@ def make_series(stamps_ns: ArrayLike, values: ArrayLike, valid: ArrayLike = True
 def make_position_series(
     stamps_ns: ArrayLike, lat_deg: ArrayLike, lon_deg: ArrayLike, valid: ArrayLike = True
 ) -> dict[str, TimeSeries | None]:
-    """Create the series of latitude and longitude, without (0, 0), which is no fix, and values out of range.
+    """Create the series of latitude and longitude, without values out of range and (0, 0), which means no fix.
 
     Args:
         stamps_ns: (N,) nanoseconds.
@@ -155,7 +155,7 @@ def make_position_series(
         valid: (N,) or one boolean.
 
     Returns:
-        ``lat_deg`` and ``lon_deg``; None where no sample is left.
+        ``lat_deg`` and ``lon_deg``; None if no sample is left.
     """
     lat, lon = np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64)
     in_range = (np.abs(lat) <= 90.0) & (np.abs(lon) <= 180.0) & ((lat != 0.0) | (lon != 0.0))
@@ -210,7 +210,7 @@ def telemetry_at(
 def rows_and_sources_at(
     log: FlightLog, stamps_ns: Sequence[int], names: Sequence[str]
 ) -> tuple[list[TelemetryRow], list[str]]:
-    """As :func:`telemetry_at`, with the source of each row's height; empty where it is unknown."""
+    """As :func:`telemetry_at`, with the source of each row's height; empty if it is unknown."""
     times_ns = np.asarray(stamps_ns, np.int64) + log.clock_shift_ns(int(stamps_ns[0]))
     start_ns, end_ns = log.span_ns
     if not ((times_ns >= start_ns - END_HOLD_NS) & (times_ns <= end_ns + END_HOLD_NS)).any():
@@ -270,7 +270,7 @@ def truth_from_log(log: FlightLog, *, utc: bool) -> list[Truth]:
         utc: whether stamps are converted to UTC; else they stay on the log's clock.
 
     Raises:
-        TelemetryError: the log has no position, or no GPS time where ``utc`` is requested.
+        TelemetryError: the log has no position, or no GPS time although ``utc`` is requested.
     """
     if "lat_deg" not in log.series:
         raise TelemetryError(f"{log.path}: expected positions to serve as truth, got a log without any")

@@ -1,4 +1,4 @@
-"""Reader of planned routes: a GeoJSON LineString, or the waypoints of a QGroundControl plan."""
+"""Read planned routes: a GeoJSON LineString, or the waypoints of a QGroundControl plan."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ _MAX_FILE_BYTES = 64 << 20
 def read_route(path: str | Path) -> NDArray[np.float64]:
     """Read the waypoints of a route; heights are ignored.
 
-    GeoJSON must contain exactly one LineString, alone or in a Feature or FeatureCollection. Of a plan the mission
-    is read: take-off, waypoints, splines, loiters, surveys, landing, and the return to the planned home position.
+    GeoJSON must contain exactly one LineString, alone or in a Feature or FeatureCollection. From a plan, the
+        mission is read: take-off, waypoints, splines, loiters, surveys, landing, and the return to the planned
+            home.
 
     Args:
         path: the file.
@@ -108,13 +109,13 @@ def _plan_positions(plan: dict[str, Any]) -> list[tuple[float, float]]:
         if item.get("command") not in _WAYPOINT_COMMANDS or not isinstance(params, list) or len(params) < 6:
             continue
         if params[4] is None or params[5] is None or (params[4] == 0 and params[5] == 0):
-            continue  # at the vehicle's current position, such as a take-off
+            continue  # at the vehicle's current position, like a take-off
         positions.append(_position(params[4:6], params))
     return positions
 
 
 def _simple_items(items: list[Any]) -> list[dict[str, Any]]:
-    """The simple items of a mission, those within surveys included."""
+    """The simple items of a mission, including those inside surveys."""
     found: list[dict[str, Any]] = []
     for item in items:
         if not isinstance(item, dict):

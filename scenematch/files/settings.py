@@ -1,4 +1,4 @@
-"""Settings files: options as TOML, written with their descriptions and defaults, read back with every key checked.
+"""Settings files: write options as TOML with descriptions and defaults, and check every key when reading.
 
 Options are dataclasses whose docstrings describe each field and its unit. A field that is a dataclass becomes a
 table, a tuple a list, and a dict of dataclasses one table per name. The file is generated from the classes.
@@ -38,12 +38,12 @@ _UNITS = {
 def settings_text(options: Any, table: str = "", without: Collection[str] = ()) -> str:
     """The text of a settings file with all keys of ``options``, each below its description.
 
-    The keys are commented out, so that a file pins only what its user changes and the rest follows the defaults.
+    The keys are commented out: a file fixes only what its user changes, and the rest follows the defaults.
 
     Args:
         options: a dataclass whose docstring has an ``Attributes:`` section.
-        table: that the keys are in.
-        without: keys that are left out.
+        table: the table of the keys.
+        without: keys to leave out.
     """
     return "\n".join(_table(options, (table,) if table else (), without)).lstrip("\n") + "\n"
 
@@ -62,7 +62,7 @@ def read_values(path: Path) -> dict[str, Any]:
 
 
 def parse_setting(text: str) -> dict[str, Any] | None:
-    """The value of NAME=VALUE, where NAME has dots and a word needs no quotes; None for a text of another form."""
+    """Parse NAME=VALUE; NAME may have dots, and a word needs no quotes. None for any other text."""
     found = _SETTING.fullmatch(text)
     if found is None:
         return None
@@ -73,7 +73,7 @@ def parse_setting(text: str) -> dict[str, Any] | None:
 
 
 def merged(values: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested values with others in their place."""
+    """Nested values, overridden by others."""
     out = dict(values)
     for name, value in more.items():
         old = out.get(name)
@@ -122,7 +122,7 @@ def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
         for part in path:
             table = table.setdefault(part, {})
             if not isinstance(table, dict):
-                raise OptionError(f"{name}: expected a setting of its own, but {part} is one")
+                raise OptionError(f"{name}: expected a setting inside a table, but {part} is a setting")
         table[last] = NONE if value is None else value
     return out
 
@@ -134,9 +134,9 @@ def options_from_mapping(
 
     Args:
         cls: dataclass of the options.
-        values: values of its fields as parsed from TOML; "none" is None where a field is optional.
+        values: values of its fields as parsed from TOML; "none" is None if a field is optional.
         within: dotted name of the enclosing table, for messages.
-        given: fields that are no setting, or count more.
+        given: fields that are not settings or take precedence.
 
     Raises:
         OptionError: a name is not a field of ``cls``, or a value has the wrong type or range.
@@ -157,9 +157,9 @@ def options_from_mapping(
 
 
 def nearest(name: str, known: list[str]) -> str:
-    """What an unknown name was meant to be."""
+    """Suggest what an unknown name was meant to be."""
     near = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {near[0]}?" if near else f"known here are {', '.join(known)}"
+    return f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
 
 
 def _kinds(cls: type[Any]) -> dict[str, Any]:
@@ -174,7 +174,7 @@ def _is_expressible(kind: Any) -> bool:
 
 
 def _plain(kind: Any) -> type | None:
-    """The scalar type of ``kind`` without "or None"; None where it is not a scalar."""
+    """The scalar type of ``kind`` without "or None"; None if it is not a scalar."""
     if isinstance(kind, types.UnionType):
         kinds = [part for part in typing.get_args(kind) if part is not type(None)]
         kind = kinds[0] if len(kinds) == 1 else None
@@ -189,7 +189,7 @@ def _value(kind: Any, value: Any, name: str) -> Any:
     if typing.get_origin(kind) is tuple:
         if isinstance(value, dict):
             raise OptionError(f"{name}: expected a list, got {value!r}")
-        items = value if isinstance(value, list) else [value]  # a single one stands for a list of it
+        items = value if isinstance(value, list) else [value]  # a single value stands for a list of one
         return tuple(_value(typing.get_args(kind)[0], item, name) for item in items)
     if typing.get_origin(kind) is dict:
         if not isinstance(value, dict):

@@ -1,10 +1,10 @@
-"""Time stamps of a table: nanoseconds, microseconds, milliseconds, seconds or UTC dates, by name or recognised.
+"""Timestamps of a table: nanoseconds, microseconds, milliseconds, seconds or UTC dates, named or recognised.
 
 Convention:
-    A column's name states its unit: timestamp_ns, timestamp_us, timestamp_ms, timestamp_s, timestamp_utc. What
-    stands in timestamp_ns and cannot be nanoseconds, since no camera takes more than a thousand frames a second,
-    is recognised by the interval between the rows and by the size of UTC's numbers, and said; what may be two
-    units is refused.
+    A column's name states its unit: timestamp_ns, timestamp_us, timestamp_ms, timestamp_s, timestamp_utc. If
+    timestamp_ns cannot be in nanoseconds, since no camera takes more than a thousand frames a second, the unit is
+    recognised by the interval between rows and by the size of UTC numbers, and reported. An ambiguous unit is
+    refused.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from engine.errors import TelemetryError
 from scenematch.files.tables import CsvRow
 
 STAMP_COLUMNS = ("timestamp_ns", "timestamp_us", "timestamp_ms", "timestamp_s", "timestamp_utc")
-"""Columns that a stamp may stand in, in order of preference."""
+"""Columns that may contain a timestamp, in order of preference."""
 OTHER_STAMPS = {STAMP_COLUMNS[0]: STAMP_COLUMNS[1:]}
-"""Columns that may stand in the place of ``timestamp_ns``."""
+"""Columns that may replace ``timestamp_ns``."""
 _UNIT_NS = {"timestamp_ns": 1, "timestamp_us": 10**3, "timestamp_ms": 10**6, "timestamp_s": 10**9}
 _WORDS = {
     "timestamp_ns": "nanoseconds", "timestamp_us": "microseconds", "timestamp_ms": "milliseconds",
     "timestamp_s": "seconds",
 }  # fmt: skip
 _SHORTEST_NS = 10**6  # between two frames
-_USUAL_NS = (5 * 10**6, 20 * 10**9)  # between two frames whose unit is not known
+_USUAL_NS = (5 * 10**6, 20 * 10**9)  # between two frames, if the unit is unknown
 _UTC_NS = (10**18, 41 * 10**17)  # the years 2001 to 2099
 _NUMBER = re.compile(r"[+-]?[0-9]{1,19}(\.[0-9]{0,30})?([eE]\+?[0-9]{1,2})?")
 _DATE = re.compile(
@@ -44,8 +44,8 @@ class Stamps:
     """The stamps of a table.
 
     Attributes:
-        ns: in nanoseconds, one a row, strictly increasing.
-        remark: how they were read, where their column does not say it; None where it does.
+        ns: in nanoseconds, one per row, strictly increasing.
+        remark: how they were interpreted; None if the column's name says it.
     """
 
     ns: list[int]
@@ -59,7 +59,7 @@ def read_stamps(rows: Sequence[CsvRow]) -> Stamps:
         rows: of a table with at least one of :data:`STAMP_COLUMNS`.
 
     Raises:
-        TelemetryError: a stamp is blank or none, does not increase, or its unit cannot be recognised.
+        TelemetryError: a timestamp is blank or invalid, does not increase, or has an unrecognisable unit.
     """
     column = next((name for name in STAMP_COLUMNS if any(row.values[name] for row in rows)), STAMP_COLUMNS[0])
     dates = [_DATE.fullmatch(row.values[column]) for row in rows]
@@ -96,7 +96,7 @@ def _dated(rows: Sequence[CsvRow], column: str, dates: Sequence[re.Match[str] | 
 
 
 def _utc_ns(date: re.Match[str]) -> int | None:
-    """Nanoseconds since 1970 of a date; None where there is no such date."""
+    """Nanoseconds since 1970 of a date; None if there is no such date."""
     year, month, day, hour, minute, second = (int(date[k]) for k in range(1, 7))
     if not (1 <= month <= 12 and hour < 24 and minute < 60 and second <= 60 and year >= 1970):
         return None
@@ -152,6 +152,6 @@ def _unit(first: CsvRow, column: str, values: Sequence[Decimal], spacing: Decima
         return found[0]
     apart = f"{first.path}: {column}: expected {_WORDS[column]}, got rows {float(spacing):g} apart"
     if not found:
-        raise TelemetryError(f"{apart}, which no unit makes the interval of a camera's frames")
+        raise TelemetryError(f"{apart}, which is no camera's frame interval in any unit")
     units = " or ".join(_WORDS[unit] for unit in found)
     raise TelemetryError(f"{apart}, which may be {units}: name the column {' or '.join(found)}")

@@ -1,9 +1,9 @@
-"""CSV tables: the one reader and writer that telemetry, truth and track share.
+"""CSV tables: the reader and writer that telemetry, truth and track share.
 
 Convention:
-    A blank cell is unknown; columns that were not requested are ignored. A byte order mark and either line ending
-    are accepted, and semicolons or tabs in place of the commas, with a comma as the decimal mark. A message names
-    the file, the line in the file (the header is line 1), the column, what was expected and what came.
+    A blank cell is unknown; columns that were not requested are ignored. A byte order mark, either line ending,
+    and semicolons or tabs instead of commas, with decimal commas, are accepted. A message names the file, the line
+    in the file (the header is line 1), the column, what was expected and what came.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class CsvRow:
         return self.values[column]
 
     def integer(self, column: str) -> int | None:
-        """A 64-bit integer, or None where blank."""
+        """A 64-bit integer, or None if blank."""
         text = self.values[column]
         if not text:
             return None
@@ -94,7 +94,7 @@ class CsvRow:
         return value
 
     def number(self, column: str, bounds: Bounds = ANY) -> float | None:
-        """A finite number within ``bounds``, or None where blank."""
+        """A finite number within ``bounds``, or None if blank."""
         text = self.values[column]
         if not text:
             return None
@@ -113,7 +113,7 @@ class CsvRow:
 
 
 def quoted(text: str) -> str:
-    """A piece of a file as a message may hold it: quoted, on one line, short."""
+    """Quote a piece of a file for a message: short, on one line."""
     return repr(text) if len(text) <= 40 else repr(text[:40]) + "..."
 
 
@@ -132,9 +132,9 @@ def read_table(
         path: the file.
         required: columns that the header must contain.
         optional: columns that it may contain.
-        instead: for a required column, the optional ones of which any will do in its place.
-        names: what the file calls a column, where that is not its name here.
-        advice: what a message adds about a required column that is missing, given the file's columns.
+        instead: for a required column, optional ones that can replace it.
+        names: the file's column names, if they differ from ours.
+        advice: returns what to add to the message about a missing required column, given the file's columns.
 
     Yields:
         One :class:`CsvRow` per row that is not blank, with all of ``required`` and ``optional`` as keys.
@@ -172,14 +172,14 @@ def read_header(path: str | Path) -> list[str]:
 
 
 def _delimiter(file: TextIO) -> str:
-    """What separates the names of the header, which is read again: the commonest of comma, semicolon, tab."""
+    """The header's separator: the most common of comma, semicolon and tab."""
     line = file.readline()
     file.seek(0)
     return max((",", ";", "\t"), key=line.count)
 
 
 def _names(reader: Iterator[list[str]]) -> list[str]:
-    """The columns of the header, none of an empty file; some programs quote the header as one cell."""
+    """The columns of the header, none for an empty file; some programs quote the header as one cell."""
     names = next(reader, [])
     return [name.strip() for name in (names[0].split(",") if len(names) == 1 else names)]
 
@@ -203,7 +203,7 @@ class _Header:
         instead: Mapping[str, Sequence[str]],
         advice: Callable[[str, Sequence[str]], str] | None,
     ) -> _Columns:
-        """Where the columns stand in a row."""
+        """The positions of the columns in a row."""
         if not any(self.found):
             raise TelemetryError(
                 f"{self.path}: expected a header with {', '.join(required)}, got an empty first line"
@@ -225,7 +225,7 @@ class _Header:
             raise TelemetryError(f"{self.path}: line 1, {name}: expected the column once, got it {count} times")
         if not count and column in self.names:
             raise TelemetryError(
-                f"{self.path}: line 1: lacks the column {name}, which is to be {column}; "
+                f"{self.path}: line 1: lacks the column {name}, which the settings name as {column}; "
                 f"its columns are {quoted(','.join(self.found))}"
             )
         return self.found.index(name) if count else None
@@ -265,7 +265,7 @@ def _cells(path: Path, line: int, row: list[str], columns: _Columns, marks: _Mar
 
 
 def known_columns(rows: Sequence[Any], required: Sequence[str], optional: Sequence[str]) -> list[str]:
-    """The required columns, and the optional ones in which at least one row has a value."""
+    """The required columns, and the optional ones with a value in at least one row."""
     return [*required, *(name for name in optional if any(getattr(row, name) is not None for row in rows))]
 
 

@@ -1,4 +1,4 @@
-"""telemetry.csv: position, height, attitude and velocity that the vehicle knew at each frame.
+"""telemetry.csv: the vehicle's own position, height, attitude and velocity at each frame.
 
 Convention:
     One row per frame, in the order of capture; a blank cell is unknown. See :mod:`scenematch.files.tables`.
@@ -56,16 +56,16 @@ class TelemetryRow:
         timestamp_ns: capture time on the vehicle's clock.
         frame: file name of the image, or for a video the index of the frame from 0.
         height_agl_m: height above the ground.
-        height_sigma_m: standard deviation of it, where it is known.
+        height_sigma_m: standard deviation of it, if it is known.
         alt_amsl_m: height above mean sea level.
         heading_deg: clockwise from true north in [0, 360).
-        heading_sigma_deg: standard deviation of it, where it is known.
+        heading_sigma_deg: standard deviation of it, if it is known.
         roll_deg: positive right side down.
         pitch_deg: positive nose up.
-        tilt_sigma_deg: standard deviation of roll and of pitch, where it is known.
+        tilt_sigma_deg: standard deviation of roll and of pitch, if it is known.
         east_velocity_mps: velocity over ground.
         north_velocity_mps: velocity over ground.
-        velocity_sigma_mps: standard deviation of it, per axis, where it is known.
+        velocity_sigma_mps: standard deviation of it, per axis, if it is known.
         lat_deg: WGS84 latitude of a prior.
         lon_deg: WGS84 longitude of the prior.
         sigma_m: standard deviation of the prior, per axis.
@@ -90,7 +90,7 @@ class TelemetryRow:
 
     @property
     def prior(self) -> Prior | None:
-        """The position with its sigma (:data:`DEFAULT_PRIOR_SIGMA_M` where blank), or None without position."""
+        """The position with its sigma (:data:`DEFAULT_PRIOR_SIGMA_M` if blank), or None without position."""
         if self.lat_deg is None or self.lon_deg is None:
             return None
         sigma_m = DEFAULT_PRIOR_SIGMA_M if self.sigma_m is None else self.sigma_m
@@ -98,10 +98,10 @@ class TelemetryRow:
 
 
 def take_off_sigma_m(height_m: float) -> float:
-    """Standard deviation of a height above take-off, taken as one above the ground: that lies elsewhere.
+    """Standard deviation of a height above take-off used as height above ground, which lies at another level.
 
-    Five metres of ground and barometer, and a twentieth of the height, by which a barometer errs on a day 15
-    degrees off the standard atmosphere.
+    Five metres for ground and barometer, plus a twentieth of the height: a barometer's error on a day 15 degrees
+        off the standard atmosphere.
     """
     return math.hypot(_TAKE_OFF_M, _TAKE_OFF_SHARE * height_m)
 
@@ -133,11 +133,11 @@ COLUMNS = (*STAMP_COLUMNS, "frame", *_BOUNDS)
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """What a telemetry.csv holds.
+    """The contents of a telemetry.csv.
 
     Attributes:
-        rows: one a frame.
-        remarks: what was recognised and not stated by the file, a sentence each.
+        rows: one per frame.
+        remarks: what was inferred rather than stated by the file, one sentence each.
     """
 
     rows: list[TelemetryRow]
@@ -163,7 +163,7 @@ def open_telemetry(
         path: the file.
         frames: the frame names that are allowed, or None for any.
         description: those names in words, for messages.
-        names: what the file calls a column, by its name in :data:`COLUMNS`; others have their own names.
+        names: the file's column names, by our names in :data:`COLUMNS`; other columns keep our names.
 
     Raises:
         TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
@@ -178,11 +178,11 @@ def open_telemetry(
         if frames is not None and row.frame not in frames:
             raise csv_row.error("frame", description)
         if row.frame in line_of_frame:
-            raise csv_row.error("frame", f"each frame once (it stands in line {line_of_frame[row.frame]} too)")
+            raise csv_row.error("frame", f"each frame once (it is also in line {line_of_frame[row.frame]})")
         line_of_frame[row.frame] = csv_row.line
         rows.append(row)
     if not rows:
-        raise TelemetryError(f"{path}: expected one row a frame, got a header and no rows")
+        raise TelemetryError(f"{path}: expected one row per frame, got a header and no rows")
     asked = question(read_header(path), names, tuple(_BOUNDS))
     remarks = [stamps.remark, None if asked is None else f"{Path(path).name}: {asked}"]
     return Telemetry(rows, [remark for remark in remarks if remark is not None])

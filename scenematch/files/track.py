@@ -1,4 +1,4 @@
-"""track.csv: the result of every frame, one row per frame, written while the run proceeds."""
+"""track.csv: the result of every frame, one row each, written during the run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class TrackRow:
         timestamp_ns: capture time of the frame.
         frame: name of the frame.
         status: "fix" or "no_fix".
-        reason: value of :class:`engine.values.Reason` where refused.
+        reason: value of :class:`engine.values.Reason` if refused.
         lat_deg: WGS84 latitude of the camera.
         lon_deg: WGS84 longitude of the camera.
         east_m: east of the map's origin.
@@ -34,7 +34,7 @@ class TrackRow:
         sigma_east_m: standard deviation east.
         sigma_north_m: standard deviation north.
         covariance_en_m2: covariance of east and north.
-        score: NCC, or of matched points the ratio of inliers.
+        score: NCC, or the ratio of inliers for matched points.
         method: "ncc", "sift" or "learned".
         window_width_px: width of the map window that was searched.
         window_height_px: height of the map window that was searched.
@@ -186,7 +186,7 @@ def _row(csv_row: CsvRow) -> TrackRow:
         raise csv_row.error("deadline_met", "true, false or nothing")
     for column in _POSITION:
         if status == "fix" and not csv_row.values[column]:
-            raise csv_row.error(column, "a number, as the row is a fix")
+            raise csv_row.error(column, "a number, since the row is a fix")
     met = {"true": True, "false": False}.get(csv_row.values["deadline_met"])
     return TrackRow(
         timestamp_ns=csv_row.integer("timestamp_ns"),

@@ -1,4 +1,4 @@
-"""truth.csv: the true position, height and attitude of the vehicle, at times of its own."""
+"""truth.csv: the true position, height and attitude of the vehicle, with its own timestamps."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def interpolate_truth(
         max_gap_ns: largest interval between two rows that is interpolated.
 
     Returns:
-        The truth, with None for what either neighbour lacks; None outside the rows and in a gap.
+        The truth, with None for values that either neighbour lacks; None outside the rows and in gaps.
     """
     after = bisect.bisect_left(rows, timestamp_ns, key=lambda row: row.timestamp_ns)
     if after < len(rows) and rows[after].timestamp_ns == timestamp_ns:

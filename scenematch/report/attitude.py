@@ -1,4 +1,4 @@
-"""Check of the telemetry's attitude against that of the fixes: its time lag and its offset."""
+"""Check the telemetry's attitude against the fixes': time lag and offset."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MAX_LAG_S = 0.5  # of the search
 _LAG_STEP_S = 0.01
 _MIN_FRAMES = 20
 _MIN_MOTION_DEG = 0.7  # standard deviation of roll or pitch below which no lag can be estimated
-_MAX_INTERVAL_S = 0.25  # between frames; with longer ones the attitude in between is unknown
+_MAX_INTERVAL_S = 0.25  # between frames; over longer intervals the attitude is unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +28,8 @@ class AttitudeCheck:
 
     Attributes:
         frames: number of frames compared.
-        lag_ms: age of the telemetry's attitude at the capture of its frame; None where the flight is too calm or
-            its frames are too far apart.
+        lag_ms: age of the telemetry's attitude at the capture of its frame; None if the flight is too calm or its
+            frames are too far apart.
         roll_offset_deg: median of telemetry minus fix at that lag.
         pitch_offset_deg: the same for pitch.
     """
@@ -41,7 +41,7 @@ class AttitudeCheck:
 
 
 def attitude_row(frame: Frame, result: Fix | NoFix) -> AttitudeRow | None:
-    """The row of one frame; None where its telemetry lacks time, roll or pitch."""
+    """The row of one frame; None if its telemetry lacks time, roll or pitch."""
     if frame.timestamp_ns is None or frame.roll_deg is None or frame.pitch_deg is None:
         return None
     attitude = result.attitude if isinstance(result, Fix) else None
@@ -56,7 +56,7 @@ def check_attitude(rows: Sequence[AttitudeRow]) -> AttitudeCheck | None:
         rows: of the frames, in the order of time.
 
     Returns:
-        The result, or None where fewer than 20 frames have a measured attitude.
+        The result, or None if fewer than 20 frames have a measured attitude.
     """
     series = np.array(rows, dtype=np.float64).reshape(-1, 5)
     time_s, telemetry_deg, measured_deg = series[:, 0] - series[:1, 0], series[:, 1:3], series[:, 3:]
@@ -76,7 +76,7 @@ def _shifted(time_s: Array, telemetry_deg: Array, at_s: Array, lag_s: float) -> 
 
 
 def _lag_s(time_s: Array, telemetry_deg: Array, measured_deg: Array, known: NDArray[np.bool_]) -> float | None:
-    """The lag with the least variance of telemetry minus measured angles; None where there is none."""
+    """The lag with the least variance of telemetry minus measured angles; None if there is none."""
     known = known & (time_s > time_s[0] + _MAX_LAG_S) & (time_s < time_s[-1] - _MAX_LAG_S)
     if np.count_nonzero(known) < _MIN_FRAMES or np.median(np.diff(time_s)) > _MAX_INTERVAL_S:
         return None

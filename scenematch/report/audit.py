@@ -1,4 +1,4 @@
-"""The figure of a map audit: the map, the probability of a fix at each position, and the causes of low ones."""
+"""Draw a map audit: the map, the probability of a fix at each position, and the causes of low ones."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None =
     """Draw an audit as an image file.
 
     Args:
-        path: the file, replaced where it exists.
+        path: the file, replaced if it exists.
         audit: the result of the audit.
-        route: drawn where given, with a heavier line where positions are not suitable.
+        route: drawn if given, with a heavier line where positions are not suitable.
         title: heading.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Charts as SVG: axes with round ticks, and the marks that the report draws on them."""
+"""Draw charts as SVG: axes with round ticks, and the report's marks."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class ChartArea:
         return f'<path class="{kind}" d="{"".join(parts)}"/>' if parts else ""
 
     def horizontal(self, y: float, kind: str, text: str) -> str:
-        """A labelled horizontal line; empty where it lies outside the limits."""
+        """A labelled horizontal line; empty if outside the limits."""
         if not self.y_limits[0] <= y <= self.y_limits[1]:
             return ""
         at, above = float(self.y(y)), float(self.y(y)) > _TOP + 24
@@ -134,9 +134,9 @@ class ChartArea:
             x_label: label of the x axis.
             marks: SVG elements, from bottom to top; the page's script stretches them along x.
             rows: labels of y = 0, 1, ... instead of numbers.
-            timed: whether x is time, so that the page's cursor is shown and the axis zooms.
+            timed: whether x is time, which shows the page's cursor and lets the axis zoom.
             fixed: SVG elements that are never stretched, such as labelled lines.
-            period: of y, whose ticks are then labelled from 0 to it; None without one.
+            period: period of y, which labels ticks from 0 to it; None without one.
         """
         foot, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
         x_grid = "".join(self._x_tick(v, t, i) for i, (v, t) in enumerate(ticks(*self.x_limits, 6)))

@@ -55,10 +55,10 @@ def summarise_loop(result: LoopResult) -> dict[str, Any]:
     """Figures of merit of a closed loop as JSON values.
 
     Returns:
-        ``seconds``; ``handed_over``, whether the flight ended that way; ``plan_rms_m`` and ``plan_max_m``, the
-        true track's horizontal distance from the planned position at each time; ``path_rms_m``, that from the
+        ``seconds``; ``handed_over``, whether the flight ended in a handover; ``plan_rms_m`` and ``plan_max_m``,
+        the true track's horizontal distance from the planned position at each time; ``path_rms_m``, that from the
         nearest point of the path; ``height_rms_m``; ``estimate_rms_m`` and ``estimate_max_m``, the filter's
-        horizontal error after its first 5 s; ``estimate_nees``, 2 where its covariance is consistent; ``frames``,
+        horizontal error after its first 5 s; ``estimate_nees``, 2 if its covariance is consistent; ``frames``,
         ``fixes``, ``used`` and ``resets``; ``unhealthy_s`` and ``hold_s``.
     """
     plan, estimate = result.plan_error_m, result.estimate_error_m

@@ -1,4 +1,4 @@
-"""Comparison of several tracks of one flight: cumulative distributions of error and latency."""
+"""Compare several tracks of one flight: cumulative distributions of error and latency."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def draw_comparison(
 ) -> None:
     """Draw the cumulative share of all frames by horizontal error and by latency.
 
-    Refused frames count in the share, so that a curve ends at the availability: a method that answers few frames
-    accurately ends low, one that answers inaccurately rises late.
+    Refused frames count, so a curve ends at the availability: a method that answers few frames accurately ends
+        low, one that answers inaccurately rises late.
 
     Args:
         path: the PNG file.

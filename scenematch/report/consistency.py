@@ -1,9 +1,9 @@
-"""Consistency of a track with the telemetry's velocity: what can be said of successive fixes without truth.
+"""Consistency of a track with the telemetry's velocity: check successive fixes without truth.
 
 Convention:
-    A step is from one fix to the next. It is off by the distance between the displacement of its fixes and the
-    integral of the velocity. An offset that stays the same does not show, of the map above all, and fixes that
-    contradict the velocity were refused before: this is no measure of accuracy.
+    A step is from one fix to the next. Its error is the distance between the displacement of its fixes and the
+        integral of the velocity. This does not measure accuracy: a constant offset, such as the map's, does not
+            show, and fixes that contradict the velocity were already refused.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from scenematch.files.track import TrackRow
 Array = NDArray[np.float64]
 
 MAX_STEP_S = 5.0
-"""Longest step that is counted: beyond, the velocity's own error is most of it."""
+"""Longest step that counts; in longer ones the velocity's own error dominates."""
 
 
 def motion_consistency(
     rows: Sequence[TrackRow], telemetry: Sequence[TelemetryRow] | None, frame: LocalFrame
 ) -> dict[str, Any] | None:
-    """How far the steps between successive fixes are off the telemetry's velocity.
+    """How far the steps between successive fixes differ from the telemetry's velocity.
 
     Args:
         rows: the track.
-        telemetry: one row per row of the track, or None where it is not known.
+        telemetry: one row per row of the track, or None if unknown.
         frame: origin of east and north.
 
     Returns:
         JSON values: ``steps`` (their number), ``interval_s`` (their median), ``median_m``, ``p95_m`` and
-        ``max_m``; None where no step has a velocity at all of its frames.
+        ``max_m``; None if no step has a velocity at all its frames.
     """
     if not telemetry or [row.timestamp_ns for row in rows] != [row.timestamp_ns for row in telemetry]:
         return None
@@ -66,7 +66,7 @@ def motion_consistency(
 
 
 def _velocity(telemetry: Sequence[TelemetryRow]) -> tuple[Array, Array]:
-    """(N,) seconds from the first frame, and (N, 2) velocity, NaN where it is unknown."""
+    """(N,) seconds from the first frame, and (N, 2) velocity, NaN if it is unknown."""
     time_s = np.array([row.timestamp_ns - telemetry[0].timestamp_ns for row in telemetry], np.float64) / 1e9
     pairs = [(row.east_velocity_mps, row.north_velocity_mps) for row in telemetry]
     return time_s, np.array([(np.nan, np.nan) if None in pair else pair for pair in pairs], np.float64)

@@ -1,4 +1,4 @@
-"""Explanations of single matches: frames selected from a track are matched again in their windows and drawn."""
+"""Explain single matches: match selected frames of a track again in their windows and draw them."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 MAX_FRAMES = 60
-"""Maximum number of frames that are shown of a flight."""
+"""Maximum number of frames shown per flight."""
 SIDE_PX = 360
 """Longer side of an image of the slider."""
-_MAX_REMARKABLE = 40  # fixes beyond three sigmas and refusals among them, so that ordinary frames remain
+_MAX_REMARKABLE = 40  # of these, fixes beyond three sigmas and refusals, so that ordinary frames remain
 _MAX_BYTES = 32_000  # per image, so that a report of 60 frames stays below 15 MB
 _QUALITIES = (82, 70, 55, 40, 25)
 _AGREE, _OTHER = (0, 158, 115), (200, 200, 200)
@@ -152,7 +152,7 @@ def match_again(
         note: its note.
 
     Returns:
-        The window and the explanation, or None where the window is unknown or the frame cannot be matched.
+        The window and the explanation, or None if the window is unknown or the frame cannot be matched.
     """
     window = _window(row, note)
     if window is None:
@@ -161,7 +161,7 @@ def match_again(
     method = row.method if row.method in ("ncc", "sift", "learned") else None
     try:
         return window, matcher.explain(matched, window, method)
-    except EngineError:  # an image of another size, which the run has reported
+    except EngineError:  # an image of another size, already reported by the run
         return None
 
 
@@ -171,7 +171,7 @@ class _Drawer:
     errors: TrackErrors
 
     def images(self, index: int, item: FlightFrame, row: TrackRow, note: FrameNote) -> list[SliderImage]:
-        """The frame, its rectified form, the window, and the score surface or the matches, where they exist."""
+        """The frame, its rectified form, the window, and the score surface or the matches, if they exist."""
         image = item.frame.image
         assert isinstance(image, np.ndarray)  # read from a file
         frame = _slider_image(image, "the frame as it was taken", f"Frame {item.name} as the camera took it.")
@@ -222,7 +222,7 @@ def _window(row: TrackRow, note: FrameNote) -> Window | None:
 
 
 def _as_matched(frame: Frame, row: TrackRow, note: FrameNote, site: OrthoMap) -> Frame:
-    """The frame with the height and heading of its match where the telemetry had none."""
+    """The frame with the height and heading of its match if the telemetry had none."""
     height_m, heading_deg = frame.height_agl_m, frame.heading_deg
     if height_m is None and row.up_m is not None and row.lat_deg is not None and row.lon_deg is not None:
         above_m = row.up_m - site.ground_at(site.pixel_from_geodetic(row.lat_deg, row.lon_deg))
@@ -273,7 +273,7 @@ def _slider_image(image: Image, caption: str, alt: str) -> SliderImage:
 
 
 def draw_surface(surface: ScoreSurface) -> tuple[Image, Array]:
-    """Draw a score surface in colour; negative correlation is as dark as none.
+    """Draw a score surface in colour; negative correlation is as dark as zero.
 
     Returns:
         (H, W, 3) RGB image of the correlation by the position of the template's centre, and (2,) its peak in that.
@@ -292,7 +292,7 @@ def draw_surface(surface: ScoreSurface) -> tuple[Image, Array]:
 
 
 def min_shown_score(surface: ScoreSurface) -> float:
-    """The correlation that is drawn darkest."""
+    """The correlation drawn darkest."""
     return min(max(0.0, float(surface.scores.min())), surface.score)
 
 

@@ -1,8 +1,8 @@
-"""What figures share: colours, resolution, and the labels of logarithmic axes.
+"""Shared parts of figures: colours, resolution, and labels of logarithmic axes.
 
 Convention:
     Colours are distinct under all common colour vision deficiencies (Okabe and Ito). matplotlib's global state is
-    not used, so that other plots are unaffected.
+    not used, so other plots are unaffected.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A finished track with all that its report is drawn from."""
+"""A finished track with all inputs of its report."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class FinishedTrack:
         site: the map.
         ground: level of the ground.
         summary: contents of summary.json, its settings included.
-        notes: one per row, or None where the run left none.
-        telemetry: of the flight, or None where it is not known any more.
+        notes: one per row, or None if the run left none.
+        telemetry: of the flight, or None if no longer known.
         loop: plan and estimate of a closed loop, or None.
     """
 

@@ -1,4 +1,4 @@
-"""Shapes of the live view: conversion of the engine's values to rerun archetypes, and the viewer's layout."""
+"""Shapes of the live view: convert the engine's values to rerun archetypes, and lay out the viewer."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The live view: the result of each frame, sent during the flight to the rerun viewer or to a recording.
+"""The live view: send each frame's result during the flight to the rerun viewer or to a recording.
 
-rerun is optional: this module is imported only where a view is requested. The view matches frames again with a
-matcher of its own, so that it does not affect that of the flight.
+rerun is optional: this module is imported only if a view is requested. The view matches frames again with its own
+matcher, so that it does not affect the flight's.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 PICTURES = ("rectified", "window", "window/found", "window/fix", "surface", "surface/peak", "matches")
-"""Image entities that a frame may lack; they are cleared where it does."""
+"""Image entities that a frame may lack; they are then cleared."""
 PLACES = ("world/ellipse", "world/window", "world/seen")
-"""World entities that a frame may lack, in metres east, north and up of the map's origin."""
+"""World entities that a frame may lack, in metres east, north and up from the map's origin."""
 
 STATE_RGB = {
     NavigatorState.SEARCHING: (150, 150, 150),
@@ -104,7 +104,7 @@ class LiveView:
             name: name of the frame.
             frame: the frame as it was matched.
             result: the fix or the refusal.
-            state: state of the navigator after it; None where the navigator is dead.
+            state: state of the navigator after it; None if the navigator is dead.
             latency_ms: latency of the answer.
         """
         stream = self._stream
@@ -186,7 +186,7 @@ class LiveView:
         return seen
 
     def _position_m(self, fix: Fix, frame: Frame) -> Array:
-        """(3,) east, north and up of a fix in metres; up by the frame's height where the match has none."""
+        """(3,) east, north and up of a fix in metres; up from the frame's height if the match has none."""
         up_m = fix.up_m
         if up_m is None:
             up_m = self._matcher.site.ground_at(np.array(fix.map_xy_px)) + (frame.height_agl_m or 0.0)
@@ -194,7 +194,7 @@ class LiveView:
 
 
 class Watcher:
-    """Shows a bridge's answers from a thread of its own: only the newest is kept, and the bridge never waits.
+    """Shows a bridge's answers from its own thread: keeps only the newest, so the bridge never waits.
 
     Args:
         view: the live view.
@@ -213,7 +213,7 @@ class Watcher:
         return navigator
 
     def __call__(self, answer: Answer) -> None:
-        """Submit the newest answer; one that still waits is dropped."""
+        """Submit the newest answer; an answer still waiting is dropped."""
         state = None if self._navigator is None else self._navigator.state
         with contextlib.suppress(queue.Empty):
             self._waiting.get_nowait()
@@ -241,7 +241,7 @@ def open_live_view(matcher: SceneMatcher, recording: Path | None, address: str |
 
     Args:
         matcher: matcher of the flight.
-        recording: a file ``.rrd``, replaced where it exists; None for none.
+        recording: a file ``.rrd``, replaced if it exists; None for none.
         address: HOST:PORT of a rerun viewer; None for none.
 
     Raises:

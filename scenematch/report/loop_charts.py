@@ -1,4 +1,4 @@
-"""What the report shows of a closed loop: the vehicle's distance from its plan, and the estimate it steered by."""
+"""Charts of a closed loop: the vehicle's distance from its plan, and the estimate it steered by."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LOOP_LEGEND = [
     ("plan", '<path d="M0 7h22" class="line plan"/>'),
     ("estimate", '<path d="M0 7h22" class="line estimate"/>'),
 ]
-"""Of the map, beside that of a track."""
+"""Entries of the map's legend besides those of a track."""
 
 
 def loop_sentence(loop: LoopRecord) -> str:

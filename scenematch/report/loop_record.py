@@ -1,4 +1,4 @@
-"""loop.csv read back: plan, truth and the filter's estimate of a closed loop, ten times a second."""
+"""Read loop.csv: plan, truth and the filter's estimate of a closed loop, ten times a second."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 _PLACES = tuple(f"{what}{axis}_m" for what in ("plan_", "true_", "") for axis in ("east", "north", "up"))
 SETTLING_S = 5.0
-"""After which the initial error has decayed."""
+"""Time after which the initial error has decayed."""
 _SIGMAS = ("sigma_east_m", "sigma_north_m")
 
 
@@ -27,7 +27,7 @@ class LoopRecord:
         timestamp_ns: (N,) of each sample.
         plan_m: (N, 3) where the vehicle should be, east, north and up.
         true_m: (N, 3) where it is.
-        estimate_m: (N, 3) where the filter takes it to be.
+        estimate_m: (N, 3) where the filter estimates it to be.
         sigma_m: (N,) the larger sigma of the estimate, east or north.
         healthy: (N,) whether the engine's last fix was recent.
     """

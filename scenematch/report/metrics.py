@@ -1,7 +1,7 @@
 """summary.json: availability, latency and, with truth, accuracy of a track.
 
 Convention:
-    An error is fix minus truth, in metres east and north. A frame is scored where it has a fix and truth is known
+    An error is fix minus truth, in metres east and north. A frame is scored if it has a fix and truth is known
     at its time; frames without truth are counted, not scored.
 """
 
@@ -35,7 +35,7 @@ class Ground:
 
     Attributes:
         ground_m: in the surface model's datum (0 for flat ground).
-        ground_amsl_m: the same level above mean sea level, or None where unknown.
+        ground_amsl_m: the same level above mean sea level, or None if unknown.
     """
 
     ground_m: float = 0.0
@@ -44,7 +44,7 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class TrackErrors:
-    """Errors of each row of a track; NaN where a row is not scored.
+    """Errors of each row of a track; NaN if a row is not scored.
 
     Attributes:
         truth_en_m: (N, 2) true position; NaN where unknown.
@@ -65,7 +65,7 @@ class TrackErrors:
 
     @property
     def normalised_squared_errors(self) -> Array:
-        """(N,) normalised squared error e^T C^-1 e; its mean (NEES) is 2 where the covariance is consistent."""
+        """(N,) normalised squared error e^T C^-1 e; its mean (NEES) is 2 if the covariance is consistent."""
         c = self.covariance_en_m2 + _FLOOR_M2 * np.eye(2)
         e, n = self.error_en_m[:, 0], self.error_en_m[:, 1]
         determinant = np.maximum(c[:, 0, 0] * c[:, 1, 1] - c[:, 0, 1] ** 2, _FLOOR_M2**2)
@@ -74,7 +74,7 @@ class TrackErrors:
 
     @property
     def beyond(self) -> NDArray[np.bool_]:
-        """(N,) whether the error exceeds three stated sigmas; False where either is unknown."""
+        """(N,) whether the error exceeds three stated sigmas; False if either is unknown."""
         return np.asarray(self.normalised_squared_errors > FALSE_SIGMAS**2, dtype=np.bool_)
 
 
@@ -154,10 +154,10 @@ def summarise(
     Returns:
         ``frames``, ``fixes``, ``availability``, ``status``, ``reasons``, ``method``, ``methods``,
         ``latency_ms``, ``deadlines_missed``, ``stated_sigma_median_m`` and ``stated_sigma_p95_m`` (over the fixes,
-        of the larger sigma that each states of itself); with truth also ``frames_without_truth``,
+        using the larger sigma of each); with truth also ``frames_without_truth``,
         ``scored_fixes``, ``rms_m``, ``median_m``, ``r95_m``, ``max_m``, ``wrong_over_10m``, ``false_fixes``,
         ``within_1_sigma``, ``within_2_sigma`` and ``within_3_sigma`` (shares of the fixes, 0.393, 0.865 and 0.989
-        where the covariance is consistent), ``beyond_3_sigma``, ``nees_mean``, ``height_rms_m`` and
+        if the covariance is consistent), ``beyond_3_sigma``, ``nees_mean``, ``height_rms_m`` and
         ``height_bias_m``.
     """
     fixes = sum(row.fixed for row in rows)
@@ -208,7 +208,7 @@ def _accuracy(errors: TrackErrors) -> dict[str, Any]:
     distance, normalised_squared_errors = errors.distance_m[scored], errors.normalised_squared_errors[scored]
     has_scores = distance.size > 0
     wrong = distance > WRONG_M
-    # NaN, of a fix without sigma, is not within three sigmas: a wrong one counts as false.
+    # NaN, from a fix without sigma, is not within three sigmas: if wrong, the fix counts as false.
     false = wrong & ~(normalised_squared_errors <= FALSE_SIGMAS**2)
     stated = normalised_squared_errors[np.isfinite(normalised_squared_errors)]
     return {

@@ -1,4 +1,4 @@
-"""Charts of attitude and velocity: of the fixes, beside the telemetry's and the true ones where they are known."""
+"""Charts of attitude and velocity: the fixes', with the telemetry's and the true ones if known."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 _ANGLES = {"roll_deg": "Roll", "pitch_deg": "Pitch", "heading_deg": "Heading"}
 _AXES = ("east", "north")
-_BASE_S, _MAX_GAP_S = 1.0, 5.0  # between the fixes whose difference is a velocity
+_BASE_S, _MAX_GAP_S = 1.0, 5.0  # between fixes whose difference gives a velocity
 
 
 def draw_motion(
@@ -35,7 +35,7 @@ def draw_motion(
     Args:
         rows: the track.
         notes: one per row, with the attitudes of the fixes, or None.
-        telemetry: of the flight, matched with the rows by the names of the frames, or None.
+        telemetry: of the flight, matched to the rows by frame name, or None.
         truth: in the order of time, or None.
         plot_data: plot data of the track.
     """
@@ -56,10 +56,10 @@ def draw_motion(
 
 
 def _angle(words: str, fix: Array, stated: Array, true: Array, plot_data: TrackPlotData) -> Chart | None:
-    """One angle; what the fixes do not measure and the telemetry does not say has no chart."""
+    """Chart of one angle; omitted if neither the fixes nor the telemetry have it."""
     if not (np.isfinite(fix).any() or np.isfinite(stated).any()):
         return None
-    if words == "Heading":  # near its neighbours, not broken at north
+    if words == "Heading":  # kept continuous across north
         reference = next(a for a in (true, stated, fix) if np.isfinite(a).any())
         reference = _unwrapped(reference)
         fix, stated, true = (_nearest_turn(angle, reference) for angle in (fix, stated, true))
@@ -71,7 +71,7 @@ def _angle(words: str, fix: Array, stated: Array, true: Array, plot_data: TrackP
 
 
 def _unwrapped(heading_deg: Array) -> Array:
-    """The heading without jumps of a turn, known everywhere."""
+    """The heading without jumps of a full turn, filled in everywhere."""
     known = np.isfinite(heading_deg)
     index = np.arange(len(heading_deg), dtype=np.float64)
     unwrapped = np.unwrap(heading_deg[known], period=360.0)
@@ -79,7 +79,7 @@ def _unwrapped(heading_deg: Array) -> Array:
 
 
 def _nearest_turn(angle_deg: Array, reference_deg: Array) -> Array:
-    """Angles by whole turns, so that they lie within half a turn of the reference."""
+    """Angles shifted by whole turns to within half a turn of the reference."""
     return np.asarray(angle_deg - 360.0 * np.round((angle_deg - reference_deg) / 360.0), np.float64)
 
 

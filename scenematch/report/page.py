@@ -1,4 +1,4 @@
-"""report.html: a self-contained page on a track, its verdict first; it needs no network and no other file."""
+"""report.html: a self-contained page on a track, verdict first; needs no network and no other file."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
     """Write the page; equal inputs give equal bytes.
 
     Args:
-        path: the file, replaced where it exists.
+        path: the file, replaced if it exists.
         track: the track.
         shown: frames of the slider with their images.
-        why_not: reason why there are none.
+        why_not: why there are none.
     """
     plot_data, settings = track.plot_data(), track.summary["settings"]
     track_map = map_of_tracks(track.site, [plot_data], _view_px(track))
@@ -60,7 +60,7 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
 
 
 def _view_px(track: FinishedTrack) -> float:
-    """Side of the window in which half of the frames were matched, in pixels of the map; 0 where unknown."""
+    """Median side of the windows, in map pixels; 0 if unknown."""
     sides = [
         max(row.window_width_px, row.window_height_px)
         for row in track.rows

@@ -50,7 +50,7 @@ def draw_charts(
 
 
 def column(records: Sequence[object], name: str) -> Array:
-    """(N,) one attribute of each record; NaN where it is None, or where the record is."""
+    """(N,) one attribute of each record; NaN if it or the record is None."""
     values = (getattr(record, name, None) for record in records)
     return np.array([np.nan if value is None else value for value in values], np.float64)
 
@@ -67,7 +67,7 @@ def _error(plot_data: TrackPlotData, time: Limits) -> Chart:
         marks = [area.dots(plot_data.time, sigma, "fix"), area.overflow(plot_data.time, sigma, "over")]
         return what, area.svg(f"{what} over time", plot_data.time_label, marks, timed=True)
     typical = float(np.percentile(errors.distance_m[known], 97))
-    # Three sigmas are in view, unless they would flatten the errors.
+    # Three sigmas are visible unless they would flatten the errors.
     shown = 1.1 * FALSE_SIGMAS * float(np.percentile(stated, 90)) if stated.size else 0.0
     area = ChartArea(time, (0.0, max(1.3 * typical, min(shown, 5.0 * typical), 0.1)))
     beyond = np.where(errors.beyond, errors.distance_m, np.nan)
@@ -175,7 +175,7 @@ def _histogram(latency_ms: Array, budget_ms: float | None) -> Chart:
 
 
 def _top_ms(latency_ms: Array, budget_ms: float | None) -> float:
-    """Upper limit of the latency axis, in milliseconds; a few outliers do not set it."""
+    """Upper limit of the latency axis in milliseconds, ignoring a few outliers."""
     known = latency_ms[np.isfinite(latency_ms)]
     typical = 1.6 * float(np.percentile(known, 97))
     return max(min(_HEADROOM * float(known.max()), typical), _HEADROOM * (budget_ms or 0.0), 0.1)

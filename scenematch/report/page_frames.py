@@ -1,4 +1,4 @@
-"""Frame by frame: the report's slider over single matches, and the data that its script shows."""
+"""The report's slider over single frames, and the data for its script."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from scenematch.report.verdict import metres
 
 
 def shows_frames(page: Path) -> bool:
-    """Whether a page that was written shows frames; a file that is not there does not."""
+    """Whether an existing page shows frames; False if there is no file."""
     return page.is_file() and 'id="slider"' in page.read_text(encoding="utf-8", errors="replace")
 
 
 def draw_slider(track: FinishedTrack, plot_data: TrackPlotData, shown: Sequence[SliderFrame], why_not: str) -> str:
-    """The slider, or why there is none."""
+    """The slider, or the reason for its absence."""
     if not shown:
         return f"<p>{escape(why_not or 'No frames are shown.')}</p>"
     text = (
@@ -43,7 +43,7 @@ def draw_slider(track: FinishedTrack, plot_data: TrackPlotData, shown: Sequence[
 
 
 def _choice(track: FinishedTrack, plot_data: TrackPlotData, shown: Sequence[SliderFrame]) -> str:
-    """Which frames are shown, in words."""
+    """Describe which frames are shown."""
     if len(shown) == len(track.rows):
         return f"All {len(shown)} frames."
     kinds = {

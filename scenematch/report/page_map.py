@@ -1,4 +1,4 @@
-"""The map of a report: the part that was flown over, in colour, with tracks, truth and error ellipses."""
+"""The map of a report: draw the part flown over, in colour, with tracks, truth and error ellipses."""
 
 from __future__ import annotations
 
@@ -68,12 +68,12 @@ class TrackMap:
 
 
 def map_of_tracks(site: OrthoMap, tracks: Sequence[TrackPlotData], view_px: float = 0.0) -> TrackMap:
-    """The part of the map with fixes, refusals and truth, and a margin; the whole map without any of them.
+    """The part of the map with fixes, refusals and truth, plus a margin; the whole map if there are none.
 
     Args:
         site: the map.
-        tracks: one, or several that are drawn together.
-        view_px: side of what one frame was matched with; the part is no smaller, however little was flown.
+        tracks: one, or several to draw together.
+        view_px: side of the window of one frame, the smallest size of the part.
     """
     positions_m = np.concatenate([p for data in tracks for p in _positions_m(data)])
     pixels = site.pixel_from_enu(positions_m[np.isfinite(positions_m).all(axis=1)])
@@ -136,7 +136,7 @@ def track_marks(track_map: TrackMap, data: TrackPlotData) -> list[str]:
 
 
 def _ground(track_map: TrackMap) -> NDArray[np.uint8]:
-    """The picture of the map, (h, w, 3) in colour where the map has colours, else (h, w) in grey."""
+    """The picture of the map, (h, w, 3) in colour if the map has colours, else (h, w) in grey."""
     crop = level_crop(track_map.site, track_map.window, track_map.level)
     valid = track_map.site.valid(crop, track_map.level)
     _, _, width, height = track_map.box
@@ -158,14 +158,14 @@ def connected(track_map: TrackMap, positions_m: Array) -> Array:
 
 
 def _path(track_map: TrackMap, data: TrackPlotData) -> tuple[str, Array]:
-    """The true path, or without truth that of the fixes: its class, and its points in units of the drawing."""
+    """The true path, or the fixes' without truth: its class, and its points in units of the drawing."""
     truth = data.errors.truth_en_m
     kind, positions_m = ("truth", truth) if np.isfinite(truth).any() else ("path", data.errors.fix_en_m)
     return kind, connected(track_map, positions_m)
 
 
 def _ellipses(track_map: TrackMap, data: TrackPlotData) -> str:
-    """Outlines of three sigmas about some fixes, so far apart that each can be read."""
+    """Outlines of three sigmas around some fixes, spaced to be readable."""
     errors = data.errors
     known = np.flatnonzero(np.isfinite(errors.fix_en_m[:, 0]) & np.isfinite(errors.covariance_en_m2[:, 0, 0]))
     parts: list[str] = []

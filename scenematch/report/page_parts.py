@@ -1,4 +1,4 @@
-"""Parts that the report's pages share: the frame of a page, its map with buttons, and its charts over time."""
+"""Shared parts of the report's pages: page frame, map with buttons, and charts over time."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def fill_page(
     """Write a page; equal parts give equal bytes.
 
     Args:
-        path: the file, replaced where it exists.
+        path: the file, replaced if it exists.
         heading: plain text.
         subheading: plain text.
         grade: of the verdict, a class of the style sheet.
         verdict: HTML.
         body: HTML sections.
-        data: what the page's script is given: ``box`` of the map, ``frames`` of the slider.
+        data: input of the page's script: ``box`` of the map, ``frames`` of the slider.
     """
     parts = {
         "title": escape(f"{heading}: scenematch report"),
@@ -91,7 +91,7 @@ def charts_with_axis(charts: Sequence[Chart], legend: Sequence[tuple[str, str]])
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], kind: str = "figures") -> str:
-    """A table of texts; what is wider than the page scrolls within it."""
+    """A table of texts; it scrolls if wider than the page."""
     heads = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     opened = f'<div class="wide"><table class="{kind}">'

@@ -1,4 +1,4 @@
-"""Figures and tables of the report: key figures, errors by segment, refusals, inputs and versions."""
+"""Tables of the report: key figures, errors by segment, refusals, inputs and versions."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def draw_segments(summary: Mapping[str, Any]) -> str:
 
 
 def draw_refusals(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
-    """Table of reasons, most frequent first, with the detail of one refusal each."""
+    """Table of reasons, most frequent first, each with the detail of one refusal."""
     if not track.summary["reasons"]:
         return "<p>No frame was refused.</p>" if track.rows else "<p>There are no frames.</p>"
     lines = []

@@ -21,7 +21,7 @@ class TrackPlotData:
     """Arrays that all plots of a track share, one element per frame.
 
     Attributes:
-        time: (N,) seconds since the first frame, or frame numbers where a stamp is missing.
+        time: (N,) seconds since the first frame, or frame numbers if a timestamp is missing.
         time_label: label of the time axis.
         errors: positions of fixes and truth, and their differences, in metres.
         heights: (N, 2) measured and true height above the ground in metres; NaN where unknown.

@@ -24,7 +24,7 @@ from scenematch.report.verdict import metres, verdict_of
 Array = NDArray[np.float64]
 
 MAX_RUNS = 6
-"""As many as there are colours that can be told apart."""
+"""The number of distinguishable colours."""
 _GRADES = ("bad", "mixed", "open", "good")
 
 
@@ -32,7 +32,7 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
     """Write the page; equal inputs give equal bytes.
 
     Args:
-        path: the file, replaced where it exists.
+        path: the file, replaced if it exists.
         tracks: by the names of their runs, all of them with the same map.
 
     Raises:
@@ -72,7 +72,7 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
 
 
 def _figures(tracks: Mapping[str, FinishedTrack]) -> str:
-    """The table of figures of merit, a run a row."""
+    """The table of figures of merit, one row per run."""
     head = ("run", "method", "fixed", "median", "95 % below", "largest", "within 3 sigma", "NEES", "latency 95 %")
 
     def cells(name: str, track: FinishedTrack) -> tuple[str, ...]:
@@ -120,11 +120,11 @@ def _run_legend(tracks: Mapping[str, FinishedTrack]) -> list[tuple[str, str]]:
 def _charts(tracks: Mapping[str, FinishedTrack], data: Mapping[str, TrackPlotData]) -> list[Chart]:
     """Error, error in sigmas, and latency over time, and the share of frames by error; those with data.
 
-    Those over time are left out where the stamps of a run are missing and those of another are not.
+    Charts over time are left out if only some runs have timestamps.
     """
     ends = [float(d.time[-1]) for d in data.values() if d.time.size]
     labels = {d.time_label for d in data.values() if d.time.size}
-    if len(labels) > 1:  # seconds of some runs, and numbers of frames of others, have no common axis
+    if len(labels) > 1:  # seconds and frame numbers have no common axis
         found = _cumulative([d.errors.distance_m for d in data.values()])
         return [] if found is None else [found]
     if not ends or not max(ends):
@@ -161,7 +161,7 @@ def _over_time(
 
 
 def _cumulative(errors_m: Sequence[Array]) -> Chart | None:
-    """Share of all frames, refused ones among them, that are answered within so many metres."""
+    """Share of all frames, including refused ones, answered within a given error."""
     known = np.concatenate(errors_m)
     known = known[np.isfinite(known)]
     if not known.size:

@@ -1,9 +1,9 @@
-"""Errors by segment: how far a track drifts against truth over so many metres of path, or so many seconds.
+"""Errors by segment: how far a track drifts from truth over a given path length or time.
 
 Convention:
-    The error of a segment is how much the displacement between its two ends is off, |(p_j - p_i) - (q_j - q_i)|:
-    what evo's ``evo_rpe --pose_relation trans_part --all_pairs --pairs_from_reference`` has of poses without
-    rotation. It is blind to an offset that is the same at both ends, which the errors of position show.
+    The error of a segment is the error of the displacement between its ends, |(p_j - p_i) - (q_j - q_i)|: what
+    evo's ``evo_rpe --pose_relation trans_part --all_pairs --pairs_from_reference`` gives for poses without
+    rotation. It ignores an offset common to both ends, which the position errors show.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 
 LENGTHS_M = (10.0, 50.0, 100.0, 500.0, 1000.0)
 DURATIONS_S = (1.0, 10.0, 30.0, 60.0, 300.0)
-_TOLERANCE = 0.1  # of the asked length, as evo has it
+_TOLERANCE = 0.1  # of the requested length, as in evo
 
 
 def segment_errors(rows: Sequence[TrackRow], errors: TrackErrors) -> list[dict[str, Any]]:
-    """Errors of the segments of a track, a row for each length and duration that it is long enough for.
+    """Errors of a track's segments, one row for each length and duration that fits into it.
 
     Args:
         rows: the track.
@@ -34,14 +34,14 @@ def segment_errors(rows: Sequence[TrackRow], errors: TrackErrors) -> list[dict[s
     Returns:
         JSON values: ``length_m`` or ``duration_s``, ``segments`` (their number), ``median_m``, ``p95_m`` and
         ``max_m``. A segment begins at each scored fix, and ends at the one whose distance along the true path, or
-        in time, is nearest to what is asked, if that is within a tenth of it.
+        in time, is nearest to the requested one, if within a tenth of it.
     """
     scored = np.flatnonzero(np.isfinite(errors.distance_m))
     if scored.size < 2:
         return []
     error_m, true_m = errors.error_en_m[scored], errors.truth_en_m[scored]
     path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(true_m, axis=0), axis=1))])
-    stamps_ns = np.array([row.timestamp_ns or 0 for row in rows], np.int64)[scored]  # what is scored has one
+    stamps_ns = np.array([row.timestamp_ns or 0 for row in rows], np.int64)[scored]  # scored rows have one
     time_s = (stamps_ns - stamps_ns[0]) / 1e9
     table = [_row("length_m", length, path_m, error_m) for length in LENGTHS_M]
     table += [_row("duration_s", duration, time_s, error_m) for duration in DURATIONS_S]
@@ -70,13 +70,13 @@ def segment_ends(along: Array, asked: float) -> tuple[NDArray[np.intp], NDArray[
         asked: length of a segment, in the same unit.
 
     Returns:
-        Two arrays of the same length. Of equally near ends the earlier one is taken.
+        Two arrays of the same length. The earlier of two equally near ends is taken.
     """
     begins = np.arange(len(along))
     after = np.searchsorted(along, along + asked)
     before, after = np.maximum(after - 1, begins), np.minimum(after, len(along) - 1)
     off_before, off_after = np.abs(along[before] - along - asked), np.abs(along[after] - along - asked)
-    # Where the vehicle hovers, the distance stays the same: the earliest pose of these ends the segment.
+    # While the vehicle hovers, the distance is constant: the earliest of these poses ends the segment.
     before = np.maximum(np.searchsorted(along, along[before]), begins)
     ends = np.where(off_before <= off_after, before, after)
     near = np.minimum(off_before, off_after) <= _TOLERANCE * asked

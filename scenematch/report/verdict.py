@@ -1,4 +1,4 @@
-"""The verdict on a track in two sentences, and the meaning of each reason for a refusal."""
+"""State the verdict on a track in two sentences, and the meaning of each reason for refusal."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MEANINGS = {
 
 # Of fixes with a consistent covariance 1 % lie beyond three sigmas, and the mean NEES is 2.
 _BEYOND_SHARE, _MOST_NEES = 0.05, 8.0
-_CAUTIOUS = 2.0  # sigmas so many times the errors are said to be
+_CAUTIOUS = 2.0  # ratio of sigmas to errors from which sigmas are called cautious
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Verdict:
     """The verdict on a track.
 
     Attributes:
-        grade: "good", "mixed" or "bad"; "open" where there is no truth.
+        grade: "good", "mixed" or "bad"; "open" without truth.
         accuracy: one sentence on availability and accuracy.
         latency: one sentence on latency.
     """
@@ -49,7 +49,7 @@ class Verdict:
 
 
 def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float | None) -> Verdict:
-    """The verdict on a track, after what a diagnosis of the inputs found, where there was one.
+    """The verdict on a track, preceded by the diagnosis of the inputs, if there was one.
 
     Args:
         summary: figures of merit by :func:`scenematch.report.metrics.summarise`.
@@ -63,7 +63,7 @@ def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: flo
 
 
 def _judged(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float | None) -> Verdict:
-    """The verdict by the figures of merit alone."""
+    """The verdict from the figures of merit alone."""
     frames, fixes = summary["frames"], summary["fixes"]
     fixed = f"{fixes} of {frames} frames fixed"
     late = _latency(summary, budget_ms)
@@ -98,7 +98,7 @@ def _judged(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float 
 
 
 def _caution(nees: float) -> str:
-    """A sentence on sigmas that are much larger than the errors; empty where they fit."""
+    """A sentence on sigmas that are much larger than the errors; empty if they are not."""
     factor = math.sqrt(2.0 / max(nees, 1e-6))
     if factor < _CAUTIOUS:
         return ""

@@ -1,1 +1,1 @@
-"""Whole runs: what each command does, as functions. Their public names are those of :mod:`scenematch`."""
+"""Complete runs: one function for each command, exported by :mod:`scenematch`."""

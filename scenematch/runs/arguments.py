@@ -1,4 +1,4 @@
-"""Arguments of runs: positions and numbers that are read, choices that are checked; messages name the argument."""
+"""Arguments of runs: parse positions and numbers, check choices; messages name the argument."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from engine.runtime import device as devices
 from engine.values import MAX_SIGMA_M, Prior
 
 START_SIGMA_M = 15.0
-"""Uncertainty of a position that was given without one."""
+"""Uncertainty of a position given without one."""
 
 
 def parse_position(name: str, text: str | None) -> Prior | None:
-    """Read LAT,LON[,SIGMA_M]; None where nothing was given.
+    """Read LAT,LON[,SIGMA_M]; None if nothing was given.
 
     Raises:
-        OptionError: the text is of another form, or a number is out of range.
+        OptionError: the text has another form, or a number is out of range.
     """
     if text is None:
         return None
@@ -36,7 +36,7 @@ def parse_place(name: str, text: str) -> tuple[float, float]:
     """Read LAT,LON.
 
     Raises:
-        OptionError: the text is of another form, or a number is out of range.
+        OptionError: the text has another form, or a number is out of range.
     """
     lat_deg, lon_deg = _numbers(name, text, "LAT,LON", (2,), "in degrees")
     if not (abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0):
@@ -45,10 +45,10 @@ def parse_place(name: str, text: str) -> tuple[float, float]:
 
 
 def parse_circle(name: str, text: str | None) -> tuple[float, float, float] | None:
-    """Read LAT,LON,RADIUS_M; None where nothing was given.
+    """Read LAT,LON,RADIUS_M; None if nothing was given.
 
     Raises:
-        OptionError: the text is of another form, or a number is out of range.
+        OptionError: the text has another form, or a number is out of range.
     """
     if text is None:
         return None
@@ -59,10 +59,10 @@ def parse_circle(name: str, text: str | None) -> tuple[float, float, float] | No
 
 
 def parse_bounds(name: str, text: str | None) -> tuple[float, float, float, float] | None:
-    """Read W,S,E,N; None where nothing was given.
+    """Read W,S,E,N; None if nothing was given.
 
     Raises:
-        OptionError: the text is of another form, or a side does not lie before the other.
+        OptionError: the text has another form, or a side is not before its opposite.
     """
     if text is None:
         return None
@@ -73,7 +73,7 @@ def parse_bounds(name: str, text: str | None) -> tuple[float, float, float, floa
 
 
 def is_in_degrees(bounds: tuple[float, float, float, float]) -> bool:
-    """Whether bounds may be degrees: no map lies so near the origin of a projection in metres."""
+    """Whether bounds may be degrees: no map in metres is so near its projection's origin."""
     west, south, east, north = bounds
     return west >= -180.0 and east <= 540.0 and south >= -90.0 and north <= 90.0
 
@@ -91,7 +91,7 @@ def _numbers(
 
 
 def parse_budget(name: str, budget_ms: float | None) -> Budget | None:
-    """The budget of a frame; None where nothing was given. A search of the whole map is not held to it.
+    """The budget of a frame; None if nothing was given. It does not apply to a search of the whole map.
 
     Raises:
         OptionError: it is not a finite number above 0.
@@ -104,7 +104,7 @@ def parse_budget(name: str, budget_ms: float | None) -> Budget | None:
 
 
 def check_above(name: str, value: float | None, low: float, most: float) -> None:
-    """Refuse a number that is not above one limit and at most another; None is not given.
+    """Refuse a number that is not above one limit and at most another; None means not given.
 
     Raises:
         OptionError: it is not.
@@ -114,10 +114,10 @@ def check_above(name: str, value: float | None, low: float, most: float) -> None
 
 
 def check_every(every: int) -> None:
-    """Refuse a share of the frames that is none.
+    """Refuse an invalid frame interval.
 
     Raises:
-        OptionError: one frame in less than one is asked for, or in a fraction.
+        OptionError: it is not a whole number of 1 or more.
     """
     if not (isinstance(every, int) and every >= 1):
         raise OptionError(f"every: expected a whole number of 1 or more, got {every}")
@@ -137,11 +137,11 @@ def check_unused(given: Mapping[str, object], other: str) -> None:
     """Refuse arguments that have no effect without another one.
 
     Args:
-        given: values by argument; None where it was not given.
-        other: the argument that they go with.
+        given: values by argument; None if not given.
+        other: the argument that they need.
 
     Raises:
-        OptionError: names the first that was given.
+        OptionError: one was given; the message names the first.
     """
     for name, value in given.items():
         if value is not None:
@@ -149,10 +149,10 @@ def check_unused(given: Mapping[str, object], other: str) -> None:
 
 
 def check_device(device: str) -> None:
-    """Refuse a device that is not there.
+    """Refuse a device that does not exist.
 
     Raises:
         OptionError, DeviceError: see :func:`engine.runtime.device.resolve`.
     """
-    if device not in ("auto", "cpu"):  # these always are, and torch need not be asked
+    if device not in ("auto", "cpu"):  # these always exist, so torch is not loaded
         devices.resolve(device)

@@ -1,4 +1,4 @@
-"""What the bridge beside an autopilot reads: the map, the camera, and pictures that are taken or played."""
+"""Inputs of the MAVLink bridge: map, camera, and live or recorded pictures."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _MAX_GRAB_MS = 10_000.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BridgeFiles:
-    """The map, the camera, and where pictures come from: files or a camera, one of the two.
+    """The map, the camera, and the source of pictures: either files or a camera.
 
     Attributes:
         map: the map with its surface.
-        camera: what is said of the camera; else by the pictures that are played.
-        frames: pictures that are played at their own pace, a folder or a video.
-        telemetry: telemetry.csv or a log, whose stamps set that pace; None takes a video's own times.
+        camera: the camera; taken from the recorded pictures if not given.
+        frames: recorded pictures, a folder or a video, replayed in real time.
+        telemetry: telemetry.csv or a log that times the replay; None uses a video's own times.
         camera_source: number of a camera, URL of a stream, or ``exec:COMMAND`` that writes JPEG pictures.
-        rate_hz: pace of pictures without stamps; None is 10.
-        every: one of the pictures that are played in so many is used, at its own time.
-        exposure_to_grab_ms: how long the pictures of a camera take to get here; None is 0.
-        gimbal: whether a gimbal, whose attitude the autopilot reports, turns the camera from its mount.
+        rate_hz: rate of pictures without timestamps; None is 10.
+        every: replay every Nth picture, at its own time.
+        exposure_to_grab_ms: camera latency, from exposure to arrival here; None is 0.
+        gimbal: whether the camera is on a gimbal whose attitude the autopilot reports.
 
     Raises:
         OptionError: a number is out of its range, or an argument does not go with another.
@@ -73,11 +73,11 @@ class BridgeFiles:
                 "camera: expected a calibration of the camera that `camera_source` opens, or `hfov_deg`"
             )
         source = Path(self.camera_source or "")
-        if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():  # it would be read as fast as it can
+        if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():  # it would be read as fast as possible
             raise OptionError(f"camera_source: expected a camera, got the video {source}; `frames` plays it")
 
     def load_camera(self, progress: Progress = SILENT) -> Camera:
-        """The calibration, else what is said of the pictures or by them, for which a camera is opened once."""
+        """The calibration, or what the pictures give; a camera is opened once to get one."""
         if self.camera_source is not None:
             return self.camera.load_live(self.camera_source, progress=progress)
         if self.camera.camera is not None or self.frames is None:
@@ -86,9 +86,9 @@ class BridgeFiles:
         return self.camera.load(flight.source, flight.names, progress=progress)
 
     def pictures(self, wait: Callable[[], None] | None = None) -> Generator[CapturedImage | None, None, None]:
-        """Pictures as they are captured, None where a camera gives none for a while.
+        """Pictures as they are captured; None if the camera delivers none for a while.
 
-        Those of a flight that is played begin when ``wait`` returns.
+        A replay begins when ``wait`` returns.
         """
         if self.frames is not None:
             telemetry = None if self.telemetry is None else Path(self.telemetry)

@@ -1,4 +1,4 @@
-"""Measure how late a camera's pictures arrive, by the attitude of the autopilot that it is mounted on."""
+"""Measure a camera's latency by comparing its pictures with the autopilot's attitude."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SETTLED_NS = 200_000_000  # after which no older attitude arrives
 
 
 class _Idle:
-    """A navigator that has nothing to do: the bridge is opened for its telemetry."""
+    """A navigator that does nothing: the bridge is opened only for its telemetry."""
 
     def update(self, frame: Frame, prior: object = None, budget: object = None) -> NoFix:
         return NoFix(reason=Reason.NO_TEXTURE, timestamp_ns=frame.timestamp_ns)
@@ -46,16 +46,16 @@ def measure_camera_delay(
     """The time from exposure to grab, while the vehicle is tilted to and fro by hand over a textured ground.
 
     Args:
-        link: the autopilot, as of the bridge.
+        link: the autopilot, as for the bridge.
         camera: a calibration, or a field of view.
-        camera_source: as of the bridge.
-        seconds: how long pictures are taken, 5 or more; None is 20.
-        progress: is shown what to do.
+        camera_source: as for the bridge.
+        seconds: how long to take pictures, 5 or more; None is 20.
+        progress: receives instructions for the user.
 
     Raises:
         OptionError: neither or both of calibration and field of view are given.
         BackendError: the link cannot be opened.
-        TelemetryError: the camera does not open, or what it shows does not agree with the attitude.
+        TelemetryError: the camera does not open, or its pictures do not agree with the attitude.
     """
     require("pymavlink", "mavlink")
     from scenematch.bridges.mavlink import MavlinkBridge, MavlinkOptions

@@ -1,4 +1,4 @@
-"""The camera of a run: its calibration, or what else is known of its lens, and how it is mounted."""
+"""The camera of a run: its calibration or field of view, and its mount."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from scenematch.runs.progress import SILENT, Progress
 
 @dataclass(frozen=True, slots=True)
 class CameraInput:
-    """What is said of a camera; None where it is not.
+    """What the user states about a camera; None for each value not given.
 
     Attributes:
         camera: calibration of ROS, OpenCV or Kalibr, or a bag that has one.
-        hfov_deg: horizontal field of view, in place of a calibration.
-        mount: a key of :data:`engine.camera.MOUNTS`; None is the calibration's, else nadir.
-        camera_pitch_deg: of the optical axis, -90 looks straight down.
-        scale_calibration: whether the calibration is scaled to pictures of another size and the same shape.
+        hfov_deg: horizontal field of view, instead of a calibration.
+        mount: a key of :data:`engine.camera.MOUNTS`; None uses the calibration's, else nadir.
+        camera_pitch_deg: pitch of the optical axis, -90 looks straight down.
+        scale_calibration: scale the calibration to pictures of another size but the same aspect ratio.
 
     Raises:
-        OptionError: there is a field of view besides a calibration, or a value is out of range, or there is no
+        OptionError: both a field of view and a calibration are given, a value is out of range, or there is no
             calibration to scale.
     """
 
@@ -58,16 +58,16 @@ class CameraInput:
 
     @classmethod
     def of(cls, value: CameraInput | StrPath | None) -> CameraInput:
-        """The camera of which only the calibration is named, or nothing, or as it is."""
+        """The camera from a calibration's path, from None, or unchanged."""
         return value if isinstance(value, CameraInput) else cls(value)
 
     @property
     def has_mount(self) -> bool:
-        """Whether it is said how the camera is mounted."""
+        """Whether the mount is given."""
         return self.mount is not None or self.camera_pitch_deg is not None
 
     def mounted(self, camera: Camera) -> Camera:
-        """The camera as it is mounted."""
+        """The camera with its mount."""
         if not self.has_mount:
             return camera
         return replace(camera, mount=mount_rotation(self.mount or "nadir", self.camera_pitch_deg))
@@ -83,13 +83,13 @@ class CameraInput:
         """The camera of some frames.
 
         Args:
-            frames: the pictures; None where they are not known before they are taken.
-            names: of those pictures that are used; none is all.
-            image_topic: of the pictures, where the calibration is that of a bag with several.
-            progress: receives what a photograph's EXIF said.
+            frames: the pictures; None if they are still to be taken.
+            names: names of the pictures that are used; none is all.
+            image_topic: topic of the pictures, if the calibration is from a bag with several.
+            progress: receives what the photographs' EXIF states.
 
         Raises:
-            CalibrationError: the calibration cannot be read, or nothing says what the camera's focal length is.
+            CalibrationError: the calibration cannot be read, or nothing states the camera's focal length.
             TelemetryError: a picture cannot be read.
         """
         if self.hfov_deg is not None and frames is not None:
@@ -101,7 +101,9 @@ class CameraInput:
                 camera = _scaled(camera, frames.read((names or frames.names)[0]).shape, progress)
             return self.mounted(camera)
         if not isinstance(frames, PictureFolder):
-            raise CalibrationError("camera: expected a calibration, or `hfov_deg`: only photographs say theirs")
+            raise CalibrationError(
+                "camera: expected a calibration, or `hfov_deg`: only photographs contain theirs"
+            )
         try:
             found = photo_camera([frames.path / name for name in names or frames.names])
         except CalibrationError as error:
@@ -111,18 +113,18 @@ class CameraInput:
         return self.mounted(found.camera)
 
     def with_field_of_view(self, shape: tuple[int, ...]) -> Camera:
-        """The camera by ``hfov_deg`` and the shape (H, W, ...) of a picture."""
-        assert self.hfov_deg is not None  # or nobody asks
+        """The camera from ``hfov_deg`` and the shape (H, W, ...) of a picture."""
+        assert self.hfov_deg is not None  # checked by the callers
         height_px, width_px = shape[:2]
         return self.mounted(Camera.from_fov(width_px, height_px, self.hfov_deg))
 
     def load_live(self, camera_source: str, *, progress: Progress = SILENT) -> Camera:
-        """A camera whose pictures are still to come.
+        """A camera that has not taken pictures yet.
 
         Args:
-            camera_source: as of :func:`scenematch.bridges.pictures.capture`; by ``hfov_deg`` it is opened until
-                its first picture says its size, and closed again.
-            progress: receives what is waited for, and what the camera then is.
+            camera_source: as of :func:`scenematch.bridges.pictures.capture`; with ``hfov_deg`` it is opened once
+                to learn the size of its pictures.
+            progress: receives what the call waits for, and the camera found.
 
         Raises:
             CalibrationError: the calibration cannot be read, or there is none.
@@ -148,7 +150,7 @@ def _scaled(camera: Camera, shape: tuple[int, ...], progress: Progress) -> Camer
 
 
 def check_size(camera: Camera, shape: tuple[int, ...]) -> None:
-    """Refuse a picture of another size than the calibration's, with the argument that scales it.
+    """Refuse a picture whose size differs from the calibration's, and name the argument that scales it.
 
     Raises:
         CalibrationError: the sizes differ.
@@ -160,9 +162,9 @@ def check_size(camera: Camera, shape: tuple[int, ...]) -> None:
 
 
 def _way_out(camera: Camera, shape: tuple[int, ...]) -> str:
-    """What to do about a calibration for another size; one of another shape cannot be scaled."""
+    """How to use a calibration for another size; it can be scaled only to the same aspect ratio."""
     try:
         camera.scaled_to(shape[1], shape[0])
     except CalibrationError:
-        return "their shapes differ: give the calibration of these pictures"
-    return "if the pictures were made smaller or larger as a whole, add `scale_calibration`"
+        return "their aspect ratios differ: give the calibration of these pictures"
+    return "if the pictures were resized without cropping, add `scale_calibration`"

@@ -1,4 +1,4 @@
-"""Checking a flight before it is tracked: whether its inputs fit each other, and which change would make them."""
+"""Check a flight before tracking: whether its inputs agree, and which change would make them agree."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ def diagnose_flight(
     inputs: FlightInputs | None = None,
     progress: Progress = SILENT,
 ) -> Diagnosis:
-    """Compare telemetry, camera, clock and map of a flight with what its pictures show by themselves.
+    """Compare a flight's telemetry, camera, clock and map with what its pictures show.
 
     Args:
-        files: of the flight.
-        start: where it begins, "LAT,LON" or "LAT,LON,SIGMA_M"; None takes the telemetry's positions.
-        columns: what the telemetry.csv calls a column, by our name for it.
-        inputs: what :func:`scenematch.runs.inputs.open_inputs` read of the files.
-        progress: is shown what is read.
+        files: files of the flight.
+        start: where it begins, "LAT,LON" or "LAT,LON,SIGMA_M"; None uses the telemetry's positions.
+        columns: the column names of telemetry.csv, by our names.
+        inputs: the inputs, if :func:`scenematch.runs.inputs.open_inputs` has already read them.
+        progress: receives progress and messages.
 
     Returns:
-        Diagnosis: what does not fit.
+        Diagnosis: what does not agree.
 
     Raises:
-        OptionError, TelemetryError, CalibrationError, MapError: an argument or a file is not as expected.
+        OptionError, TelemetryError, CalibrationError, MapError: an argument or a file is invalid.
     """
     settings = TrackSettings(method="sift", start=start, telemetry_columns=dict(columns))
     inputs = inputs or open_inputs(files, [settings], progress=progress)
@@ -51,7 +51,7 @@ def diagnose_flight(
     positions = [row.prior for row in flight.rows] or [None] * len(flight)
     stamps = [row.timestamp_ns for row in flight.rows]
     reference = [_of_truth(stamp, inputs.truth) for stamp in stamps] if inputs.truth and stamps else positions
-    with progress.task("placing pictures without the telemetry"):
+    with progress.task("locating pictures without the telemetry"):
         found = diagnose(
             flight.rows or [flight.read(0).frame] * len(flight),
             lambda index: flight.read(index).frame,
@@ -61,7 +61,7 @@ def diagnose_flight(
             start=begin,
             reference=reference,
         )
-    # A bag holds its calibration, which cannot be written to.
+    # A bag contains its calibration and cannot be edited.
     cures = [
         _that_can_be_set(one, flight.has_gimbal, files.camera.camera not in (None, files.frames))
         for one in found.findings
@@ -70,13 +70,13 @@ def diagnose_flight(
 
 
 def _that_can_be_set(finding: Finding, has_gimbal: bool, has_calibration: bool) -> Finding:
-    """A finding whose cure is possible: not every flight has a mount that can be written somewhere."""
+    """A finding with a cure that applies: some flights have no file to write a mount into."""
     line, where, _ = finding.cure.partition(IN_CALIBRATION)
     if finding.cause != "mount" or not (has_gimbal or where):
         return finding
     if has_gimbal:
         return replace(
-            finding, cure="beside a gimbal's angles no mount is set: correct the angles, with --correct "
+            finding, cure="the gimbal's angles replace a mount: correct the angles with --correct "
             "roll_deg=roll_deg+DEG, --correct pitch_deg=pitch_deg+DEG or --correct heading_offset_deg=DEG",
         )  # fmt: skip
     return (
@@ -94,22 +94,24 @@ def _of_truth(stamp_ns: int, truth: list[Truth]) -> Prior | None:
 
 
 def as_rows(found: Diagnosis, *, corrected: bool = False) -> list[tuple[str, str]]:
-    """What a diagnosis says, a name and a sentence a row.
+    """A diagnosis as rows, each a name and a sentence.
 
     Args:
         found: the diagnosis.
-        corrected: whether the telemetry was corrected already: what is found comes on top of that.
+        corrected: whether the telemetry was already corrected; the findings then add to that.
     """
-    seen = f"{found.seen} of {found.looked_at} pictures were placed on the map without the telemetry"
-    more = ", on top of the corrections that were given" if corrected else ""
+    seen = f"{found.seen} of {found.looked_at} pictures were located on the map without the telemetry"
+    more = ", in addition to the given corrections" if corrected else ""
     out = []
     for one in found.findings:
         cure = f"try {one.cure}{more}" if one.cure.startswith("--") else one.cure
         out.append((one.cause.replace("_", " "), f"{one.text}; {cure}"))
     if found.seen < _LEAST_SEEN:
-        seen += ", too few to say more: is it the map of this place and season, the calibration of this camera?"
+        seen += (
+            ", too few to say more: does the map show this place and season, and is the calibration this camera's?"
+        )
     elif not out and found.compared:
-        seen += f"; they fit what is said of {', '.join(found.compared)}{_contradicted(found, ', but ')}"
+        seen += f"; they agree with the {', '.join(found.compared)}{_contradicted(found, ', but ')}"
     elif not out:
         seen += "; there is no telemetry to compare them with"
     else:
@@ -118,7 +120,7 @@ def as_rows(found: Diagnosis, *, corrected: bool = False) -> list[tuple[str, str
 
 
 def _contradicted(found: Diagnosis, before: str) -> str:
-    """Which share of the pictures contradicts which field, the largest first; "" where none does."""
+    """The share of pictures that contradict each field, largest first; "" if none do."""
     shares = sorted(
         (one for one in found.contradicted if one.pictures),
         key=lambda one: one.pictures / one.compared, reverse=True,

@@ -1,4 +1,4 @@
-"""What can be wrong with a flight as a whole: found before a run begins and before its folder is created."""
+"""Check a flight as a whole, before a run begins and before its folder is created."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from scenematch.runs.progress import SILENT, Progress
 
 
 def check_pictures(flight: Flight, camera: Camera, progress: Progress = SILENT) -> None:
-    """Every picture decodes and is of the camera's size; of a video only the first frame is looked at.
+    """Check that every picture decodes and has the camera's size; of a video only the first frame is checked.
 
     Raises:
-        TelemetryError: a picture is empty, truncated or none.
-        CalibrationError: a picture is of another size.
+        TelemetryError: a picture is empty, truncated or not a picture.
+        CalibrationError: a picture has another size.
     """
     source = flight.source
     if not isinstance(source, PictureFolder):
@@ -37,7 +37,7 @@ def check_pictures(flight: Flight, camera: Camera, progress: Progress = SILENT) 
 
 
 def _decoded_size(path: str) -> tuple[int, int]:
-    """Width and height; a JPEG is decoded at an eighth, of a PNG the checksums are read, others are decoded."""
+    """Width and height; a JPEG is decoded at 1/8 scale, of a PNG the checksums are read, others are decoded."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -55,66 +55,65 @@ def _decoded_size(path: str) -> tuple[int, int]:
 
 
 def check_gimbal(flight: Flight, camera: Camera) -> None:
-    """Refuse a mount besides the angles of a gimbal, which say by themselves where the camera looks.
+    """Refuse a mount in addition to a gimbal's angles, which already state where the camera looks.
 
     Raises:
         CalibrationError: the camera would be turned twice.
     """
     if flight.has_gimbal and not np.allclose(camera.mount, mount_rotation(), atol=1e-3):
         raise CalibrationError(
-            "mount: expected nadir, since the telemetry has the angles of a gimbal and they say where the camera "
-            "looks"
+            "mount: expected nadir, since the telemetry's gimbal angles already state where the camera looks"
         )
 
 
 def _needs(method: str, profile: str) -> list[str]:
-    """What of the telemetry a method cannot do without."""
+    """Telemetry that a method requires."""
     needs = ["height_agl_m"] if profile == "paper" or method == "ncc" else []
     return [*needs, "heading_deg"] if method == "ncc" else needs
 
 
 def say_what_lacks(flight: Flight, method: str, profile: str, progress: Progress) -> None:
-    """Of how many frames it is known beforehand that the method will refuse them, and which does not."""
+    """Report how many frames the method will certainly refuse, and which method would not."""
     for name in _needs(method, profile):
         lacking = sum(getattr(row, name) is None for row in flight.rows)
         if lacking:
-            other = "" if profile == "paper" else "; sift and auto do without"
-            progress.message(f"{lacking} of {len(flight)} frames lack {name}, {method} refuses them{other}")
+            other = "" if profile == "paper" else "; sift and auto do not need it"
+            progress.message(f"{lacking} of {len(flight)} frames lack {name}, so {method} will refuse them{other}")
 
 
 def check_needs(flight: Flight, method: str, profile: str) -> None:
-    """Refuse a method to which no frame gives what it needs.
+    """Refuse a method if no frame has the telemetry that it needs.
 
     Raises:
         TelemetryError: every frame would be refused.
     """
     needs = _needs(method, profile)
     if needs and not any(all(getattr(row, name) is not None for name in needs) for row in flight.rows):
-        other = "" if profile == "paper" else "; sift and auto do without"
+        other = "" if profile == "paper" else "; sift and auto do not need it"
         asked, doubts = " and ".join(needs), "".join(f"; {remark}" for remark in flight.remarks)
         raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}{doubts}")
 
 
 def check_start(start: Prior | None, site: OrthoMap) -> None:
-    """Refuse a flight without a beginning over a map that is too large to be searched for one.
+    """Refuse a flight without a start if the map is too large to search.
 
     Raises:
         OptionError: no position is known.
     """
     if start is None and not site.is_searchable:
         raise OptionError(
-            f"start: expected a place to begin at, as LAT,LON or LAT,LON,SIGMA_M: the map of {site.size_km} is "
-            "not searched as a whole, and the telemetry has no position"
+            f"start: expected LAT,LON or LAT,LON,SIGMA_M: the map of {site.size_km} is too large to search, "
+            "and the telemetry has no position"
         )
 
 
 def check_position(
     name: str, position: Prior | None, site: OrthoMap, error: type[OptionError | TelemetryError]
 ) -> None:
-    """Refuse a position in latitude and longitude that has nothing to do with the map.
+    """Refuse a latitude and longitude far off the map.
 
     Raises:
-        OptionError, TelemetryError: as asked; it lies further off than the map is large.
+        OptionError, TelemetryError: as requested; it is further away than the map is wide.
     """
     from pyproj import Geod
 
@@ -130,7 +129,7 @@ def check_position(
     limit_m = extent_m + 3.0 * position.sigma_m
     if distance_m > limit_m:
         is_swapped = abs(position.lon_deg) <= 90.0 and off_m(position.lon_deg, position.lat_deg) <= limit_m
-        hint = "; latitude and longitude are swapped?" if is_swapped else ""
+        hint = "; are latitude and longitude swapped?" if is_swapped else ""
         raise error(
             f"{name}: expected a place on the map {site.name}, got {position.lat_deg:g},{position.lon_deg:g}, "
             f"{distance_m / 1000.0:,.1f} km from its middle ({middle.lat_deg:.5f},{middle.lon_deg:.5f}){hint}"

@@ -1,4 +1,4 @@
-"""The closed loop: a simulated vehicle that flies by the engine's fixes, with its folder, track and figures."""
+"""The closed loop: fly a simulated vehicle by the engine's fixes, and write its folder, track and figures."""
 
 from __future__ import annotations
 
@@ -45,23 +45,23 @@ if TYPE_CHECKING:  # rerun is optional
     from scenematch.report.live_view import LiveView
 
 FAULT_START_S = 60.0
-"""When a fault begins; in a flight that is shorter than twice that, halfway."""
-_MIN_HALF_SIDE_M = 10.0  # half of a side of the rounds
-_EDGE_M = 6.0  # that a level footprint keeps from the map's edge
+"""When a fault begins; halfway if the flight is shorter than twice that."""
+_MIN_HALF_SIDE_M = 10.0  # half a side of the circuit
+_EDGE_M = 6.0  # distance from a level footprint to the map's edge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClosedLoopSettings:
-    """How the loop is closed.
+    """Settings of the closed loop.
 
     Attributes:
         minutes: of flight.
         method: "auto", "ncc" or "sift".
-        fault: what goes wrong: "none", "killed", "shifted" or "frozen".
-        device: where tensors live.
+        fault: fault to inject: "none", "killed", "shifted" or "frozen".
+        device: to compute on.
 
     Raises:
-        OptionError: a word or a number is none of those that are expected.
+        OptionError: a word or a number is invalid.
         DeviceError: the device is missing.
     """
 
@@ -78,7 +78,7 @@ class ClosedLoopSettings:
         check_device(self.device)
 
     def planned_fault(self) -> Fault:
-        """The fault with its times: ten seconds, but a map that is shifted stays so."""
+        """The fault with its times: ten seconds, but a shifted map stays shifted."""
         start_s = min(FAULT_START_S, 30.0 * self.minutes)
         return Fault(kind=self.fault, start_s=start_s, duration_s=math.inf if self.fault == "shifted" else 10.0)
 
@@ -96,11 +96,11 @@ def fly_closed_loop(
 
     Args:
         out: the folder.
-        world: what is flown over; None is the first town.
-        loop: how the loop is closed; None is the defaults.
-        force: whether the folder may be there already.
-        live_view: where the live view goes.
-        progress: is shown what the run does.
+        world: what to fly over; None is the first town.
+        loop: settings of the loop; None uses the defaults.
+        force: whether the folder may already exist.
+        live_view: where to send the live view.
+        progress: receives progress and messages.
 
     Returns:
         The figures, as loop.json has them.
@@ -128,7 +128,7 @@ def fly_closed_loop(
 
 
 def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: Progress) -> dict[str, Any]:
-    """Track, record, figures of merit and report of a flight that was flown."""
+    """Write track, record, figures of merit and report of a finished flight."""
     flown, latency_ms = flight.flown, 1e3 * flight.options.latency_s
     answers = [(_name(k), answer) for k, answer in enumerate(flown.answers)]
     rows = [track_row(name, answer.result, latency_ms=latency_ms, deadline_met=None) for name, answer in answers]
@@ -138,7 +138,7 @@ def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: P
     write_notes(out / NOTES, notes)
     write_loop_csv(out / LOOP, flown)
     (out / SUMMARY).write_text(json.dumps({"settings": record.facts()}), encoding="utf-8")
-    summary = redraw(out, progress=progress)  # as any finished track, so that evaluate gives the same
+    summary = redraw(out, progress=progress)  # like any finished track, so that evaluate gives the same
     figures = summarise_loop(flown)
     figures |= {name: summary[name] for name in ("availability", "wrong_over_10m", "false_fixes")}
     (out / "loop.json").write_text(
@@ -150,7 +150,7 @@ def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: P
 def plan_closed_loop(
     town: Town, camera: Camera, matcher: SceneMatcher, seed: int, loop: ClosedLoopSettings
 ) -> ClosedLoop:
-    """The flight by its settings, not begun yet: rounds of the town, 150 m above its ground."""
+    """The flight before it begins: circuits of the town, 150 m above its ground."""
     site = matcher.site
     style = FlightStyle()
     corner = np.linalg.inv(camera.matrix) @ (camera.width_px - 0.5, camera.height_px - 0.5, 1.0)
@@ -176,7 +176,7 @@ def _name(k: int) -> str:
 
 
 def _fly(flight: ClosedLoop, seconds: float, view: LiveView | None) -> Iterator[Frame]:
-    """The frames of a flight while it is flown, each shown once it is answered."""
+    """The frames of a flight in progress, each shown once it is answered."""
     latency_ms = 1e3 * flight.options.latency_s
     for k, frame in enumerate(flight.fly(seconds)):
         if view is not None:
@@ -188,7 +188,7 @@ def _fly(flight: ClosedLoop, seconds: float, view: LiveView | None) -> Iterator[
 def _write_folder(
     out: Path, frames: Iterator[Frame], flight: ClosedLoop, town: Town, camera: Camera, site: OrthoMap
 ) -> None:
-    """Fly, and write the folder as it goes: pictures, telemetry by the filter, truth, camera and map."""
+    """Fly, and write the folder meanwhile: pictures, telemetry from the filter, truth, camera and map."""
     start = flight.flown.start_m
     lat, lon = site.frame.geodetic_from_enu(start[0], start[1])
     write_flight_folder(
@@ -207,7 +207,7 @@ def _write_folder(
 
 
 def _truth_rows(flight: ClosedLoop, town: Town, site: OrthoMap) -> Iterator[Truth]:
-    """Where the vehicle really was, ten times a second; known once it has been flown."""
+    """The true positions, ten per second; available after the flight."""
     for row in flight.flown.record:
         east, north, up = (float(v) for v in row.truth.position_m)
         lat, lon = site.frame.geodetic_from_enu(east, north)
@@ -227,7 +227,7 @@ def _truth_rows(flight: ClosedLoop, town: Town, site: OrthoMap) -> Iterator[Trut
 def _record(
     out: Path, world: WorldSettings, loop: ClosedLoopSettings, site: OrthoMap, town: Town, device: str
 ) -> RunRecord:
-    """What a run was made of, as ``track`` records it, so that ``evaluate`` reads it."""
+    """The record of a run in ``track``'s form, so that ``evaluate`` can read it."""
     files: dict[str, Any] = {name: str((out / file).resolve()) for name, file in FOLDER_LAYOUT.items()}
     return RunRecord(
         **files,

@@ -1,4 +1,4 @@
-"""Comparing methods, profiles or settings over one flight: a folder a run, one table and one chart of all."""
+"""Compare methods, profiles or settings on one flight: a folder for each run, one table and one chart."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from scenematch.runs.tracking import track
 
 TABLE, CHART = "table.json", "comparison.png"
 DEFAULT_RUNS = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")
-"""What is compared unless named: the paper's Table I."""
+"""The default runs: the paper's Table I."""
 
 
 def parse_runs(
@@ -32,15 +32,15 @@ def parse_runs(
     settings: Sequence[StrPath] = (),
     **overrides: Any,
 ) -> dict[str, TrackSettings]:
-    """Settings by the name of their run, from METHOD, METHOD/PROFILE or a settings file each.
+    """Settings by run name; each run is given as METHOD, METHOD/PROFILE or a settings file.
 
     Args:
-        texts: one a run; none of them is :data:`DEFAULT_RUNS`.
-        settings: of all runs, files or NAME=VALUE; a run's own file counts more.
-        overrides: settings that hold for all of them, where not None.
+        texts: one for each run; none means :data:`DEFAULT_RUNS`.
+        settings: for all runs, files or NAME=VALUE; a run's own file takes precedence.
+        overrides: settings for all runs; None is ignored.
 
     Raises:
-        OptionError: a text is none of these, or two runs have one name.
+        OptionError: a text is none of these, or two runs have the same name.
     """
     texts = texts or DEFAULT_RUNS
     runs: dict[str, TrackSettings] = {}
@@ -72,23 +72,23 @@ def compare(
     force: bool = False,
     progress: Progress = SILENT,
 ) -> dict[str, dict[str, Any]]:
-    """Follow the flight once for each run; each has the folder that :func:`scenematch.track` writes.
+    """Track the flight once for each run; each run has the folder that :func:`scenematch.track` writes.
 
     The inputs are read and checked against every run's settings before the first run begins and before a folder
     is created.
 
     Args:
         files: of the flight.
-        out: the folder, with one folder a run in it.
-        runs: settings by the name of their run; None is :data:`DEFAULT_RUNS`.
-        force: whether the folders may be there already.
-        progress: is shown what the runs do.
+        out: the folder, with one subfolder for each run.
+        runs: settings by run name; None means :data:`DEFAULT_RUNS`.
+        force: whether the folders may already exist.
+        progress: receives progress and messages.
 
     Returns:
         The summaries by name, which ``table.json`` holds too.
 
     Raises:
-        MissingExtraError: matplotlib, which draws the chart, is not installed.
+        MissingExtraError: matplotlib is not installed; it draws the chart.
     """
     require("matplotlib", "desk")
     out, runs = Path(out), parse_runs() if runs is None else runs

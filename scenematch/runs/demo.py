@@ -1,4 +1,4 @@
-"""The demo: the built-in flight, matched by both methods in both profiles, beside what the paper states."""
+"""The demo: the built-in flight, tracked by both methods in both profiles, beside the paper's figures."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ def run_demo(
     force: bool = False,
     progress: Progress = SILENT,
 ) -> dict[str, dict[str, Any]]:
-    """Fly and match; the folder holds the flight, and what :func:`scenematch.runs.comparison.compare` writes.
+    """Fly and match; the folder contains the flight and the output of :func:`scenematch.runs.comparison.compare`.
 
     Args:
         out: the folder.
-        frames: flies only the first so many; None is all.
+        frames: number of frames to fly; None is all.
         seed: of town, path, sensors and camera.
-        device: where tensors live.
-        force: whether the folder may be there already.
-        progress: is shown what the runs do.
+        device: to compute on.
+        force: whether the folder may already exist.
+        progress: receives progress and messages.
 
     Returns:
         The summaries by the name of their run, such as "ncc-paper".
 
     Raises:
-        MissingExtraError: matplotlib, which draws the chart, is not installed.
+        MissingExtraError: matplotlib is not installed; it draws the chart.
     """
     require("matplotlib", "desk")
     out = Path(out)

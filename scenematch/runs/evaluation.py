@@ -1,4 +1,4 @@
-"""Scoring a finished track again, perhaps with another truth."""
+"""Score a finished track again, optionally against another truth."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def evaluate(
     """Score a finished track again, if there is truth, and rewrite its summary and page.
 
     Args:
-        folder: of a finished run.
-        truth: truth.csv, a log or a folder of photographs; None is the one that the run had.
-        force: without another truth, whether the page may lose frames that are not there any more.
-        progress: is shown what the run does.
+        folder: folder of a finished run.
+        truth: truth.csv, a log or a folder of photographs; None uses the run's own.
+        force: without another truth, allow the page to lose frames that no longer exist.
+        progress: receives progress and messages.
 
     Returns:
         The summary.
@@ -47,13 +47,13 @@ def evaluate(
 def redraw(
     folder: Path, truth: StrPath | None = None, *, keep_frames: bool = False, progress: Progress = SILENT
 ) -> dict[str, Any]:
-    """Write the results of a finished run again, by its own record.
+    """Rewrite the results of a finished run from its own record.
 
     Args:
         folder: of the run.
-        truth: in place of the one that the run had.
-        keep_frames: whether a page that shows frames is not to be replaced by one that cannot show them any more.
-        progress: is shown what the run does.
+        truth: replaces the run's own.
+        keep_frames: do not replace a page that shows frames by one that no longer can.
+        progress: receives progress and messages.
 
     Returns:
         The summary.
@@ -73,10 +73,10 @@ def redraw(
     if frames.flight is None and shows_frames(folder / PAGE):
         if keep_frames:
             raise OptionError(
-                f"runs: {folder / PAGE} shows frames, which are lost if it is drawn again; add `force` to do so; "
+                f"runs: {folder / PAGE} shows frames, which redrawing would lose; add `force` to do it anyway; "
                 f"{frames.why_missing}"
             )
-        progress.message(f"{folder / PAGE} loses the frames that it showed: {frames.why_missing}")
+        progress.message(f"{folder / PAGE} loses the frames that it shows: {frames.why_missing}")
     if path is not None:
         record = replace(record, truth=str(Path(path).resolve()))
     return write_results(folder, rows, truth_rows, site, ground, record, frames, progress=progress)
@@ -88,7 +88,7 @@ def open_recorded_map(record: RunRecord, progress: Progress = SILENT) -> OrthoMa
 
 
 def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> ReportFrames:
-    """The flight and the matcher of a finished run, as far as its record and its files still give them."""
+    """The flight and matcher of a finished run, if its record and files still provide them."""
     try:
         values = {"method": record.method, "profile": record.profile} | dict(record.changed)
         settings = options_from_mapping(TrackSettings, nested(values))
@@ -97,7 +97,7 @@ def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> R
         stamps = [row.timestamp_ns for row in flight.rows]
         recorded = [row.timestamp_ns for row in rows if row.timestamp_ns is not None]
         if (stamps, flight.names) != (recorded, [row.frame for row in rows]):
-            return ReportFrames(why_missing="the frames or their telemetry are not those of the run any more.")
+            return ReportFrames(why_missing="the frames or their telemetry have changed since the run.")
         camera, options = files.load_camera(flight), settings.matcher_options()
         return ReportFrames(flight, SceneMatcher(site, camera, settings.method, settings.device, options))
     except (EngineError, OSError) as error:
@@ -109,7 +109,7 @@ def recorded_files(record: RunRecord) -> FlightFiles:
 
     Raises:
         TelemetryError: the record does not name the frames.
-        OptionError: what it names does not go together.
+        OptionError: the files that it names do not fit together.
     """
     if record.frames is None:
         raise TelemetryError("the record of the run lacks its frames")

@@ -1,4 +1,4 @@
-"""Output folders and files: checked before any work is done for them, and never replaced unless asked to."""
+"""Output folders and files: checked before any work is done, and replaced only on request."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ StrPath: TypeAlias = str | Path
 
 
 def check_folder(out: Path, force: bool) -> None:
-    """Refuse an output folder that is there already, before any work is done for it.
+    """Refuse an existing output folder before any work is done.
 
     Raises:
-        OptionError: it is there and ``force`` was not given, or it or a parent of it is a file.
+        OptionError: it exists and ``force`` was not given, or it or one of its parents is a file.
     """
     if out.is_dir():
         if not force:
@@ -30,10 +30,10 @@ def check_folder(out: Path, force: bool) -> None:
 
 
 def check_file(out: Path, force: bool) -> None:
-    """Refuse an output file that is there already.
+    """Refuse an existing output file.
 
     Raises:
-        OptionError: it is there and ``force`` was not given, or it is a folder.
+        OptionError: it exists and ``force`` was not given, or it is a folder.
     """
     if out.is_dir():
         raise OptionError(f"out: expected a file, but {out} is a folder")
@@ -42,12 +42,12 @@ def check_file(out: Path, force: bool) -> None:
 
 
 def prepare_folder(out: Path, force: bool, owned: Sequence[str]) -> None:
-    """Create the output folder; with ``force`` the results of an older run leave it, and nothing else does.
+    """Create the output folder; with ``force``, delete the results of an older run and nothing else.
 
     Args:
         out: the folder.
-        force: whether it may be there already.
-        owned: patterns of the files that a run writes, relative to the folder.
+        force: whether it may already exist.
+        owned: patterns of files that a run writes, relative to the folder.
 
     Raises:
         OptionError: see :func:`check_folder`.

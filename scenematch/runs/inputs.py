@@ -1,4 +1,4 @@
-"""The inputs of a run: the files of a flight, opened and checked against each other before the run begins."""
+"""The inputs of a run: open a flight's files and check that they fit together before the run begins."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ FOLDER_LAYOUT = {
     "telemetry": "telemetry.csv",
     "truth": "truth.csv",
 }
-"""The files of a flight folder by what they are."""
+"""The usual file names in a flight folder, by field."""
 _OPTIONAL = ("surface", "camera", "telemetry", "truth")
 
 
@@ -49,22 +49,21 @@ class FlightFiles:
     """The files of one flight.
 
     Attributes:
-        map: the map with its surface; of a map that says all else itself, its path.
-        camera: what is said of the camera, or the path of its calibration; None takes a bag's own, or the
-            photographs' EXIF.
+        map: the map with its surface, or just the path of the map.
+        camera: the camera, or the path of its calibration; None uses a bag's own, or the photographs' EXIF.
         frames: folder of pictures, video or bag.
-        telemetry: telemetry.csv or a log; None takes the bag's own, the subtitles beside a video, or the
-            pictures' EXIF.
-        truth: truth.csv, a log or a folder of photographs; None takes the truth.csv beside the telemetry.
-        frame_stamps: with a log, a CSV with timestamp_ns and frame.
-        log_offset_s: with a log, added to the frames' stamps.
-        image_topic: of the pictures, where the frames are a bag with several.
-        odometry_topic: another odometry that the velocity is taken from, where the telemetry is a bag.
-        every: one frame in so many is used, from the first on.
-        corrections: of telemetry that is wrong in a known way.
+        telemetry: telemetry.csv or a log; None uses the bag's own, the subtitles beside a video, or the pictures'
+            EXIF.
+        truth: truth.csv, a log or a folder of photographs; None uses truth.csv beside the telemetry.
+        frame_stamps: CSV with timestamp_ns and frame, if the telemetry is a log.
+        log_offset_s: added to the frames' timestamps, if the telemetry is a log.
+        image_topic: topic of the pictures, if the frames are a bag with several.
+        odometry_topic: topic of another odometry that provides the velocity, if the telemetry is a bag.
+        every: use every Nth frame, starting with the first.
+        corrections: for telemetry that is wrong in a known way.
 
     Raises:
-        OptionError: a file does not go with another.
+        OptionError: a file does not fit another.
     """
 
     map: MapInput
@@ -102,7 +101,7 @@ class FlightFiles:
         if camera.camera is None and is_bag(frames):
             camera = replace(camera, camera=frames)
         if camera.camera is None and camera.hfov_deg is None and Path(frames).suffix.lower() in VIDEO_SUFFIXES:
-            raise OptionError("camera: expected a calibration, or `hfov_deg`: a video has neither within itself")
+            raise OptionError("camera: expected a calibration, or `hfov_deg`: a video contains neither")
         if (frame_stamps is not None or log_offset_s) and (telemetry is None or not is_log(telemetry)):
             raise OptionError(f"frame_stamps, log_offset_s: expected a log as telemetry, got {telemetry}")
         if image_topic is not None and not is_bag(frames):
@@ -122,7 +121,7 @@ class FlightFiles:
 
     @classmethod
     def from_flat(cls, **values: Any) -> FlightFiles:
-        """The files by :meth:`flat` names, those of map and camera among them."""
+        """The files by their names in :meth:`flat`, including those of map and camera."""
 
         def taken(kind: type[MapInput | CameraInput]) -> dict[str, Any]:
             return {each.name: values.pop(each.name) for each in fields(kind) if each.name in values}
@@ -130,7 +129,7 @@ class FlightFiles:
         return cls(map=MapInput(**taken(MapInput)), camera=CameraInput(**taken(CameraInput)), **values)
 
     def flat(self) -> dict[str, Any]:
-        """All fields by name, those of map and camera in their place."""
+        """All fields by name, with the fields of map and camera in their place."""
         own = {each.name: getattr(self, each.name) for each in fields(self)}
         return asdict(own.pop("map")) | asdict(own.pop("camera")) | own
 
@@ -138,7 +137,7 @@ class FlightFiles:
     def in_folder(cls, folder: StrPath) -> FlightFiles:
         """The files of a flight folder by their usual names.
 
-        Surface, camera, telemetry and truth are those that are there.
+        Surface, camera, telemetry and truth are used if they exist.
         """
         paths: dict[str, Any] = {name: Path(folder) / file for name, file in FOLDER_LAYOUT.items()}
         there = {name: path for name, path in paths.items() if name not in _OPTIONAL or path.exists()}
@@ -146,27 +145,27 @@ class FlightFiles:
 
     @property
     def has_clock(self) -> bool:
-        """Whether it is given when the frames were taken."""
+        """Whether the capture times of the frames are given."""
         return self.frame_stamps is not None or self.log_offset_s != 0.0
 
     def clock(self) -> LogClock:
-        """When the frames were taken, where the telemetry is a log."""
+        """The capture times of the frames, if the telemetry is a log."""
         return LogClock(self.frame_stamps, self.log_offset_s)
 
     def load_camera(self, flight: Flight, progress: Progress = SILENT) -> Camera:
-        """The calibration, of a file, a bag or the photographs of the flight."""
+        """The calibration from a file, a bag or the photographs of the flight."""
         camera = self.camera.load(flight.source, flight.names, image_topic=self.image_topic, progress=progress)
         check_gimbal(flight, camera)
         return camera
 
     def open_flight(self, columns: Mapping[str, str] = {}) -> Flight:
-        """The frames with what is known of each, corrected.
+        """The frames with their corrected telemetry.
 
         Args:
-            columns: what the telemetry.csv calls a column, by our name for it.
+            columns: the column names of telemetry.csv, by our names.
 
         Raises:
-            OptionError: columns are named, and the telemetry is no table.
+            OptionError: columns are named, but the telemetry is not a table.
         """
         if columns and (self.telemetry is None or is_log(self.telemetry)):
             raise OptionError(f"telemetry_columns: expected a table as telemetry, got {self.telemetry}")
@@ -174,12 +173,12 @@ class FlightFiles:
             self.frames, self.telemetry, clock=self.clock(), image_topic=self.image_topic, columns=columns,
             odometry_topic=self.odometry_topic,
         )  # fmt: skip
-        if not self.corrections.changes_nothing:  # before frames are left out: they interpolate between rows
+        if not self.corrections.changes_nothing:  # before frames are dropped, because it interpolates between rows
             flight = replace(flight, rows=self.corrections.applied(flight.rows))
         return flight.every(self.every)
 
     def find_truth(self) -> Path | None:
-        """The truth that was named, else ``truth.csv`` beside the telemetry where there is one."""
+        """The given truth, else ``truth.csv`` beside the telemetry if it exists."""
         if self.truth is not None or self.telemetry is None:
             return self.truth
         beside = self.telemetry.with_name(FOLDER_LAYOUT["truth"])
@@ -188,7 +187,7 @@ class FlightFiles:
 
 @dataclass(frozen=True)
 class FlightInputs:
-    """A flight whose every part was read and found to fit the others."""
+    """A flight whose parts have been read and fit together."""
 
     site: OrthoMap
     camera: Camera
@@ -198,11 +197,11 @@ class FlightInputs:
 
 
 def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: Progress = SILENT) -> FlightInputs:
-    """Read what runs of one flight need, and check it against the settings of every run.
+    """Read the inputs that runs of one flight share, and check them against each run's settings.
 
     Raises:
-        OptionError, TelemetryError, CalibrationError, MapError: something cannot be read, or does not belong
-            together, or is of no use to one of the runs.
+        OptionError, TelemetryError, CalibrationError, MapError: something cannot be read, does not fit together,
+            or cannot be used by one of the runs.
     """
     site = files.map.open(progress)
     flight = files.open_flight(_columns(runs))
@@ -225,30 +224,30 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
             check_start(first, site)
     check_pictures(flight, camera, progress)
     if files.every > 1:
-        progress.message(f"one frame in {files.every} is used, {len(flight)} of all")
+        progress.message(f"using one frame in {files.every}, {len(flight)} in all")
     if flight.unused:
-        progress.message(f"frames without a row in the telemetry, left out: {flight.unused}")
+        progress.message(f"frames left out because the telemetry has no row: {flight.unused}")
     for remark in flight.remarks:
         progress.message(remark)
     if flight.heights:
         counts = ", ".join(f"{source} {count}" for source, count in flight.heights.items())
-        progress.message(f"height above ground, by source, of {len(flight)} frames: {counts}")
+        progress.message(f"height above ground of {len(flight)} frames, by source: {counts}")
     return FlightInputs(site, camera, flight, truth_path, truth)
 
 
 def open_run_truth(path: Path, stamp_ns: int | None, progress: Progress = SILENT) -> list[Truth]:
-    """Read a truth (:func:`scenematch.files.logs.readers.open_truth`), and say where it is a receiver's only."""
+    """Read a truth (:func:`scenematch.files.logs.readers.open_truth`), and report if it is only a receiver's."""
     truth = open_truth(path, stamp_ns)
     if is_photographs(path):
         progress.message(
-            f"truth: {len(truth)} positions in the photographs' EXIF, by their receiver: the errors hold its own, "
+            f"truth: {len(truth)} positions from the photographs' EXIF, by a receiver: errors include its own, "
             "of metres"
         )
     return truth
 
 
 def _columns(runs: Sequence[TrackSettings]) -> Mapping[str, str]:
-    """What the telemetry calls its columns, as all runs of a flight say."""
+    """The telemetry's column names, which all runs of a flight must share."""
     for settings in runs:
         if settings.telemetry_columns != runs[0].telemetry_columns:
             raise OptionError("telemetry_columns: expected the same of all runs of a flight, got others")

@@ -1,4 +1,4 @@
-"""The last fix of a bridge, kept where the process that takes over finds it."""
+"""The last fix of a bridge, stored for the process that takes over."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from pathlib import Path
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Fix, Prior
 
-_MAX_AGE_S = 60.0  # of a position with which a bridge starts
+_MAX_AGE_S = 60.0  # of a position that a bridge may start from
 _VALUES = struct.Struct("=dddd16s")  # latitude, longitude, sigma, monotonic time, boot
-_RECORD = struct.Struct(f"={_VALUES.size}sI")  # and a checksum: a process may die within a write
+_RECORD = struct.Struct(f"={_VALUES.size}sI")  # and a checksum: a process may die while writing
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 class LastFix:
     """The last fix of a bridge, in memory that outlives the process.
 
-    It is a file's page in the system's memory, so that keeping a fix costs no wait for a disk. Times are of the
-    monotonic clock, which no receiver sets in flight, and hold until the computer starts again.
+    The file is mapped into memory, so storing a fix never waits for the disk. Times are on the monotonic clock,
+    which no receiver adjusts in flight, and are valid until the computer reboots.
 
     Args:
-        path: the file; None, or a folder that cannot be written, keeps it for copies of this process alone.
+        path: the file; None, or a folder that cannot be written, shares it with forks of this process only.
     """
 
     def __init__(self, path: Path | None = None) -> None:
@@ -38,7 +38,7 @@ class LastFix:
         self._memory[:] = _RECORD.pack(values, zlib.crc32(values))
 
     def prior(self, max_speed_mps: float) -> Prior | None:
-        """Where the vehicle can be by now; None where nothing was kept, or more than a minute ago."""
+        """Where the vehicle can be by now; None if nothing was stored in the last minute."""
         values, checksum = _RECORD.unpack(self._memory[:])
         lat_deg, lon_deg, sigma_m, time_s, boot = _VALUES.unpack(values)
         age_s = time.monotonic() - time_s
@@ -48,7 +48,7 @@ class LastFix:
 
 
 def last_fix_file(*names: object) -> Path:
-    """Where the bridge of a link over a map keeps its last fix."""
+    """The file in which the bridge of a link over a map stores its last fix."""
     digest = hashlib.sha256("\n".join(map(str, names)).encode()).hexdigest()
     return cache_folder() / f"last-fix-{digest[:16]}"
 
@@ -59,17 +59,17 @@ def _mapped(path: Path | None) -> mmap.mmap:
             path.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
             try:
-                os.posix_fallocate(file, 0, _RECORD.size)  # of a full disk here, not at the first fix
+                os.posix_fallocate(file, 0, _RECORD.size)  # a full disk fails here, not at the first fix
                 return mmap.mmap(file, _RECORD.size)
             finally:
                 os.close(file)
-        except (OSError, ValueError, AttributeError):  # a home that cannot be written is no reason to fail
+        except (OSError, ValueError, AttributeError):  # a home that cannot be written must not end the run
             pass
     return mmap.mmap(-1, _RECORD.size)
 
 
 def _boot() -> bytes:
-    """What tells this start of the computer from another, where the system says it."""
+    """An id of this boot, if the system provides one."""
     try:
         return bytes.fromhex(_BOOT_ID.read_text(encoding="ascii").strip().replace("-", ""))
     except (OSError, ValueError):

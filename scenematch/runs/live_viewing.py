@@ -1,4 +1,4 @@
-"""The live view of a run: where it goes, and the view itself while the run goes on."""
+"""The live view of a run: its target, and the view while the run lasts."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _CONNECT_TIMEOUT_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class LiveViewTarget:
-    """Where the live view goes; nowhere without either.
+    """Where to send the live view; nowhere if neither is given.
 
     Attributes:
-        recording: a file that is created.
-        viewer: HOST:PORT on which a viewer of rerun listens.
+        recording: file to create.
+        viewer: HOST:PORT of a rerun viewer.
     """
 
     recording: StrPath | None = None
@@ -39,11 +39,11 @@ class LiveViewTarget:
         return self.recording is not None or self.viewer is not None
 
     def check(self, *, force: bool = False) -> None:
-        """Refuse what cannot be done, before any work is done for it.
+        """Refuse a target that cannot be used, before any work is done.
 
         Raises:
-            OptionError: the recording is there and ``force`` was not given, has another ending, or the address is
-                none.
+            OptionError: the recording exists and ``force`` was not given, has another suffix, or the address is
+                invalid.
             MissingExtraError: rerun is not installed.
             BackendError: no viewer listens.
         """
@@ -73,7 +73,7 @@ NO_LIVE_VIEW = LiveViewTarget()
 
 
 def _check_viewer(address: str) -> None:
-    """Refuse an address on which nobody listens: rerun itself would wait for long and say nothing."""
+    """Refuse an address without a viewer: rerun itself would wait long and silently."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise OptionError(f"viewer: expected HOST:PORT, got {address!r}")
@@ -86,7 +86,7 @@ def _check_viewer(address: str) -> None:
 
 @contextmanager
 def open_view(matcher: SceneMatcher, target: LiveViewTarget) -> Iterator[LiveView | None]:
-    """The live view of a run, closed with it; None where it goes nowhere.
+    """The live view of a run, closed when the context ends; None without a target.
 
     Raises:
         BackendError: the recording cannot be written.
@@ -105,7 +105,7 @@ def open_view(matcher: SceneMatcher, target: LiveViewTarget) -> Iterator[LiveVie
 def open_bridge_view(
     matcher: SceneMatcher, target: LiveViewTarget, options: NavigatorOptions | None = None
 ) -> Iterator[tuple[Callable[[Prior | None], Navigator], Watcher | None]]:
-    """The live view of a bridge, whose answers do not wait for it: what creates its navigators, and the view."""
+    """The live view of a bridge, which never delays answers: the factory of its navigators, and the view."""
     make = partial(Navigator, matcher, options=options)
     if not target:
         yield make, None

@@ -1,4 +1,4 @@
-"""Auditing a map: where on it frames from a given height can be matched, and what a route will meet."""
+"""Audit a map: predict where frames from a given height can be matched, over the map and along a route."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from scenematch.runs.renaming import renamed_in_errors
 OWNED = ("matchability.tif", "audit.png", "summary.json")
 NODATA = -1.0
 PAPER_CAMERA, PAPER_HEIGHT_M = (300, 300, 60.0), 150.0
-"""Width, height and field of view of the paper's camera, and its height: what an audit assumes unless given."""
+"""Default width, height and field of view of the camera, and height above ground: the paper's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditFiles:
-    """The files of an audit, the height, and what part of the map it is of; None where not given.
+    """The files of an audit, the height, and the part of the map; None for each not given.
 
     Attributes:
         map: the map with its surface.
-        camera: calibration; None is the paper's camera.
+        camera: calibration; None uses the paper's camera.
         route: GeoJSON LineString, or a QGroundControl .plan.
         other: the same ground at another date.
-        height_agl_m: above the ground; None is the paper's height.
-        around: only what lies within "LAT,LON,RADIUS_M".
-        corridor_m: only what lies so near to the route.
+        height_agl_m: above the ground; None uses the paper's height.
+        around: audit only the circle "LAT,LON,RADIUS_M".
+        corridor_m: audit only this distance to either side of the route.
     """
 
     map: MapInput
@@ -58,9 +58,9 @@ class MapAudit:
     """A finished audit.
 
     Attributes:
-        audit: its grid.
-        route: availability along the route, where there is one.
-        summary: what summary.json holds.
+        audit: the grid of cells.
+        route: availability along the route, if one was given.
+        summary: the contents of summary.json.
     """
 
     audit: Audit
@@ -76,19 +76,19 @@ def audit_map(
     force: bool = False,
     progress: Progress = SILENT,
 ) -> MapAudit:
-    """Audit a map, and write raster, picture and summary.
+    """Audit a map and write the raster, the picture and the summary.
 
     Args:
-        files: the map, and what it is audited for.
+        files: the map, and the flight to audit it for.
         out: the folder.
-        options: what is assumed; None is the defaults.
-        force: whether the folder may be there already.
-        progress: is shown what the audit does.
+        options: assumptions; None uses the defaults.
+        force: whether the folder may already exist.
+        progress: receives progress and messages.
 
     Raises:
-        OptionError: an argument is out of its range, or beside the map.
+        OptionError: an argument is out of range, or off the map.
         MapError, CalibrationError, TelemetryError: a file cannot be read.
-        MissingExtraError: matplotlib, which draws the picture, is not installed.
+        MissingExtraError: matplotlib is not installed; it draws the picture.
     """
     require("matplotlib", "desk")
     out = Path(out)
@@ -106,7 +106,7 @@ def audit_map(
 def _plan(
     files: AuditFiles, options: AuditOptions, progress: Progress
 ) -> tuple[AuditPlan, NDArray[np.float64] | None]:
-    """What is audited, and the (N, 2) waypoints of the route in degrees."""
+    """The plan's inputs, and the (N, 2) waypoints of the route in degrees."""
     around = parse_circle("around", files.around)
     if files.corridor_m is not None and files.route is None:
         raise OptionError("corridor_m: expected a `route` with it, got none")
@@ -130,10 +130,10 @@ def _part(
     corridor_m: float | None,
     site: OrthoMap,
 ) -> MapPart | None:
-    """The part of the map to audit; None is all of it, which a huge map is never audited as.
+    """The part of the map to audit; None is all of it, which is refused for a huge map.
 
     Raises:
-        OptionError: the map is huge and no part is given, or the part lies beside it.
+        OptionError: the map is huge and no part is given, or the part lies off the map.
     """
     if around is not None:
         x, y = site.pixel_from_geodetic(*around[:2])
@@ -144,17 +144,17 @@ def _part(
         return MapPart(route=waypoints, corridor_m=corridor_m)
     if not site.is_searchable:
         raise OptionError(
-            f"around: expected LAT,LON,RADIUS_M, or a `route` to audit along: the map of {site.size_km} is not "
-            "audited as a whole"
+            f"around: expected LAT,LON,RADIUS_M, or a `route` to audit along: the map of {site.size_km} is too "
+            "large to audit as a whole"
         )
     return None
 
 
 def _check_size(plan: AuditPlan, part: MapPart | None) -> None:
-    """Refuse a part so large that its places would say nothing of what lies between them.
+    """Refuse a part so large that its cells would not represent the ground between them.
 
     Raises:
-        OptionError: it has more pixels than a map that is audited as a whole.
+        OptionError: it has more pixels than the largest map audited as a whole.
     """
     if part is not None and plan.area_px > SEARCH_LIMIT_PX:
         name = "around" if part.around is not None else "corridor_m"
@@ -163,7 +163,7 @@ def _check_size(plan: AuditPlan, part: MapPart | None) -> None:
 
 
 def _same_ground(other: OrthoMap, site: OrthoMap) -> OrthoMap:
-    """The other map, if it has anything to do with the first."""
+    """The other map, if it shows the same ground."""
     (west, south, east, north), (left, low, right, high) = other.bounds_deg, site.bounds_deg
     if west > right or east < left or south > high or north < low:
         raise OptionError(f"other: expected a map of the same ground as {site.name}, got {other.name}, elsewhere")
@@ -191,7 +191,7 @@ def _write(out: Path, audit: Audit, route: RouteAvailability | None, title: str)
 
 
 def _cells_to_crs(audit: Audit) -> tuple[NDArray[np.float64], int]:
-    """(2, 3) from cells to the map's CRS, and its EPSG code; WGS84 where the map's CRS has no code."""
+    """(2, 3) from cells to the map's CRS, and its EPSG code; WGS84 if the map's CRS has no code."""
     from pyproj import Transformer
 
     plan = audit.plan
@@ -204,7 +204,7 @@ def _cells_to_crs(audit: Audit) -> tuple[NDArray[np.float64], int]:
 
 
 def _summary(audit: Audit, route: RouteAvailability | None, files: AuditFiles) -> dict[str, Any]:
-    """What summary.json holds."""
+    """The contents of summary.json."""
     plan = audit.plan
     known = np.isfinite(audit.availability)
     scale = 2.0**plan.level * plan.site.gsd_m_per_px
@@ -230,7 +230,7 @@ def _summary(audit: Audit, route: RouteAvailability | None, files: AuditFiles) -
 
 
 def _part_facts(plan: AuditPlan, files: AuditFiles) -> dict[str, Any] | None:
-    """What part of the map was audited; None for all of it."""
+    """The part of the map that was audited; None for all of it."""
     if plan.audited.all() and plan.window.area_px == plan.site.width_px * plan.site.height_px:
         return None
     return {

@@ -1,4 +1,4 @@
-"""Fetching a map, and a surface model with it, from servers that the user names."""
+"""Fetch a map and a surface model from servers that the user names."""
 
 from __future__ import annotations
 
@@ -37,19 +37,18 @@ MAX_TILES = 2000
 NOTE = "you named this server: its terms decide what may be fetched, kept and used, and whom to credit"
 _MAX_RADIUS_M = 100_000.0
 GSD_M_PER_PX = 0.5
-_USUAL_HEIGHT_M = 150.0  # of a camera for which a map of that ground sample distance is fine enough
-_MARGIN_M = 50.0  # beyond what photographs saw
-_MUCH_EMPTY = 0.5  # of a map: more is worth a word
+_USUAL_HEIGHT_M = 150.0  # of a camera that suits the ground sample distance
+_MARGIN_M = 50.0  # beyond what the photographs cover
+_MUCH_EMPTY = 0.5  # of a map: more is reported
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FetchSettings:
-    """What is fetched, and how; None where not given.
+    """What to fetch, and how; None for each not given.
 
     Attributes:
-        around: "LAT,LON", the middle of the map, or a folder of photographs, the middle of their positions.
-        radius_m: half the side of the square that the map covers at least; None is what the
-            photographs saw, and 50 m.
+        around: "LAT,LON", the centre of the map, or a folder of photographs with positions.
+        radius_m: half the side of the square to cover at least; None covers what the photographs show, plus 50 m.
         source: template of tiles with {z}, {x}, {y}, or the address of a WMS or WMTS.
         gsd_m_per_px: as coarse as the map may be; of a WMS its pixels. None is 0.5, around photographs that were
             taken from less than 150 m as much less.
@@ -99,13 +98,13 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
     Args:
         settings: what, and how.
         out: the map; the surface model is ``NAME-surface.tif`` beside it.
-        progress: is shown how far it is, and what is waited for.
+        progress: receives progress and messages.
 
     Returns:
-        What was planned, asked for and written.
+        What was planned, requested and written.
 
     Raises:
-        OptionError: a setting cannot be, more tiles are needed than allowed, or a file is there already.
+        OptionError: a setting is invalid, more tiles are needed than allowed, or a file already exists.
         MapError: a server refuses, cannot be reached, or sends something else.
     """
     out = Path(out)
@@ -130,7 +129,7 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
 
 
 def _say_what_comes(grid: Grid, settings: FetchSettings, wanted: Wanted, progress: Progress) -> None:
-    """What a person should know before the pictures come."""
+    """Report what a person should know before the download."""
     for name, text in grid.states.items():
         progress.message(f"the server states as {name}: {text}")
     got, asked = grid.gsd_m_per_px, wanted.gsd_m_per_px
@@ -143,7 +142,7 @@ def _say_what_comes(grid: Grid, settings: FetchSettings, wanted: Wanted, progres
 def _write(
     settings: FetchSettings, grid: Grid, folder: Path, out: Path, fetched_utc: str, progress: Progress
 ) -> dict[str, Any]:
-    """Fetch the pictures and write the map; what was fetched stays in the folder if that fails.
+    """Fetch the pictures and write the map; on failure, fetched pictures stay in the folder.
 
     Raises:
         MapError: the server refuses, or has nothing there.
@@ -161,15 +160,15 @@ def _write(
         remove_pictures(folder, all_of_them=complete)
     nodata_share = 1.0 - known / (grid.size_px[0] * grid.size_px[1])
     if nodata_share > _MUCH_EMPTY:
-        progress.message(f"{nodata_share:.0%} of the map is empty; is `around` within what the server covers?")
+        progress.message(f"{nodata_share:.0%} of the map is empty; does the server cover `around`?")
     return {"nodata_share": nodata_share, "file_mb": out.stat().st_size / 1e6}
 
 
 def _checked(settings: FetchSettings, progress: Progress) -> Wanted:
-    """What is asked for, where the settings can be.
+    """The request that the settings describe.
 
     Raises:
-        OptionError: one cannot.
+        OptionError: a setting is invalid.
         TelemetryError: the folder of photographs cannot be read.
     """
     wanted = _wanted(settings, progress)
@@ -198,10 +197,10 @@ def _checked(settings: FetchSettings, progress: Progress) -> Wanted:
 
 
 def _wanted(settings: FetchSettings, progress: Progress) -> Wanted:
-    """The place that was named, or that of photographs, and what is asked for there.
+    """The given place, or that of the photographs, and the request for it.
 
     Raises:
-        OptionError: it is no place, or its radius is missing.
+        OptionError: it is not a place, or its radius is missing.
         TelemetryError: the folder cannot be read.
     """
     radius_m, gsd_m_per_px = settings.radius_m, settings.gsd_m_per_px
@@ -214,7 +213,7 @@ def _wanted(settings: FetchSettings, progress: Progress) -> Wanted:
             f"asked for {gsd_m_per_px:.2g} m/px"
         )
     elif radius_m is None:
-        raise OptionError("radius_m: expected with LAT,LON; only around photographs it may be left out")
+        raise OptionError("radius_m: expected with LAT,LON; it is optional only with photographs")
     else:
         place = Place(*_place(settings.around), radius_m)
     return Wanted(
@@ -231,21 +230,21 @@ def _place(around: str) -> tuple[float, float]:
     """LAT,LON, in the right order.
 
     Raises:
-        OptionError: it is no such pair; a name says why not.
+        OptionError: it is not such a pair; the message explains why a place name is not.
     """
     try:
         return parse_place("around", around)
     except OptionError:
         if any(part.strip()[:1].isalpha() for part in around.split(",")):
             raise OptionError(
-                f"around: expected LAT,LON in degrees or a folder of photographs, got {around!r}; names of places "
+                f"around: expected LAT,LON in degrees or a folder of photographs, got {around!r}; place names "
                 "are not looked up"
             ) from None
         raise
 
 
 def _seen_by_photographs(folder: Path) -> tuple[Place, float]:
-    """The square that photographs saw, and the ground sample distance of a map that suits their height.
+    """The square that the photographs cover, and the ground sample distance that suits their height.
 
     Raises:
         OptionError: they have no positions.
@@ -265,7 +264,7 @@ def _seen_by_photographs(folder: Path) -> tuple[Place, float]:
 
 
 def _plan_facts(settings: FetchSettings, grid: Grid) -> dict[str, Any]:
-    """What is known before the first picture is asked for."""
+    """Facts known before the first request for a picture."""
     width, height = grid.size_px
     return {
         "source": shown(settings.source),
@@ -294,7 +293,7 @@ def _bounds_deg(grid: Grid) -> Bounds:
 
 
 def _map_tags(settings: FetchSettings, grid: Grid, fetched_utc: str) -> dict[str, object]:
-    """Metadata items of the map: its accuracy, and where it is from."""
+    """Metadata items of the map: its accuracy and origin."""
     tags = {
         GEOREFERENCE_TAG: settings.map_sigma_m,
         "SOURCE": shown(settings.source),
@@ -311,21 +310,21 @@ def _map_tags(settings: FetchSettings, grid: Grid, fetched_utc: str) -> dict[str
 
 
 def _check_surface_stays(files: Sequence[str], outputs: Sequence[Path]) -> None:
-    """Refuse to replace the heights that are read by a part of them, whatever may be replaced.
+    """Refuse to overwrite the heights that are being read, even with ``force``.
 
     Raises:
-        OptionError: a file of heights is one that the fetch writes.
+        OptionError: a file of heights is also an output of the fetch.
     """
-    for file in map(Path, files):  # an address is no file that exists
+    for file in map(Path, files):  # a URL is no existing file
         for output in outputs:
             if file.exists() and output.exists() and file.samefile(output):
-                raise OptionError(f"out: {output} is the `surface` that is read; choose another file")
+                raise OptionError(f"out: {output} is also the input `surface`; choose another file")
 
 
 def _write_surface(
     settings: FetchSettings, heights: Heights | None, files: Sequence[str], out: Path, fetched_utc: str
 ) -> dict[str, Any]:
-    """Write the heights under the map, with the accuracy of their slope where it is known."""
+    """Write the heights under the map, with the accuracy of their slope if it is known."""
     if heights is None:
         return {"surface": None}
     known = GLO30_SLOPE_SIGMA_DEG if any(GLO30 in file for file in files) else None

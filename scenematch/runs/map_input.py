@@ -1,4 +1,4 @@
-"""The map of a run: its files, and what they do not say of themselves."""
+"""The map of a run: its files, and what they do not state themselves."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from scenematch.runs.renaming import renamed_in_errors
 
 @dataclass(frozen=True, slots=True)
 class MapInput:
-    """A map with its surface; None where the files say it themselves.
+    """A map with its surface; None for each value that the files state themselves.
 
     Attributes:
         map: see :meth:`engine.OrthoMap.open`.
-        surface: surface model, a GeoTIFF of heights; None is flat ground.
+        surface: surface model, a GeoTIFF of heights; None assumes flat ground.
         map_sigma_m: georeferencing accuracy of the map per axis.
         map_bounds: "W,S,E,N" of the outer edges of a picture without georeference, in degrees or in ``map_crs``;
             numbers that may be degrees are degrees.
         map_crs: coordinate reference system of a map that names none, such as "EPSG:32636".
 
     Raises:
-        OptionError: the bounds are none.
+        OptionError: the bounds are invalid.
     """
 
     map: StrPath
@@ -44,14 +44,14 @@ class MapInput:
 
     @classmethod
     def of(cls, value: MapInput | StrPath) -> MapInput:
-        """The map of which only the file is named, or as it is."""
+        """The map from a path, or unchanged."""
         return value if isinstance(value, MapInput) else cls(value)
 
     def open(self, progress: Progress = SILENT) -> OrthoMap:
-        """The map; if it is copied into the cache, that is a task of the progress.
+        """Open the map; copying it into the cache is reported as a task.
 
         Raises:
-            OptionError: the accuracy is not above 0 or wider than any map, or bounds or CRS do not suit the file.
+            OptionError: the accuracy is out of range, or bounds or CRS do not suit the file.
             MapError: a file cannot be read, or is nowhere on the Earth.
         """
         if self.map_sigma_m is not None and not 0.0 < self.map_sigma_m <= MAX_SIGMA_M:

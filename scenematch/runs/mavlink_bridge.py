@@ -1,4 +1,4 @@
-"""The loop of the MAVLink bridge, and its parameter files: pictures in, fixes to the autopilot out."""
+"""Run the MAVLink bridge: pictures in, fixes to the autopilot out."""
 
 from __future__ import annotations
 
@@ -38,31 +38,31 @@ if TYPE_CHECKING:
     from scenematch.bridges.mavlink_status import MavlinkStatus
 
 _AUTOPILOT_TIMEOUT_S = 10.0
-_MAX_ALT_M = 10_000.0  # of an origin: beyond the ground of the Earth, and MAVLink's millimetres hold it
+_MAX_ALT_M = 10_000.0  # of an origin: above any ground, and within the range of MAVLink's millimetres
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MavlinkSettings:
-    """How the autopilot is reached and what it is sent.
+    """How to reach the autopilot, and what to send it.
 
     Attributes:
-        connect: as :func:`scenematch.bridges.links.parse_connection` reads it.
-        listen_anywhere: allow udpin on addresses that other machines reach.
-        system_id: of the vehicle; others are not heard.
-        component_id: of the vehicle, that the bridge is; an ODOMETRY of type VISION from it is taken for its own.
-        key: secret of MAVLink's signing; with it unsigned packets are ignored.
-        firmware: of the autopilot, "ardupilot" or "px4".
-        message: what is sent; "" is the firmware's usual one.
-        max_sigma_m: a fix that is less certain is not sent.
-        set_origin: give an autopilot without an origin the map's.
-        origin_alt_m: height of that origin above sea level; None is the map's ground.
-        use_velocity: whether the autopilot's velocity is used between fixes.
-        check_gnss: whether the first fixes are held against the autopilot's GNSS receiver, where it has a fix.
-        gps_id: receiver that GPS_INPUT poses as; 0 is the autopilot's first.
+        connect: see :func:`scenematch.bridges.links.parse_connection`.
+        listen_anywhere: allow udpin on addresses that other machines can reach.
+        system_id: system id of the vehicle; others are ignored.
+        component_id: component id of the bridge; it treats an ODOMETRY of type VISION with this id as its own.
+        key: key file for MAVLink signing; with it, unsigned packets are ignored.
+        firmware: firmware of the autopilot, "ardupilot" or "px4".
+        message: message that carries the fixes; "" is the firmware's default.
+        max_sigma_m: largest sigma of a fix that is sent.
+        set_origin: set the map's origin on an autopilot that has none.
+        origin_alt_m: height of that origin above sea level; None uses the map's ground.
+        use_velocity: use the autopilot's velocity between fixes.
+        check_gnss: check the first fixes against the autopilot's GNSS receiver, if it has a fix.
+        gps_id: number of the receiver that GPS_INPUT emulates; 0 is the autopilot's first.
 
     Raises:
-        OptionError: the height of the origin is not one of the Earth's, or there is to be no origin; or the
-            component is none, or the autopilot.
+        OptionError: the height of the origin is impossible or given without ``set_origin``, or the component id is
+            invalid or the autopilot's.
     """
 
     connect: str
@@ -88,13 +88,13 @@ class MavlinkSettings:
             )
 
         if not 2 <= self.component_id <= 255:
-            raise OptionError(f"component_id: expected 2 to 255, 1 is the autopilot, got {self.component_id}")
+            raise OptionError(f"component_id: expected 2 to 255 (1 is the autopilot), got {self.component_id}")
 
     def outgoing(self) -> MavlinkOptions:
         """What is sent.
 
         Raises:
-            OptionError: the firmware, the message or the accuracy is none that can be.
+            OptionError: the firmware, the message or the accuracy is invalid.
         """
         from scenematch.bridges.mavlink_out import MavlinkOptions
 
@@ -103,9 +103,9 @@ class MavlinkSettings:
         )
 
     def origin(self, site: OrthoMap, start: Prior | None) -> NedOrigin | None:
-        """The start of the flight or else the map's middle; None where none is to be set.
+        """The start of the flight, or the map's centre; None if no origin should be set.
 
-        Its height is that of the ground there, of the map's ground in general, or as it was given.
+        Its height is the given one, the ground there, or else the map's mean ground.
         """
         if not self.set_origin:
             return None
@@ -123,18 +123,18 @@ class BridgeSettings:
 
     Attributes:
         method: "auto", "ncc", "sift" or "learned".
-        device: where tensors live.
+        device: to compute on.
         matcher: settings of the methods.
-        navigator: how a position is carried from frame to frame.
+        navigator: how the position is propagated between frames.
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
-        deadline_ms: age by which a frame is answered; None is what the receiver of the fixes takes.
-        seconds: ends after this time; None ends with the pictures.
-        realtime: match with a real-time priority and locked memory (Linux).
-        nice: with realtime, a nice value, -20 to -1, in place of SCHED_FIFO.
-        cores: with realtime, the cores that match; none leaves them those of the process.
+        deadline_ms: largest age of an answer; None uses the limit of the fixes' receiver.
+        seconds: stop after this time; None stops when the pictures end.
+        realtime: match with real-time priority and locked memory (Linux).
+        nice: with realtime, a nice value, -20 to -1, instead of SCHED_FIFO.
+        cores: with realtime, cores for matching; none uses all cores of the process.
 
     Raises:
-        OptionError: a word or a number is none of those that are expected, or real time is not this system's.
+        OptionError: a word or a number is invalid, or this system has no real-time scheduling.
         DeviceError: the device is missing.
         BackendError: real time is not permitted.
     """
@@ -160,10 +160,10 @@ class BridgeSettings:
             raise OptionError(f"profile: expected engine in a bridge, got {self.matcher.profile!r}")
 
     def scheduling(self) -> Realtime | None:
-        """How the threads that match are scheduled; None is as usual.
+        """Scheduling of the matching threads; None is the default.
 
         Raises:
-            OptionError: a number is none that can be, or has no effect without ``realtime``.
+            OptionError: a number is invalid, or has no effect without ``realtime``.
         """
         if not self.realtime:
             check_unused({"nice": self.nice, "cores": self.cores or None}, "realtime")
@@ -171,7 +171,7 @@ class BridgeSettings:
         return Realtime(nice=self.nice, cores=self.cores)
 
     def live_options(self, deadline_ms: float = 121.0) -> LiveOptions:
-        """The deadlines of the frames, with the one that counts where none was set."""
+        """The deadlines of the frames, or the default ones."""
         deadline_ms = deadline_ms if self.deadline_ms is None else self.deadline_ms
         return LiveOptions(deadline_ms=deadline_ms, realtime=self.scheduling())
 
@@ -185,15 +185,15 @@ def run_mavlink_bridge(
     live_view: LiveViewTarget = NO_LIVE_VIEW,
     progress: Progress = SILENT,
 ) -> MavlinkStatus:
-    """Bridge until the pictures end or the time is over.
+    """Run the bridge until the pictures end or the time is up.
 
     Args:
         files: map, camera and pictures.
         link: the autopilot.
-        settings: how frames are matched; None is the defaults.
-        supervise: whether this process stays behind with what is loaded, to replace a worker that is killed.
-        live_view: where the live view goes.
-        progress: is shown what the bridge does.
+        settings: how to match frames; None uses the defaults.
+        supervise: keep this process, with everything loaded, to replace a worker that is killed.
+        live_view: where to send the live view.
+        progress: receives progress and messages.
 
     Returns:
         What was done.
@@ -201,7 +201,7 @@ def run_mavlink_bridge(
     Raises:
         MissingExtraError: pymavlink, or for a serial line pyserial, is not installed.
         BackendError: the link cannot be opened.
-        OptionError, MapError, CalibrationError, TelemetryError: an argument or a file is not as expected.
+        OptionError, MapError, CalibrationError, TelemetryError: an argument or a file is invalid.
     """
     require("pymavlink", "mavlink")
     live_view.check()
@@ -219,18 +219,18 @@ def run_mavlink_bridge(
     matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
-    # A camera's bridge may start in the air; a flight that is played begins where it began.
+    # With a camera the bridge may start in the air; a replayed flight begins at its start.
     resumes = files.camera_source is not None
     last_fix = LastFix(
         last_fix_file(link.connect, link.system_id, Path(files.map.map).absolute()) if resumes else None
     )
-    end_on_sigterm()  # before there is a worker, which has it from its first instruction on
+    end_on_sigterm()  # before the fork, so that the worker has it from its first instruction
     if supervise:
         check_supervision(matcher.device)
         become_worker(progress)
     start = _resumed(last_fix.prior(settings.live_options().max_speed_mps), start, site, progress)
 
-    # Before the link: an autopilot on the bench takes off when the bridge listens.
+    # Before the link: a bench autopilot takes off as soon as the bridge listens.
     pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))
     with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
         try:
@@ -245,8 +245,8 @@ def run_mavlink_bridge(
         with bridge:
             scheduling = settings.scheduling()
             if scheduling is not None:  # this thread, too, may hold Python's lock
-                set_realtime(replace(scheduling, cores=()))  # of which a camera's command would inherit
-            # Ctrl-C is the usual end beside a camera, and no reason to lose the counts.
+                set_realtime(replace(scheduling, cores=()))  # a camera's command would inherit cores
+            # Ctrl-C is the usual way to stop a camera's bridge and must keep the counts.
             with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
                 _run(bridge, pictures, camera, settings.seconds, progress, beat)
             if files.camera_source is not None:
@@ -255,14 +255,14 @@ def run_mavlink_bridge(
 
 
 def _resumed(last: Prior | None, start: Prior | None, site: OrthoMap, progress: Progress) -> Prior | None:
-    """Where the bridge before this one, or the worker, sent its last fix, unless that is too long ago."""
+    """The last fix of the previous bridge or worker, unless it is too old."""
     if last is None:
         return start
     try:
         check_position("last fix", last, site, OptionError)
-    except OptionError:  # the file of the map is another one now
+    except OptionError:  # the map file has changed
         return start
-    progress.message(f"goes on from the last fix, which has grown uncertain by {last.sigma_m:.0f} m")
+    progress.message(f"continues from the last fix, whose uncertainty has grown by {last.sigma_m:.0f} m")
     return last
 
 
@@ -274,7 +274,7 @@ def _run(
     progress: Progress,
     beat: Callable[[], None],
 ) -> None:
-    """Every picture to the bridge; now and then a line of what it does."""
+    """Pass every picture to the bridge; report its status now and then."""
     begin, count = time.monotonic(), 0
     report = status_reporter(lambda: bridge.status.line(), progress)
     for picture in pictures:
@@ -300,7 +300,7 @@ def _submit(bridge: MavlinkBridge, picture: CapturedImage, camera: Camera, numbe
 
 
 def _wait_for_autopilot(bridge: MavlinkBridge, progress: Progress, beat: Callable[[], None]) -> None:
-    """A flight that is played begins with the autopilot's: where it was earlier is not known."""
+    """A replay starts with the autopilot's flight, because its earlier position is unknown."""
     if not bridge.connected:
         progress.message(f"the pictures wait for the autopilot, {_AUTOPILOT_TIMEOUT_S:g} s at most")
     until = time.monotonic() + _AUTOPILOT_TIMEOUT_S
@@ -310,7 +310,7 @@ def _wait_for_autopilot(bridge: MavlinkBridge, progress: Progress, beat: Callabl
 
 
 def _wait_for_answers(answered: Callable[[], int], count: int) -> None:
-    """The last frame's answer; those that newer frames replaced have none."""
+    """The last frame's answer; frames replaced by newer ones have none."""
     before, until = -1, time.monotonic() + 2.0
     while answered() not in (before, count) and time.monotonic() < until:
         before = answered()

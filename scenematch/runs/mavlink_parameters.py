@@ -1,4 +1,4 @@
-"""Write the parameter file of an autopilot that flies by the bridge's fixes."""
+"""Write the parameter file for an autopilot that uses the bridge's fixes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DEFAULT_DELAY_MS = 100
 
 @dataclass(frozen=True, slots=True)
 class WrittenParameters:
-    """What a parameter file was written for.
+    """The delay written into a parameter file, and its source.
 
     Attributes:
         delay_ms: from capture to arrival.
@@ -29,11 +29,11 @@ class WrittenParameters:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterSettings:
-    """What a parameter file is for, beside the bridge's own settings.
+    """Settings of a parameter file besides the bridge's own.
 
     Attributes:
-        takeoff: "none" without GNSS, or "gnss", from which ArduPilot is switched over in flight.
-        delay_ms: from capture to arrival; none is what the last bridge with a camera measured, else 100.
+        takeoff: "none" without GNSS, or "gnss" to take off with GNSS and switch ArduPilot over in flight.
+        delay_ms: from capture to arrival; none uses what the last bridge with a camera measured, else 100.
     """
 
     takeoff: str = "none"
@@ -43,16 +43,16 @@ class ParameterSettings:
 def write_parameter_file(
     out: StrPath, link: MavlinkSettings, settings: ParameterSettings | None = None, *, force: bool = False
 ) -> WrittenParameters:
-    """Write the parameters that let an autopilot fly by the bridge's fixes.
+    """Write the parameters with which an autopilot uses the bridge's fixes.
 
     Args:
         out: the file.
         link: what is sent to the autopilot.
-        settings: what the file is for; None is the defaults.
-        force: whether the file may be there already.
+        settings: of the file; None uses the defaults.
+        force: whether the file may already exist.
 
     Returns:
-        The delay that was written, and where it came from.
+        The delay written, and its source.
     """
     require("pymavlink", "mavlink")
     out, outgoing, settings = Path(out), link.outgoing(), settings or ParameterSettings()

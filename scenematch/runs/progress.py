@@ -1,4 +1,4 @@
-"""Progress of a run: what it says and how far it is, given to whoever wants to show it."""
+"""Progress of a run: messages and completed work, for the caller to show."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ T = TypeVar("T")
 
 
 class Progress:
-    """Shows nothing. A subclass overrides what it shows; runs call it from the caller's thread."""
+    """Shows nothing; subclasses override what to show. Runs call it from the caller's thread."""
 
     def message(self, text: str) -> None:
-        """Take one line for a person."""
+        """Show one line to a person."""
 
     def update(self, description: str, done: int, total: int) -> None:
-        """Take how far a task is.
+        """Show how far a task is.
 
         Args:
             description: of the task, the same each time.
@@ -25,10 +25,10 @@ class Progress:
         """
 
     def finish(self, description: str) -> None:
-        """Take that a task has ended or was interrupted; one that was never updated is finished all the same."""
+        """Called when a task has ended or was interrupted, even if it was never updated."""
 
     def track(self, items: Iterable[T], total: int, description: str) -> Iterator[T]:
-        """The same items, each counted once its consumer asks for the next."""
+        """The same items; each is counted when the consumer asks for the next."""
         self.update(description, 0, total)
         try:
             for done, item in enumerate(items, 1):
@@ -39,7 +39,7 @@ class Progress:
 
     @contextmanager
     def task(self, description: str) -> Iterator[Callable[[int, int], None]]:
-        """A function that takes ``done`` and ``total`` of a task, which ends with the context."""
+        """A function that takes ``done`` and ``total`` of a task; the task ends with the context."""
         try:
             yield lambda done, total: self.update(description, done, total)
         finally:

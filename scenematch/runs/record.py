@@ -1,4 +1,4 @@
-"""Records: inputs and settings of a finished run, as its summary.json keeps them for later runs over it."""
+"""Records: inputs and settings of a finished run, stored in its summary.json."""
 
 from __future__ import annotations
 
@@ -24,45 +24,45 @@ _NUMBERS_OR_NONE = ("log_offset_s", "map_sigma_m", "hfov_deg", "camera_pitch_deg
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunRecord:
-    """The inputs and settings of a run; paths are absolute, and None is what there was not.
+    """The inputs and settings of a run; paths are absolute, None means not given.
 
     Attributes:
         map: file or folder.
         surface: heights.
-        camera: calibration, or a bag that has it; None was the photographs' EXIF or ``hfov_deg``.
+        camera: calibration, or a bag that has it; None if it came from EXIF or ``hfov_deg``.
         frames: folder, video or bag.
         telemetry: telemetry.csv or a log.
         truth: truth.csv or a log.
-        frame_stamps: when the frames were taken, where the telemetry is a log.
-        log_offset_s: added to the frames' own stamps, in the same case.
-        image_topic: of the pictures, where the frames are a bag.
-        odometry_topic: that the velocity was taken from, where the telemetry is a bag.
-        every: one frame in so many was used; None is all.
-        map_sigma_m: georeferencing accuracy of the map, where it was given, as are the next five.
-        map_bounds: of a picture, as typed.
-        map_crs: of a map that names none.
+        frame_stamps: file of capture times, if the telemetry is a log.
+        log_offset_s: added to the frames' own timestamps, in the same case.
+        image_topic: topic of the pictures, if the frames are a bag.
+        odometry_topic: topic of the odometry that provided the velocity, if the telemetry is a bag.
+        every: every Nth frame was used; None is all.
+        map_sigma_m: georeferencing accuracy of the map, if given; so are the next five.
+        map_bounds: bounds of a picture, as typed.
+        map_crs: CRS of a map that names none.
         hfov_deg: horizontal field of view.
         mount: of the camera, by name.
         camera_pitch_deg: of the camera.
         scale_calibration: whether the calibration was scaled to the pictures.
         corrections: of the telemetry, by name; None without any.
-        heights: frames by the source of their height, where the telemetry is a log or the photographs' own.
+        heights: frames by the source of their height, if the telemetry is a log or the photographs' own.
         method: "ncc", "sift", "auto" or "learned".
         profile: "engine" or "paper".
-        device: where tensors lived.
+        device: that computed.
         start: where the flight began, as typed.
         budget_ms: of a frame.
         changed: settings that are not the defaults, by name.
         origin: ``lat_deg`` and ``lon_deg`` of the plane of the track.
         ground_m: height of the ground on the map.
         ground_amsl_m: the same above the sea, by the telemetry.
-        surface_datum: vertical system of the heights, where the surface is above the sea by its file.
-        attitude: what the fixes said of the telemetry's attitude.
-        diagnosis: where few frames were fixed, what of the inputs does not fit, sentences by cause.
-        more: what else stands in the file, by name.
+        surface_datum: vertical system of the heights, if the file states heights above the sea.
+        attitude: check of the telemetry's attitude against the fixes.
+        diagnosis: errors found in the inputs if few frames were fixed, sentences by cause.
+        more: other contents of the file, by name.
 
     Raises:
-        TelemetryError: a value is not of its kind.
+        TelemetryError: a value has the wrong type.
     """
 
     map: str
@@ -121,7 +121,7 @@ class RunRecord:
                 raise TelemetryError(f"{name}: expected {expected}, got {_shown(value)}")
 
     def facts(self) -> dict[str, Any]:
-        """The same as JSON holds it."""
+        """The record as JSON values."""
         values = asdict(self)
         more: dict[str, Any] = values.pop("more")
         return values | more

@@ -1,6 +1,6 @@
-"""Other names for the arguments in a message: a field of a lower object, or what was typed for it.
+"""Rename the arguments in a message: a field of a lower object, or what the user typed.
 
-The argument that a message is about stands first, before a colon; others stand in backquotes.
+The argument at fault comes first, before a colon; others are in backquotes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _QUOTED = re.compile(r"`(\w+)`")
 
 @contextmanager
 def renamed_in_errors(**arguments: str) -> Iterator[None]:
-    """Within it, an error about a field of a lower object names the argument that the field came from.
+    """Inside this context, an error about a field of a lower object names the argument that it came from.
 
     Args:
         arguments: argument by field.
@@ -31,7 +31,7 @@ def renamed_in_errors(**arguments: str) -> Iterator[None]:
 
 
 def rename_arguments(message: str, names: Mapping[str, str], quote: str = "`") -> str:
-    """A message with other names for its arguments: those before the first colon, and those in backquotes.
+    """Rename the arguments of a message: those before the first colon, and those in backquotes.
 
     Args:
         message: of an error.
@@ -46,5 +46,5 @@ def rename_arguments(message: str, names: Mapping[str, str], quote: str = "`") -
 
 
 def rename_quoted(text: str, names: Mapping[str, str], quote: str = "`") -> str:
-    """A text with other names for the arguments that stand in backquotes; see :func:`rename_arguments`."""
+    """Rename the arguments in backquotes; see :func:`rename_arguments`."""
     return _QUOTED.sub(lambda found: f"{quote}{names[found[1]]}{quote}" if found[1] in names else found[0], text)

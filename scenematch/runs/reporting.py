@@ -1,4 +1,4 @@
-"""Reports on finished runs, drawn again: of one run its own page, of several one page on one map."""
+"""Redraw reports on finished runs: one run's own page, or one page for several runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scenematch.runs.record import read_record
 from scenematch.runs.results import PAGE, SUMMARY, TRACK
 
 COMPARISON = "comparison.html"
-"""The page on several runs, where it has no other name."""
+"""Default name of the page on several runs."""
 
 
 def report(
@@ -29,17 +29,16 @@ def report(
     """Draw the report on finished runs.
 
     Args:
-        folders: of one run, whose own page is written again, or of several, drawn on the first one's map.
+        folders: one run, whose page is rewritten, or several, drawn on the first one's map.
         out: the page on several runs; None is ``comparison.html`` in the working directory.
-        force: whether that may be there already; of one run, whether its page may lose frames that are not there
-            any more.
-        progress: is shown what the run does.
+        force: allow that file to exist; for one run, allow its page to lose frames that no longer exist.
+        progress: receives progress and messages.
 
     Returns:
         The page.
 
     Raises:
-        OptionError: there are too many runs, one of them twice, ``out`` is given with one run or is in no folder,
+        OptionError: there are too many runs, one is given twice, ``out`` is given with one run or is in no folder,
             or a page would lose its frames.
         TelemetryError: a folder holds no finished track.
     """
@@ -58,7 +57,7 @@ def report(
 
 
 def run_names(folders: Sequence[Path]) -> dict[str, Path]:
-    """Folders by as much of the end of their path as tells them apart.
+    """Folders by the shortest ends of their paths that tell them apart.
 
     Raises:
         OptionError: there are fewer than two or too many, or two are the same.
@@ -76,23 +75,21 @@ def draw_together(page: Path, runs: dict[str, Path], *, progress: Progress = SIL
     """Write the page on several finished runs.
 
     Args:
-        page: the file, replaced where it exists.
+        page: the file, replaced if it exists.
         runs: folders by the names of their runs.
-        progress: is shown what the run does.
+        progress: receives progress and messages.
     """
     records = {name: read_record(folder / SUMMARY) for name, folder in runs.items()}
     first, *others = records
     for other in others:
         if records[other].map != records[first].map:
-            progress.message(
-                f"{other} was made with another map, {records[other].map}; it is drawn on that of {first}"
-            )
+            progress.message(f"{other} used another map, {records[other].map}; it is drawn on that of {first}")
     site = open_recorded_map(records[first], progress)
     write_runs_page(page, {name: _finished(folder, site) for name, folder in runs.items()})
 
 
 def _finished(folder: Path, site: OrthoMap) -> FinishedTrack:
-    """A finished run on a map, its figures computed again."""
+    """A finished run on a map, with its figures recomputed."""
     rows, record = read_track(folder / TRACK), read_record(folder / SUMMARY)
     start_ns = rows[0].timestamp_ns if rows else None
     truth = None if record.truth is None else open_truth(Path(record.truth), start_ns)

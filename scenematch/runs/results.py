@@ -28,14 +28,14 @@ from scenematch.runs.record import RunRecord
 
 TRACK, SUMMARY, NOTES, PAGE = "track.csv", "summary.json", "notes.csv", "report.html"
 LOOP = "loop.csv"
-"""Of a closed loop, beside its track."""
+"""File of a closed loop, besides its track."""
 OWNED = (TRACK, SUMMARY, NOTES, PAGE)
 """The files of an output folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReportFrames:
-    """The frames and the matcher by which the report shows single frames; or None, and why they are not there."""
+    """The frames and the matcher for showing single frames in the report; or None, and why they are missing."""
 
     flight: Flight | None = None
     matcher: SceneMatcher | None = None
@@ -54,7 +54,7 @@ def write_results(
     report: bool = True,
     progress: Progress = SILENT,
 ) -> dict[str, Any]:
-    """Write summary.json and, where there is to be one, the report page, in place of older ones."""
+    """Write summary.json and, if requested, the report page, replacing older ones."""
     summary = summarise(rows, truth, frame=site.frame, ground=ground)
     segments = {"segments": segment_errors(rows, errors_en_m(rows, truth, site.frame))} if truth else {}
     telemetry = None if frames.flight is None else frames.flight.rows
@@ -75,7 +75,7 @@ def write_results(
 
 
 def _span(stamps_ns: list[int]) -> str:
-    """First and last of some stamps, to be read: as dates where they are UTC, else as seconds."""
+    """First and last timestamp as text: dates if UTC, else seconds."""
     if not stamps_ns:
         return "none"
     ends = (min(stamps_ns), max(stamps_ns))
@@ -93,16 +93,16 @@ def finished_track(
     summary: dict[str, Any],
     frames: ReportFrames,
 ) -> FinishedTrack:
-    """A finished track with what its folder holds beside it."""
+    """A finished track with the other files of its folder."""
     notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
-    is_loop = "closed_loop" in summary["settings"]  # a loop.csv may be that of another run
+    is_loop = "closed_loop" in summary["settings"]  # a loop.csv may be another run's
     loop = read_loop_csv(out / LOOP) if is_loop and (out / LOOP).is_file() else None
     telemetry = None if frames.flight is None else frames.flight.rows
     return FinishedTrack(rows, truth, site, ground, summary, notes, telemetry, loop)
 
 
 def _write_page(path: Path, track: FinishedTrack, frames: ReportFrames) -> None:
-    """The report, with some frames matched again where that can be done."""
+    """Write the report, with some frames matched again if possible."""
     if frames.flight is None or frames.matcher is None:
         return write_page(path, track, why_not=f"No frames are shown: {frames.why_missing}")
     if track.notes is None or [note.frame for note in track.notes] != [row.frame for row in track.rows]:

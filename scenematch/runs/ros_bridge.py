@@ -1,4 +1,4 @@
-"""The loop of the ROS bridge: a camera's topic and a vehicle's in, poses, fixes and diagnostics out."""
+"""Run the ROS bridge: camera and vehicle topics in, poses, fixes and diagnostics out."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _CAMERA_INFO_TIMEOUT_S = 30.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RosSettings:
-    """What a node of ROS hears and publishes.
+    """What a ROS node subscribes to and publishes.
 
     Attributes:
         version: 1 for rospy, 2 for rclpy.
         map: the map with its surface.
-        camera: what is said of the camera; its calibration else is the topic's.
-        topics: that are heard.
-        firmware: for whom the poses are, behind MAVROS: "none", "ardupilot" or "px4".
-        origin: of the poses, "LAT,LON"; None is the map's.
+        camera: the camera; without a calibration, the topic's is used.
+        topics: to subscribe to.
+        firmware: autopilot behind MAVROS that receives the poses: "none", "ardupilot" or "px4".
+        origin: origin of the poses, "LAT,LON"; None uses the map's.
         arguments: for ROS: "NAME:=VALUE" for ROS 1, those from "--ros-args" on for ROS 2.
 
     Raises:
@@ -64,7 +64,7 @@ class RosSettings:
         """What is published.
 
         Raises:
-            OptionError: the firmware or the origin is none.
+            OptionError: the firmware or the origin is invalid.
         """
         position = parse_position("origin", self.origin)
         begin = None if position is None else NedOrigin(position.lat_deg or 0.0, position.lon_deg or 0.0, 0.0)
@@ -82,18 +82,18 @@ def run_ros_bridge(
     """Run the node until ROS, Ctrl-C, SIGTERM or the time ends it.
 
     Args:
-        ros: what is heard and published.
-        settings: how frames are matched; None is the defaults.
-        node: that hears and publishes; None creates one.
-        live_view: where the live view goes.
-        progress: is shown what the node does.
+        ros: what to subscribe to and publish.
+        settings: how frames are matched; None uses the defaults.
+        node: the ROS node; None creates one.
+        live_view: where to send the live view.
+        progress: receives progress and messages.
 
     Returns:
         What was done.
 
     Raises:
         BackendError: ROS is not installed, or nothing answers.
-        OptionError, MapError, CalibrationError: an argument or a file is not as expected.
+        OptionError, MapError, CalibrationError: an argument or a file is invalid.
     """
     live_view.check()
     end_on_sigterm()  # before rospy, which calls this handler, too
@@ -115,7 +115,7 @@ def run_ros_bridge(
         try:
             scheduling = settings.scheduling()
             if scheduling is not None:  # this thread, too, may hold Python's lock
-                set_realtime(replace(scheduling, cores=()))  # of which a camera's command would inherit
+                set_realtime(replace(scheduling, cores=()))  # a camera's command would inherit cores
             report = status_reporter(lambda: bridge.status.line(), progress)
             with running_service() as beat, suppress(KeyboardInterrupt):  # the usual end, with its counts
 
@@ -143,7 +143,7 @@ def _node(version: int, arguments: tuple[str, ...]) -> RosNode:
 
 
 def _heard_camera(node: RosNode, ros: RosSettings, progress: Progress) -> Camera:
-    """The camera by its field of view and a picture of it, else the calibration that is published."""
+    """The camera by its field of view and picture size, or the published calibration."""
     described, topics = ros.camera, ros.topics
     if described.hfov_deg is None:
         return described.mounted(_published_camera(node, topics.camera_info, progress))
@@ -157,7 +157,7 @@ def _heard_camera(node: RosNode, ros: RosSettings, progress: Progress) -> Camera
 
 
 def _published_camera(node: RosNode, topic: str, progress: Progress) -> Camera:
-    """The calibration that is published on a topic."""
+    """The calibration published on a topic."""
     if not topic:
         raise OptionError("camera: expected a calibration, or a topic that has it")
     progress.message(f"waiting for the calibration on {topic}")

@@ -1,6 +1,6 @@
-"""What a bridge reports while it runs: to the terminal a line, to systemd also that it is ready, goes on and ends.
+"""Report what a bridge does: status lines to the terminal; readiness, heartbeats and stopping to systemd.
 
-Nothing is sent to systemd where it does not ask for it by $NOTIFY_SOCKET and $WATCHDOG_USEC (sd_notify(3)).
+systemd receives reports only if it sets $NOTIFY_SOCKET and $WATCHDOG_USEC (sd_notify(3)).
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from contextlib import contextmanager
 from scenematch.runs.progress import Progress
 
 _STATUS_PERIOD_S = 5.0
-_BEATS = 4  # within the time that the watchdog waits, so that one that is late or lost does not end the bridge
+_BEATS = 4  # per watchdog interval, so that a late or lost one does not end the bridge
 
 
 @contextmanager
 def running_service() -> Iterator[Callable[[], None]]:
-    """Tell that the service is ready, and when the context ends that it stops.
+    """Report that the service is ready and, when the context ends, that it is stopping.
 
     Yields:
-        A function for the loop to call each time around: it tells the watchdog that the loop goes on, as often as
-        that waits for it. A loop that hangs does not call it, and systemd starts the service again.
+        A function to call in every iteration of the loop: it tells the watchdog in time that the loop still runs.
+            If the loop hangs, systemd restarts the service.
     """
     period_s = int(os.environ.get("WATCHDOG_USEC") or 0) * 1e-6 / _BEATS
     due_s = time.monotonic()
@@ -42,11 +42,11 @@ def running_service() -> Iterator[Callable[[], None]]:
 
 
 def status_reporter(line: Callable[[], str], progress: Progress) -> Callable[[], None]:
-    """A function for the loop to call each time around: now and then it shows what the bridge does.
+    """A function to call in every iteration of the loop: it reports the bridge's status now and then.
 
     Args:
         line: of the bridge's status.
-        progress: is shown it; so is ``systemctl status``.
+        progress: receives the line, as does ``systemctl status``.
     """
     reported_s = time.monotonic()
 
@@ -62,7 +62,7 @@ def status_reporter(line: Callable[[], str], progress: Progress) -> Callable[[],
 
 
 def _tell(state: str) -> None:
-    """Send a line; a manager that does not listen is no reason to stop a bridge."""
+    """Send a line; a manager that does not listen must not stop the bridge."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return

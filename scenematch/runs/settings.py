@@ -1,4 +1,4 @@
-"""How a flight is followed: the settings of a run, as a settings file holds them."""
+"""Settings of a run, read from and written to settings files."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from scenematch.runs.folders import StrPath
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackSettings:
-    """How a flight is followed: all that a settings file holds.
+    """Settings for tracking a flight.
 
     Attributes:
         method: "ncc", "sift", "auto" or "learned".
-        profile: "engine", or "paper" for the paper's own recipe, the baseline.
-        device: where tensors live: "auto", "cpu" or "cuda".
-        start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M" in degrees and metres; none takes the first
-            position of the telemetry, and where that has none the whole map is searched.
-        budget_ms: time that one frame may take, later answers are refused; none does not hurry.
-        risk: probability of a wrong fix that is allowed.
-        telemetry_columns: what a telemetry.csv calls its columns, by our name: timestamp_us = "time",
-            height_agl_m = "alt". A table, [telemetry_columns]; columns that are not in it have our names.
+        profile: "engine", or "paper" for the baseline, the paper's own recipe.
+        device: "auto", "cpu" or "cuda".
+        start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M" in degrees and metres; none uses the
+            telemetry's first position, or searches the whole map if there is none.
+        budget_ms: longest time per frame, later answers are refused; none sets no limit.
+        risk: largest acceptable probability of a wrong fix.
+        telemetry_columns: names that telemetry.csv uses for our columns: timestamp_us = "time",
+            height_agl_m = "alt". A table, [telemetry_columns]; other columns keep our names.
         ncc: settings of the NCC method.
-        sift: settings of the SIFT method, and of what learned matches become.
-        learned: settings of the learned method, its weights among them.
-        navigator: how a position is carried from frame to frame; the paper's profile has none of it.
+        sift: settings of the SIFT method, also used to turn learned matches into fixes.
+        learned: settings of the learned method, including its weights.
+        navigator: how the position is propagated between frames; not used in the paper profile.
 
     Raises:
-        OptionError: a name or a number is none of those that are expected.
+        OptionError: a name or a number is invalid.
         DeviceError: the device is missing.
     """
 
@@ -76,10 +76,10 @@ class TrackSettings:
         for name, theirs in self.telemetry_columns.items():
             check_choice("telemetry_columns", name, COLUMNS)
             if not theirs.strip():
-                raise OptionError(f"telemetry_columns.{name}: expected the name of a column, got a blank one")
+                raise OptionError(f"telemetry_columns.{name}: expected the name of a column, got an empty one")
 
     def matcher_options(self) -> MatcherOptions:
-        """What of it is the matcher's."""
+        """The part of the settings that the matcher takes."""
         return MatcherOptions(
             profile=self.profile, risk=self.risk, ncc=self.ncc, sift=self.sift, learned=self.learned
         )
@@ -87,22 +87,22 @@ class TrackSettings:
 
 @dataclass(frozen=True, slots=True)
 class InputSettings:
-    """What is rarely said of a flight's or a bridge's files.
+    """Rarely needed settings for the input files of flights and bridges.
 
     Attributes:
-        every: one frame in so many is used, from the first on.
-        frame_stamps: with a log, a CSV with timestamp_ns and frame.
-        log_offset_s: with a log, added to the frames' own stamps.
-        image_topic: of the pictures, if the frames are a bag with several.
-        odometry_topic: another odometry that the velocity is taken from, if the telemetry is a bag.
-        camera_pitch_deg: of the camera, -90 looks straight down.
-        scale_calibration: scale the calibration to pictures of another size and the same shape.
-        map_sigma_m: georeferencing accuracy of the map per axis; none is what the map states.
-        map_bounds: "W,S,E,N", edges of a picture without georeference, in degrees or in map_crs.
-        map_crs: of a map that names none, EPSG:N.
-        rate_hz: of a bridge: pace of played pictures without stamps; none is 10.
-        exposure_to_grab_ms: of a bridge: how long the pictures of its camera take to get here.
-        gimbal: of a bridge: the camera hangs on a gimbal that the autopilot reports.
+        every: use every Nth frame, starting with the first.
+        frame_stamps: CSV with timestamp_ns and frame, if the telemetry is a log.
+        log_offset_s: added to the frames' own timestamps, if the telemetry is a log.
+        image_topic: topic of the pictures, if the frames are a bag with several.
+        odometry_topic: topic of another odometry that provides the velocity, if the telemetry is a bag.
+        camera_pitch_deg: pitch of the camera, -90 looks straight down.
+        scale_calibration: scale the calibration to pictures of another size but the same aspect ratio.
+        map_sigma_m: georeferencing accuracy of the map per axis; none uses what the map states.
+        map_bounds: "W,S,E,N", bounds of a picture without georeference, in degrees or in map_crs.
+        map_crs: CRS of a map that names none, as EPSG:N.
+        rate_hz: bridge: rate at which to replay pictures without timestamps; none is 10.
+        exposure_to_grab_ms: bridge: camera latency, from exposure to arrival here.
+        gimbal: bridge: the camera is on a gimbal whose attitude the autopilot reports.
     """
 
     every: int = 1
@@ -120,7 +120,7 @@ class InputSettings:
     gimbal: bool = False
 
     def of(self, *kinds: type[Any]) -> dict[str, Any]:
-        """The values of the fields that these dataclasses have too, by name."""
+        """The values of the fields that these dataclasses share, by name."""
         names = {each.name for kind in kinds for each in fields(kind)}
         return {each.name: getattr(self, each.name) for each in fields(self) if each.name in names}
 
@@ -136,25 +136,26 @@ TABLES = {
     "audit": ("scenematch.check.plan", "AuditOptions", ("ncc",)),
     "fetch": ("scenematch.runs.map_fetch", "FetchSettings", ("around", "source", "dry_run", "force")),
 }  # fmt: skip
-"""Tables of a settings file beside those of :class:`TrackSettings`: module and class, and what is no setting.
+"""Tables of a settings file besides those of :class:`TrackSettings`: module, class, and fields that are not
+settings.
 
-A module is imported with its table only: a map is fetched without torch.
+A module is imported only when its table is used: fetching a map needs no torch.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Settings of files and of NAME=VALUE, the later ones counting more.
+    """Settings from files and NAME=VALUE; later ones take precedence.
 
     Attributes:
-        sources: values with the file that they are from; None is no file.
+        sources: values with the file that they come from; None if from NAME=VALUE.
     """
 
     sources: tuple[tuple[Path | None, Mapping[str, Any]], ...] = ()
 
     @classmethod
     def read(cls, texts: Sequence[StrPath]) -> Settings:
-        """Read them.
+        """Read files and NAME=VALUE.
 
         Raises:
             OptionError: a file is not TOML, or a name is unknown.
@@ -174,10 +175,10 @@ class Settings:
 
     @property
     def threads(self) -> int:
-        """Of torch and OpenCV.
+        """Number of threads for torch and OpenCV.
 
         Raises:
-            OptionError: it is no number above 0.
+            OptionError: it is not a whole number above 0.
         """
         count = self._values().get("threads", 1)
         if type(count) is not int or count < 1:
@@ -188,25 +189,25 @@ class Settings:
         """How frames are matched.
 
         Args:
-            given: settings that count more; None is none.
+            given: settings that take precedence; None is ignored.
 
         Raises:
-            OptionError: a name is unknown, or a value is none that can be.
+            OptionError: a name is unknown, or a value is invalid.
         """
         values = {name: value for name, value in self._values().items() if name not in (*TABLES, "threads")}
         found: TrackSettings = self._built(TrackSettings, values, "", given)
-        weights = tuple(str(Path(path).resolve()) for path in found.learned.weights)  # as a record keeps them
+        weights = tuple(str(Path(path).resolve()) for path in found.learned.weights)  # as records keep them
         return replace(found, learned=replace(found.learned, weights=weights))
 
     def table(self, name: str, **given: Any) -> Any:
         """A table of :data:`TABLES`.
 
         Args:
-            name: of the table.
-            given: what is no setting, or counts more; None is none.
+            name: name of the table.
+            given: fields that are not settings or take precedence; None is ignored.
 
         Raises:
-            OptionError: a name is unknown, or a value is none that can be.
+            OptionError: a name is unknown, or a value is invalid.
         """
         module, kind, hidden = TABLES[name]
         values = self._values().get(name, {})
@@ -250,12 +251,12 @@ def documented_settings() -> str:
 
 
 def load_settings(*texts: StrPath | None, **overrides: Any) -> TrackSettings:
-    """The settings of files, or the defaults, with what overrides them.
+    """Load settings from files, or the defaults, and apply overrides.
 
     Args:
-        texts: TOML files as ``scenematch doctor --settings`` prints one, or NAME=VALUE, the later counting more;
-            None is the defaults.
-        overrides: settings by name that count more; None is none.
+        texts: TOML files as printed by ``scenematch doctor --settings``, or NAME=VALUE; later ones take
+            precedence.
+        overrides: settings by name that take precedence; None is ignored.
 
     Raises:
         OptionError, OSError: see :meth:`Settings.read` and :meth:`Settings.track`.

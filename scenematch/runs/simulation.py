@@ -1,4 +1,4 @@
-"""Simulating a flight: a flight folder with its truth, over a town or the user's map."""
+"""Simulate a flight over a town or the user's map, and write a flight folder with truth."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from scenematch.simulator.town import EXACT, MAX_RELIEF_M
 FOLDER_OWNED = ("frames/[0-9]*.jpg", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif")
 """The files of a simulated flight's folder."""
 LOOP_OWNED = ("loop.csv", "loop.json", *OWNED)
-"""What a closed loop writes beside them."""
+"""Further files that a closed loop writes."""
 START_SIGMA_M = 10.0
 MAX_PITCH_DEG = -30.0
-"""Pitch of the camera that looks furthest from the vertical: 60 degrees off it."""
+"""Largest pitch of the camera: 60 degrees from the vertical."""
 _HEIGHT_M = FlightStyle().height_agl_m
 _TOWN_PX, _GSD_M_PER_PX = (900, 1000), 0.53
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldSettings:
-    """What is flown over.
+    """The world to fly over.
 
     Attributes:
         seed: of town, path, sensors and camera.
-        condition: light, season and air of the frames; None is noon.
+        condition: light, season and weather in the frames; None is noon.
         relief_m: height of a town's hills.
-        map: the user's own map as the world, in place of a town.
+        map: the user's map, used instead of a town.
         surface: heights of that map.
-        camera_pitch_deg: of the camera, -90 straight down, towards the nose: -45 looks 45 degrees ahead of that.
+        camera_pitch_deg: pitch of the camera: -90 looks straight down, -45 looks 45 degrees ahead of that.
 
     Raises:
         OptionError: the arguments do not go together, there is no such condition, the hills are too high, or the
@@ -75,10 +75,10 @@ class WorldSettings:
             )
 
     def build(self) -> Town:
-        """The world with its map: a town of the seed's, or the user's rasters."""
+        """The world with its map: the seed's town, or the user's rasters."""
         if self.map is not None:
             return world_from_map(self.map, self.surface, condition=self.condition, seed=self.seed)
-        # An oblique camera sees further, and the flight is as long over as much more of a town.
+        # An oblique camera sees further, so the town is larger; the flight stays as long.
         more_m = 2.0 * (reach_m(self.camera(), _HEIGHT_M) - reach_m(paper_camera(), _HEIGHT_M))
         width_px, height_px = (n + math.ceil(more_m / _GSD_M_PER_PX) for n in _TOWN_PX)
         return build_town(
@@ -95,7 +95,7 @@ class WorldSettings:
         return paper_camera(self.camera_pitch_deg)
 
     def facts(self) -> dict[str, Any]:
-        """The same as JSON can hold it."""
+        """The world as JSON values."""
         return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()}
 
 
@@ -111,10 +111,10 @@ def simulate(
 
     Args:
         out: the folder.
-        world: what is flown over; None is the first town.
-        frames: flies only the first so many; None is all.
-        force: whether the folder may be there already.
-        progress: is shown what the run does.
+        world: what to fly over; None is the first town.
+        frames: number of frames to fly; None is all.
+        force: whether the folder may already exist.
+        progress: receives progress and messages.
 
     Returns:
         Facts about the flight.
@@ -131,7 +131,7 @@ def simulate(
 
 
 def write_flight(folder: StrPath, plan: FlightPlan, *, progress: Progress = SILENT) -> FlightFiles:
-    """Put the simulated flight on disk as any other flight is; it is then read back like one."""
+    """Write the simulated flight to disk like any other flight; it is then read back."""
     truth = plan.truth_rows()
     start = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=START_SIGMA_M)
     names = [f"{index:06d}.jpg" for index in range(len(plan))]

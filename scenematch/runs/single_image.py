@@ -1,4 +1,4 @@
-"""Locating one image on the map, without a flight around it."""
+"""Locate one image on the map, without a flight."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ def locate_image(
     options: MatcherOptions | None = None,
     progress: Progress = SILENT,
 ) -> Fix | NoFix:
-    """Match one image. Height, attitude and position are the arguments', not those of a photograph's EXIF.
+    """Match one image. Height, attitude and position come from the arguments, not from a photograph's EXIF.
 
     Args:
         image: the file.
-        map: the map with its surface; of a map that says all else itself, its path.
-        camera: what is said of the camera, or the path of its calibration; None takes the photograph's EXIF.
-        height_agl_m: above the ground; None is unknown, as of the next three.
+        map: the map with its surface, or just the path of the map.
+        camera: the camera, or the path of its calibration; None uses the photograph's EXIF.
+        height_agl_m: above the ground; None is unknown, also for the next three.
         heading_deg: clockwise from true north.
         roll_deg: right side down.
         pitch_deg: nose up.
         start: where to search, "LAT,LON" or "LAT,LON,SIGMA_M"; None is the whole map.
         method: "ncc", "sift", "auto" or "learned".
-        device: where tensors live.
-        options: settings of the methods; None is the defaults.
-        progress: is shown the copying of the map.
+        device: to compute on.
+        options: settings of the methods; None uses the defaults.
+        progress: receives the copying of the map.
 
     Raises:
-        OptionError: an argument is out of its range.
+        OptionError: an argument is out of range.
         MapError, CalibrationError, TelemetryError: a file cannot be read, or does not fit another.
     """
     known = {
@@ -75,7 +75,7 @@ def locate_image(
 
 
 def _check_picture(file: Path) -> None:
-    """Refuse what is no picture by its own name: a folder or a video serves other commands."""
+    """Refuse a file that is not a picture; folders and videos are for other commands."""
     if not file.exists():
         raise TelemetryError(f"{file}: expected a picture, got no such file")
     if not file.is_file() or file.suffix.lower() not in PICTURE_SUFFIXES:

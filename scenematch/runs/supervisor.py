@@ -1,7 +1,7 @@
-"""A supervisor: what is slow to load is loaded once, and a worker that dies is replaced by a copy of it.
+"""A supervisor: loads map and matcher once, and replaces a worker that dies by a forked copy.
 
-The parent has loaded map and matcher and does nothing but wait. Its children, copies made by ``fork``, have all of
-it from their first instruction on.
+The parent loads map and matcher and then only waits. Its children, copies made by ``fork``, have everything from
+their first instruction.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 from engine.errors import OptionError
 from scenematch.runs.progress import SILENT, Progress
 
-_PAUSE_S, _MAX_PAUSE_S = 0.05, 5.0  # before a worker is replaced; doubled where one after the other dies at once
+_PAUSE_S, _MAX_PAUSE_S = 0.05, 5.0  # before a worker is replaced; doubled each time a new one dies at once
 _SHORT_S = 5.0
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -25,19 +25,21 @@ def check_supervision(device: Any) -> None:
     """Refuse what cannot be supervised.
 
     Raises:
-        OptionError: the system cannot fork, or the device belongs to the process that has opened it.
+        OptionError: the system cannot fork, or the device cannot be shared with a forked process.
     """
     if not hasattr(os, "fork"):
         raise OptionError("supervise: expected a system that forks, as Linux does")
     if device.type != "cpu":
-        raise OptionError(f"supervise: expected the device cpu, got {device.type}, which no copy of a process has")
+        raise OptionError(
+            f"supervise: expected the device cpu, got {device.type}, which a forked process cannot use"
+        )
 
 
 def become_worker(progress: Progress = SILENT) -> None:
-    """Return in a worker, again and again: the caller stays behind to replace those that are killed.
+    """Fork a worker and return in it; the caller stays behind and forks a new one if it is killed.
 
-    A worker that ends by itself, well or with an error, ends the supervisor, too, with its exit code. SIGTERM is
-    passed on; SIGINT, which a terminal sends to both, is left to the worker.
+    If a worker exits by itself, the supervisor exits with the same code. It passes SIGTERM on and leaves SIGINT,
+    which a terminal sends to both, to the worker.
     """
     pause_s = _PAUSE_S
     reading, writing = os.pipe()  # its end is that of this process
@@ -59,19 +61,19 @@ def become_worker(progress: Progress = SILENT) -> None:
 
 
 def _die_with_the_writer_of(pipe: int) -> None:
-    """End this process when its parent is killed: two bridges at one autopilot would push each other out."""
+    """End this process when its parent is killed: two bridges on one autopilot would conflict."""
 
     def watch() -> None:
-        os.read(pipe, 1)  # returns when nobody is left who could write
+        os.read(pipe, 1)  # returns when the parent is gone
         os._exit(1)
 
     threading.Thread(target=watch, name="scenematch-supervised", daemon=True).start()
 
 
 class _Waiting:
-    """What signals do while a worker is waited for; it begins before the fork, so that none is lost in between.
+    """Handle signals while waiting for a worker; starts before the fork, so that none is lost.
 
-    They are blocked until the parent knows its worker, and the worker has its own handlers back.
+    Signals stay blocked until the parent knows its worker and the worker has its own handlers back.
     """
 
     def __init__(self) -> None:
@@ -83,15 +85,15 @@ class _Waiting:
     def for_end_of(self, worker: int) -> int:
         """Its exit code, below 0 the signal that killed it."""
         self._worker = worker
-        self._pass_on()  # another thread may have taken a signal already
+        self._pass_on()  # another thread may already have taken a signal
         signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
         code = os.waitstatus_to_exitcode(os.waitpid(worker, 0)[1])
-        self._worker = 0  # the number may become another process's
+        self._worker = 0  # the process id may be reused
         self.end()
         return code
 
     def end(self) -> None:
-        """Let signals do what they did before."""
+        """Restore the previous signal handlers."""
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
@@ -109,6 +111,6 @@ class _Waiting:
 
 
 def end_on_sigterm() -> None:
-    """Let SIGTERM end a run as Ctrl-C does, with its table; in the main thread, where signals can be handled."""
+    """Let SIGTERM end a run like Ctrl-C does, with its table; call it in the main thread."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -1,4 +1,4 @@
-"""Exporting a finished track in the formats of other programs."""
+"""Export a finished track in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def export_track(
     """Write a track in another format.
 
     Args:
-        folder: of a finished run.
+        folder: folder of a finished run.
         kind: one of :data:`scenematch.files.export.WRITERS`.
         out: the file; ``track.KIND`` in the folder where None, or ``truth.KIND``.
-        truth: write this instead, where it knows the position at the times of the fixes, about the track's origin.
-        force: whether the file may be there already.
+        truth: write this instead, at the times of the fixes and about the track's origin.
+        force: whether the file may already exist.
 
     Returns:
-        What was written; of TUM also how many fixes were left out (:func:`scenematch.files.export.tum_rows`).
+        What was written; for TUM also how many fixes were left out (:func:`scenematch.files.export.tum_rows`).
 
     Raises:
-        OptionError: the format is unknown, or the file is there and ``force`` was not given.
+        OptionError: the format is unknown, or the file exists and ``force`` was not given.
         TelemetryError: the folder holds no track, or the track has no fix.
     """
     folder = Path(folder)
@@ -60,16 +60,16 @@ def export_track(
 
 
 def _poses(folder: Path, track: list[TrackRow]) -> list[PoseRow]:
-    """The track with what the run noted of the rest of each pose."""
+    """The track with the rest of each pose from the run's notes."""
     notes = read_notes(folder / NOTES) if (folder / NOTES).is_file() else None
     is_amsl = (folder / SUMMARY).is_file() and read_record(folder / SUMMARY).surface_datum is not None
     return pose_rows(track, notes, is_amsl=is_amsl)
 
 
 def _at_truth(folder: Path, track: list[TrackRow], path: Path) -> list[PoseRow]:
-    """The rows of the fixes, each at the true pose of that time, where the truth knows it.
+    """The rows of the fixes with the true pose at each time, if known.
 
-    Its heights are those that ``summary.json`` compares with the fixes', in the datum of the surface model.
+    Heights are in the datum of the surface model, as compared in ``summary.json``.
     """
     record = read_record(folder / SUMMARY)
     ground, frame = Ground(record.ground_m, record.ground_amsl_m), LocalFrame(**record.origin)

@@ -1,4 +1,4 @@
-"""Tracking a flight: its frames through the navigator, into track.csv, summary.json and a report."""
+"""Track a flight: pass its frames through the navigator, and write track.csv, summary.json and a report."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from scenematch.runs.settings import TrackSettings
 if TYPE_CHECKING:  # rerun is optional
     from scenematch.report.live_view import LiveView
 
-# Of the frames: with fewer fixed the inputs are checked, and with few the check is kept even where all fits.
+# Shares of frames fixed: below the first the inputs are checked, below the second the check is always kept.
 _CHECKED_SHARE, _FEW_SHARE = 0.9, 0.5
 
 
@@ -50,26 +50,26 @@ def track(
     inputs: FlightInputs | None = None,
     progress: Progress = SILENT,
 ) -> dict[str, Any]:
-    """Follow a flight and write the output folder.
+    """Track a flight and write the output folder.
 
-    Everything that can be wrong with the input is found before the output folder is created.
+    All errors in the input are found before the output folder is created.
 
     Args:
-        files: of the flight.
+        files: files of the flight.
         out: the folder, created by this run.
-        settings: how it is followed; None is the defaults.
-        force: whether the folder may be there already.
-        report: whether there is a page; :func:`scenematch.runs.evaluation.evaluate` draws them later.
-        diagnosis: whether the inputs are checked where few frames were fixed.
-        live_view: where the live view goes.
-        inputs: what :func:`scenematch.runs.inputs.open_inputs` read of the files, where several runs share it.
-        progress: is shown what the run does.
+        settings: of the run; None uses the defaults.
+        force: whether the folder may already exist.
+        report: whether to draw the page; :func:`scenematch.runs.evaluation.evaluate` draws them later.
+        diagnosis: whether to check the inputs if few frames were fixed.
+        live_view: where to send the live view.
+        inputs: the inputs, if :func:`scenematch.runs.inputs.open_inputs` has already read them.
+        progress: receives progress and messages.
 
     Returns:
-        The summary, as summary.json has it.
+        The contents of summary.json.
 
     Raises:
-        OptionError, TelemetryError, CalibrationError, MapError: an argument or a file is not as expected.
+        OptionError, TelemetryError, CalibrationError, MapError: an argument or a file is invalid.
     """
     out, settings = Path(out), settings or TrackSettings()
     check_folder(out, force)
@@ -88,7 +88,7 @@ def track(
     with open_view(matcher, live_view) as view:
         attitude = _follow(frames, navigator, out, budget, use_priors=start is None, view=view)
     ground = Ground(site.ground_m, ground_amsl_m(flight.rows))
-    # From the rows as they stand in the file, so that evaluate gives the same figures.
+    # From the rows in the file, so that evaluate gives the same figures.
     rows, shown = read_track(out / TRACK), ReportFrames(flight, matcher)
     record = _record(files, settings, inputs, str(matcher.device), ground, attitude)
     share = _fixed_share(rows)
@@ -98,7 +98,7 @@ def track(
 
 
 def _fixed_share(rows: Sequence[TrackRow]) -> float:
-    """Which share of the frames was fixed; those that came too late say nothing of the inputs."""
+    """The share of frames fixed, without late ones, which say nothing about the inputs."""
     answered = [row for row in rows if row.reason != Reason.LATE.value]
     return sum(row.fixed for row in answered) / len(answered) if answered else 1.0
 
@@ -106,8 +106,8 @@ def _fixed_share(rows: Sequence[TrackRow]) -> float:
 def _diagnosis(
     files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, share: float, progress: Progress
 ) -> dict[str, str] | None:
-    """What of the inputs does not fit; None where that cannot be said, which is no reason to lose a track."""
-    progress.message(f"{share:.0%} of the frames were fixed: looking for what does not fit")
+    """Errors found in the inputs; None if the check fails, which must not lose the track."""
+    progress.message(f"{share:.0%} of the frames were fixed: looking for errors in the inputs")
     try:
         found = diagnose_flight(files, settings.start, inputs=inputs, progress=progress)
     except (EngineError, MemoryError, KeyboardInterrupt):
@@ -125,7 +125,7 @@ def _record(
     ground: Ground,
     attitude: AttitudeCheck | None,
 ) -> RunRecord:
-    """What a run was made of, for summary.json."""
+    """The record of a run, for summary.json."""
     given = files.flat() | {"truth": inputs.truth_path}
     for name in PATHS:
         given[name] = None if given[name] is None else str(Path(given[name]).resolve())
@@ -160,18 +160,18 @@ def _follow(
     use_priors: bool,
     view: LiveView | None = None,
 ) -> AttitudeCheck | None:
-    """Every frame through the navigator, each row on disk as soon as it is known.
+    """Pass every frame through the navigator, and write each row to disk at once.
 
     Args:
         frames: in their order.
         navigator: fresh.
         out: the folder of track.csv and notes.csv.
         budget: of each frame.
-        use_priors: whether the telemetry's own positions count; a start that was given stands in their place.
-        view: is shown each frame once it is answered.
+        use_priors: whether to use the telemetry's own positions; a given start replaces them.
+        view: receives each frame once it is answered.
 
     Returns:
-        AttitudeCheck | None: what the fixes say of the telemetry's attitude.
+        AttitudeCheck | None: check of the telemetry's attitude against the fixes.
     """
     attitudes: list[AttitudeRow | None] = []
     notes = []
@@ -192,7 +192,7 @@ def _follow(
 
 
 def _update(navigator: Navigator, item: FlightFrame, prior: Prior | None) -> Fix | NoFix:
-    """The frame's result; an error in the middle of a flight names its frame, and is no wrong usage."""
+    """The frame's result; an error in mid-flight names the frame and does not count as wrong usage."""
     try:
         return navigator.update(item.frame, prior)
     except EngineError as error:

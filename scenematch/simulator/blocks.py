@@ -70,7 +70,7 @@ def _perimeter(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None
                 offset = np.array([at + length / 2, side * (across / 2 - 8.5)])
                 uv = (u + offset[0], v + offset[1]) if not turn else (u + offset[1], v + offset[0])
                 kind = "flat" if rng.random() < 0.2 else "gable"
-                # Neighbours share a wall: the gap that keeps houses apart is a metre and a half of alley here.
+                # Neighbours share a wall: the usual gap between houses would leave an alley of a metre and a half.
                 building(canvas, *uv, length - 1.3, rng.uniform(11, 13), rng.uniform(9, 17), kind, turn)
                 at += length
     grove(canvas, u, v, 0.6 * du, 0.6 * dv, 160, (1.5, 3.5))
@@ -162,7 +162,7 @@ _SHARES = np.array([0.31, 0.17, 0.22, 0.13, 0.09, 0.05, 0.01, 0.02])
 
 
 def fill_blocks(canvas: Canvas, edges_u: list[float], edges_v: list[float]) -> None:
-    """Fill the blocks between the streets; those near the centre hold one of the rarer kinds each."""
+    """Fill the blocks between the streets; each block near the centre is of one of the rarer kinds."""
     rng, road, before = canvas.rng, canvas.busy > 0, (canvas.rgb.copy(), canvas.material.copy())
     cells = [
         ((a + b) / 2, (c + d) / 2, b - a - 18.5, d - c - 17.0)
@@ -174,6 +174,6 @@ def fill_blocks(canvas: Canvas, edges_u: list[float], edges_v: list[float]) -> N
         kind = first[index] if index < len(first) else int(rng.choice(len(_KINDS), p=_SHARES))
         if math.hypot(cell[0], cell[1]) < canvas.reach_m + 40:
             _KINDS[kind](canvas, *cell)
-    # The winding road cuts through blocks: restore what they painted over, except for crowns above it.
+    # The winding road cuts through blocks: restore it, except for crowns above it.
     road &= canvas.height == 0.0
     canvas.rgb[road], canvas.material[road] = before[0][road], before[1][road]

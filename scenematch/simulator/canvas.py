@@ -1,8 +1,8 @@
-"""A canvas of colour, height and material on which a town is drawn, with buildings and trees.
+"""A canvas of colour, height and material for drawing a town with buildings and trees.
 
 Convention:
-    Town coordinates (u, v) are metres from the town's centre along and across its main streets, turned against
-    the raster so that nothing is aligned with pixels.
+    Town coordinates (u, v) are metres from the town's centre along and across its main streets, rotated from the
+    raster so that nothing is aligned with pixels.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class Canvas:
 
         Returns:
             Slices of rows and columns, and offsets (h, w) of the pixels from the centre in u and in v, in metres;
-            None where the canvas cuts the window off.
+            None if the window leaves the canvas.
         """
         x, y = np.rint(self.px(np.array([[u, v]]))[0]).astype(int)
         r = math.ceil(radius_m / self.gsd) + 1
@@ -169,7 +169,7 @@ class Canvas:
 def building(
     canvas: Canvas, u: float, v: float, length: float, width: float, eave: float, kind: str, angle: float = 0.0
 ) -> bool:
-    """Draw a building ("gable", "hip" or "flat") where the ground is free, and return whether it was drawn."""
+    """Draw a building ("gable", "hip" or "flat") if the ground is free, and return whether it was drawn."""
     found = canvas.patch(u, v, math.hypot(length, width) / 2 + 1.0)
     if found is None:
         return False
@@ -240,7 +240,7 @@ def _flat_roof(canvas: Canvas, a: Array, b: Array, gap: Array, length: float, wi
 
 
 def tree(canvas: Canvas, u: float, v: float, radius: float) -> None:
-    """Draw a crown where there is neither road nor house."""
+    """Draw a crown except on roads and houses."""
     found = canvas.patch(u, v, radius)
     if found is None:
         return

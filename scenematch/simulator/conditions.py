@@ -1,6 +1,6 @@
-"""Conditions: light, season and air of a day, and how they change the appearance of the ground.
+"""Conditions: light, season and air of a day, and their effect on the appearance of the ground.
 
-Snow, foliage and lamps work on the drawn colours before light falls on them, by the material of each pixel.
+Snow, foliage and lamps change the drawn colours by the material of each pixel, before lighting.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scenematch.simulator.optics import Sensor
 from scenematch.simulator.render import Atmosphere
 
 _SNOW: tuple[float, ...] = (0.92, 0.18, 0.45, 0.72, 0.92, 0.0, 0.35)
-"""Share of each material, in the canvas's order, that a closed cover of snow hides; streets are cleared."""
+"""Share of each material, in the canvas's order, hidden by a full snow cover; streets are cleared."""
 _SNOW_RGB, _STRAW_RGB, _LITTER_RGB, _BARK_RGB = (214, 220, 230), (148, 134, 92), (98, 88, 68), (110, 98, 86)
 _TURNED: tuple[tuple[int, int, int], ...] = ((164, 118, 46), (150, 78, 38), (120, 112, 52), (110, 70, 44))
 
@@ -29,12 +29,12 @@ class Condition:
 
     Attributes:
         light: sun and sky, as exposed.
-        shade: share of the sky's light that is lost between high walls and under crowns, in [0, 1].
-        snow: 0 none to 1 a closed cover on roofs and lawns, with streets cleared.
-        leaves: share of the trees' crowns that is closed; the rest shows the ground between branches.
-        turned: share of the foliage that has its autumn colours.
+        shade: share of the sky's light lost between high walls and under crowns, in [0, 1].
+        snow: 0 none to 1 a full cover on roofs and lawns, with streets cleared.
+        leaves: density of the trees' crowns; the rest shows the ground between branches.
+        turned: share of the foliage in autumn colours.
         dry: 0 green to 1 withered lawns and crops.
-        visibility_m: distance at which 2 % of a contrast is left (Koschmieder); inf is perfectly clear.
+        visibility_m: distance at which 2 % of a contrast remains (Koschmieder); inf is perfectly clear.
         air_rgb: colour of the air, in grey levels.
         lamps: strength of the street lamps.
         noise: the sensor's noise as a multiple of its own.
@@ -65,7 +65,7 @@ class Condition:
 
     @property
     def air(self) -> Atmosphere | None:
-        """The air between camera and ground, None where it is perfectly clear."""
+        """The air between camera and ground, None if perfectly clear."""
         return None if math.isinf(self.visibility_m) else Atmosphere(self.visibility_m, self.air_rgb)
 
     @property
@@ -111,10 +111,10 @@ CONDITIONS = {
 
 
 def condition_by_name(condition: str | Condition) -> Condition:
-    """The condition of that name, or the one that is given.
+    """The condition with this name, or the given condition.
 
     Raises:
-        OptionError: there is none.
+        OptionError: there is no such condition.
     """
     if isinstance(condition, Condition):
         return condition
@@ -144,16 +144,16 @@ def apply_season(
     gsd_m_per_px: float,
     rng: np.random.Generator,
 ) -> tuple[Image, Float32]:
-    """Colours and heights of the ground in a season; unchanged where the condition has none.
+    """Colours and heights of the ground in a season; unchanged if the condition has none.
 
     Args:
         albedo: (H, W, 3) drawn colours of summer.
         height_m: (H, W) of the highest surface.
         material: (H, W) indices of the materials of :mod:`scenematch.simulator.canvas`.
-        ground_m: (H, W) of the bare ground, None where it is flat at 0.
+        ground_m: (H, W) of the bare ground, None if it is flat at 0.
         condition: of the day.
         gsd_m_per_px: pixel in metres.
-        rng: of the snow's patches and the bare branches.
+        rng: for snow patches and bare branches.
 
     Returns:
         (H, W, 3) uint8 colours and (H, W) heights.
@@ -182,7 +182,7 @@ def _shed(
 ) -> None:
     """Open the crowns of trees by their share of leaves: bare ground between branches, in place."""
     bare = (kind == CANOPY) & (0.5 + 0.29 * grain + 0.12 * small > condition.leaves)
-    if condition.leaves < 0.5:  # what is left of a bare tree is wood
+    if condition.leaves < 0.5:  # a bare tree shows only wood
         wood = ((kind == CANOPY) & ~bare).astype(np.float32) * np.float32(0.85 * (1.0 - condition.leaves))
         _mix(rgb, np.array(_BARK_RGB, np.float32), wood)
         height[wood > 0] = ground[wood > 0] + np.float32(0.65) * (height - ground)[wood > 0]
@@ -192,7 +192,7 @@ def _shed(
 
 
 def _cover_with_snow(rgb: Float32, kind: Image, snow: float, large: Float32, small: Float32) -> None:
-    """Blend in snow by material, in patches, in place; through a thin cover the ground shows."""
+    """Blend in snow by material, in patches, in place; the ground shows through a thin cover."""
     cover = np.array(_SNOW, np.float32)[kind] * np.float32(snow * 1.2)
     share = np.clip(2.2 * (cover - 0.5) + 0.5 + 0.22 * large + 0.1 * small, 0.0, 1.0) * (cover > 0)
     grey = rgb.mean(axis=2, keepdims=True) / np.float32(110.0)
@@ -202,7 +202,7 @@ def _cover_with_snow(rgb: Float32, kind: Image, snow: float, large: Float32, sma
 def _wither(
     rgb: Float32, kind: Image, condition: Condition, large: Float32, rng: np.random.Generator, gsd: float
 ) -> None:
-    """Straw for lawns and crops, autumn colours for crowns; every tree turns on its own day."""
+    """Straw for lawns and crops, autumn colours for crowns; each tree changes colour on its own day."""
     if condition.dry:
         field = ((kind == GRASS) | (kind == CROP)) * np.clip(condition.dry + 0.15 * large, 0.0, 0.9)
         shade = rgb.mean(axis=2, keepdims=True) / np.float32(105.0)

@@ -1,9 +1,9 @@
 """The reference filter: an error-state EKF over IMU, barometer, compass, and positions of GPS or of the engine.
 
 Convention:
-    Fifteen states of the vehicle: errors of position, velocity, attitude (a small turn in east-north-up, applied
-    from the left), accelerometer bias and gyroscope bias. Two more, the barometer's drift and the compass's
-    error, which last so long that they would otherwise be taken for height and heading. After Solà,
+    Fifteen states of the vehicle: errors of position, velocity, attitude (a small rotation in east-north-up,
+        applied from the left), accelerometer bias and gyroscope bias. Two more are the barometer's drift and the
+        compass's error: they last so long that they would otherwise appear as height and heading. After Solà,
     "Quaternion kinematics for the error-state Kalman filter" (2017), section 7, with rotation matrices.
 """
 
@@ -27,7 +27,7 @@ POSITION, VELOCITY, TURN, ACCEL, GYRO = (slice(k, k + 3) for k in range(0, 15, 3
 BARO, COMPASS = 15, 16
 STATES = 17
 START_TILT_DEG = 0.5
-"""Standard deviation of roll and pitch of a vehicle that was levelled."""
+"""Standard deviation of roll and pitch of a levelled vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +41,8 @@ class FilterState:
         enu_from_body: (3, 3) attitude.
         accel_bias_mps2: (3,) in the body.
         gyro_bias_rps: (3,) in the body.
-        baro_drift_m: error of the barometer, positive where it reads too high.
-        compass_bias_rad: error of the compass, positive where it reads too far clockwise.
+        baro_drift_m: error of the barometer, positive if it reads too high.
+        compass_bias_rad: error of the compass, positive if it reads too far clockwise.
         covariance: (17, 17) of the errors, in the order of the attributes.
     """
 
@@ -63,7 +63,7 @@ class FilterState:
 
 
 def initial_state(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSuite) -> FilterState:
-    """The state of a levelled vehicle at rest, whose heading is as uncertain as its compass.
+    """The state of a levelled vehicle at rest; its heading is as uncertain as its compass.
 
     Args:
         position_m: (3,) east, north, up.
@@ -82,7 +82,7 @@ def initial_state(position_m: Array, sigma_m: float, attitude: Attitude, suite: 
         + [imu.gyro_start_rps] * 3 + [0.02, math.radians(suite.compass.bias_deg)]
     )  # fmt: skip
     covariance = np.diag(sigmas**2)
-    # The heading is the compass's: where that reads too far clockwise, the true heading is anticlockwise of it.
+    # The heading is the compass's: if that reads too far clockwise, the true heading is anticlockwise of it.
     up = TURN.start + 2
     covariance[up, COMPASS] = covariance[COMPASS, up] = math.radians(suite.compass.bias_deg) ** 2
     return FilterState(
@@ -99,7 +99,7 @@ def initial_state(position_m: Array, sigma_m: float, attitude: Attitude, suite: 
 
 
 def predict(state: FilterState, sample: IdealImu, suite: SensorSuite) -> FilterState:
-    """The state one step later, from what the IMU measured in between."""
+    """The state one step later, from the IMU's measurements."""
     rates, dt = sample.rates_rps - state.gyro_bias_rps, STEP_S
     half = state.enu_from_body @ rotation(0.5 * dt * rates)
     force = half @ (sample.force_mps2 - state.accel_bias_mps2)
@@ -140,7 +140,7 @@ def _transition(half: Array, force: Array, keep_accel: float, keep_gyro: float, 
 
 
 def _process_noise(suite: SensorSuite) -> Array:
-    """(17,) variances that one step adds; the same in every direction, so that attitude does not enter."""
+    """(17,) variances that one step adds; the same in every direction, so attitude does not matter."""
     imu, baro = suite.imu, suite.barometer
     drive = [0.0, imu.accel_noise, imu.gyro_noise, imu.accel_walk, imu.gyro_walk]
     drift = baro.drift_m * math.sqrt(2.0 / baro.drift_time_s)
@@ -148,7 +148,7 @@ def _process_noise(suite: SensorSuite) -> Array:
 
 
 def correct(state: FilterState, residual: Array, H: Array, R: Array) -> FilterState:
-    """The state after a measurement, in Joseph's form, which keeps the covariance positive definite.
+    """The state after a measurement, in Joseph form, which keeps the covariance positive definite.
 
     Args:
         state: before.
@@ -164,7 +164,7 @@ def correct(state: FilterState, residual: Array, H: Array, R: Array) -> FilterSt
     update = np.eye(STATES) - gain @ H
     covariance = update @ P @ update.T + gain @ R @ gain.T
     error = gain @ residual
-    # Injecting the turn into the attitude rotates the error frame by half of it (Solà, eq. 287): negligible.
+    # Applying the rotation to the attitude rotates the error frame by half of it (Solà, eq. 287): negligible.
     return FilterState(
         state.time_s,
         state.position_m + error[POSITION],
@@ -187,7 +187,7 @@ def fuse_height(state: FilterState, height_m: float, suite: SensorSuite) -> Filt
 
 
 def fuse_heading(state: FilterState, heading_deg: float, suite: SensorSuite) -> FilterState:
-    """Fuse a heading of the compass, clockwise from north; a body that points straight up or down has none."""
+    """Fuse a compass heading, clockwise from north; a body that points straight up or down has none."""
     east, north, up = state.enu_from_body[:, 0].tolist()
     flat2 = east**2 + north**2
     if flat2 < 1e-3:
@@ -202,7 +202,7 @@ def fuse_heading(state: FilterState, heading_deg: float, suite: SensorSuite) -> 
 
 
 def fuse_gps(state: FilterState, sample: GpsSample, suite: SensorSuite) -> FilterState:
-    """Fuse position and velocity of the receiver; the state is that of the sample's time."""
+    """Fuse the receiver's position and velocity; the state is at the sample's time."""
     gps = suite.gps
     variances = np.array([gps.noise_m] * 2 + [gps.height_noise_m] + [gps.velocity_noise_mps] * 3) ** 2
     residual = np.concatenate([sample.position_m - state.position_m, sample.velocity_mps - state.velocity_mps])
@@ -210,7 +210,7 @@ def fuse_gps(state: FilterState, sample: GpsSample, suite: SensorSuite) -> Filte
 
 
 def fuse_fix(state: FilterState, fix: Fix) -> FilterState:
-    """Fuse a fix of the engine with its covariance, and its height where it has one.
+    """Fuse a fix of the engine with its covariance, and its height if it has one.
 
     Args:
         state: at the capture of the frame, about the same origin and in the same datum of heights.

@@ -51,8 +51,8 @@ class Fault:
 class ShiftedMap:
     """A matcher whose map can be shifted to the east while it works.
 
-    On a map that shows everything ``shift_m`` too far east a search near a prior is one that far west of it on the
-    correct map, and its fix is reported that far too far east.
+    If the map shows everything ``shift_m`` too far east, a search near a prior happens that far to its west on the
+    correct map, and the fix is reported that far too far east.
 
     Args:
         matcher: on the correct map.
@@ -67,7 +67,7 @@ class ShiftedMap:
         self.shift_m = 0.0
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
-        """As the matcher's; a prior is in metres about the map's origin."""
+        """Same as the matcher's; a prior is in metres from the map's origin."""
         if prior is not None and self.shift_m:
             if prior.east_m is None:
                 raise OptionError("prior: expected east_m and north_m over a shifted map")

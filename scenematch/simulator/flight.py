@@ -54,9 +54,9 @@ def grid_at(town: Town, origin: LocalFrame, east_north_m: Array) -> tuple[float,
     """Easting and northing of a position in the local frame.
 
     Args:
-        town: whose CRS is meant.
+        town: provides the CRS.
         origin: of the local frame.
-        east_north_m: (2,) or (3,) east and north in metres; what follows is not read.
+        east_north_m: (2,) or (3,) east and north in metres; further values are ignored.
 
     Returns:
         (easting, northing) in metres in the town's CRS.
@@ -77,10 +77,10 @@ def picture_at(
     optics: Optics | None = None,
     sway: ExposureMotion | None = None,
 ) -> Image:
-    """The picture that a camera at a position delivers.
+    """The picture from a camera at a position.
 
     Args:
-        town: what it looks at.
+        town: the scene.
         camera: intrinsics and mount.
         origin: of the local east-north-up frame.
         east_north_up_m: (3,) the camera's position in it, up above the world's height 0.
@@ -102,18 +102,18 @@ def picture_at(
 
 @dataclass(frozen=True)
 class FlightPlan:
-    """A flight before its pictures are drawn.
+    """A flight before its pictures are rendered.
 
     Attributes:
-        town: what it flies over.
-        camera: what it looks through.
+        town: the ground flown over.
+        camera: of the drone.
         origin: of the local east-north-up frame of its motions: the map's centre; up from the world's height 0.
         truth: the exact motion, one entry per frame.
-        telemetry: the same as the sensors measure it.
+        telemetry: the motion as the sensors measure it.
         timestamps_ns: capture times.
         seed: of the camera's noise.
         optics: exposure, shutter and gain; None is an ideal camera.
-        sways: motion while each picture is taken, where the optics show it.
+        sways: motion during each exposure, if the optics show it.
     """
 
     town: Town
@@ -130,7 +130,7 @@ class FlightPlan:
         return len(self.timestamps_ns)
 
     def iter_frames(self) -> Iterator[Frame]:
-        """Draw the frames one after the other, each with its telemetry."""
+        """Render the frames one by one, each with its telemetry."""
         rng = generator(self.seed, 0xCA)
         for k in range(len(self)):
             yield self._frame(k, rng)
@@ -175,17 +175,17 @@ class FlightPlan:
         ]
 
     def draw(self) -> SimulatedFlight:
-        """Draw all pictures at once; :meth:`iter_frames` holds one at a time."""
+        """Render all pictures at once; :meth:`iter_frames` keeps only one at a time."""
         return SimulatedFlight(self.town, self.camera, list(self.iter_frames()), self.truth_rows())
 
 
 @dataclass(frozen=True)
 class SimulatedFlight:
-    """A flight with its pictures drawn.
+    """A flight with rendered pictures.
 
     Attributes:
         town: map, surface model and world.
-        camera: what the frames were taken with.
+        camera: that took the frames.
         frames: pictures with noisy telemetry in them.
         truth: the exact poses, row for row with the frames.
     """
@@ -200,8 +200,8 @@ def paper_camera(pitch_deg: float = NADIR_PITCH_DEG) -> Camera:
     """The paper's camera, 300 x 300 px with 60 degrees.
 
     Args:
-        pitch_deg: of its axis against the body's horizontal, as gimbals state it: -90 looks straight down, -45
-            half way up from there towards the nose.
+        pitch_deg: of its axis from the body's horizontal, as gimbals state it: -90 looks straight down, -45
+            halfway up towards the nose.
     """
     camera = Camera.from_fov(300, 300, 60.0)
     up = math.radians(pitch_deg - NADIR_PITCH_DEG)
@@ -210,7 +210,7 @@ def paper_camera(pitch_deg: float = NADIR_PITCH_DEG) -> Camera:
 
 
 def reach_m(camera: Camera, height_m: float) -> float:
-    """How far a level camera sees: to the corners of a nadir picture, to the middle of an oblique one, in metres.
+    """How far a level camera sees in metres: to the corners of a nadir picture, to the centre of an oblique one.
 
     Args:
         camera: intrinsics and mount.
@@ -224,7 +224,7 @@ def reach_m(camera: Camera, height_m: float) -> float:
 def _waypoints(town: Town, camera: Camera, height_m: float, rng: np.random.Generator) -> Array:
     """Corners (5, 2) of the largest rectangle whose level footprints lie on the map, jittered.
 
-    Of an oblique camera it is the middle of the footprint.
+    For an oblique camera, the centre of the footprint counts.
     """
     half_w, half_h = (0.5 * n * town.gsd_m_per_px for n in (town.ortho.shape[1], town.ortho.shape[0]))
     reach = reach_m(camera, height_m) + EDGE_M
@@ -260,13 +260,13 @@ def _sways(motion: Motion, time_s: Array) -> tuple[ExposureMotion, ...]:
 
 
 class TownOptions(TypedDict, total=False):
-    """Keyword arguments of :func:`plan_flight` about the town that is built, see :func:`build_town`.
+    """Keyword arguments of :func:`plan_flight` about the town to build, see :func:`build_town`.
 
     Attributes:
         condition: day of the frames: light, season and air.
         map_condition: day of the map.
-        relief_m: height of the hills. The flight keeps its height above the ground where it begins.
-        river: whether one crosses the town.
+        relief_m: height of the hills. The flight keeps its height above the ground at its start.
+        river: whether a river crosses the town.
         changed: share of the houses, 0 to 1, that differ between the map and the flight.
     """
 
@@ -295,12 +295,12 @@ def plan_flight(
         seed: of town, path, sensors and camera.
         frames: how many, from take-off on; None flies to the end (about 150).
         rate_hz: frames per second.
-        noise: of the telemetry; None takes the defaults, as for the style.
+        noise: of the telemetry; None uses the defaults, also for the style.
         style: of flying.
         town: to fly over; None builds the seed's by ``town_options``.
-        camera: None takes the paper's, 300 x 300 px with 60 degrees.
+        camera: None uses the paper's, 300 x 300 px with 60 degrees.
         optics: exposure time, shutter and gain of the camera; None is an ideal one.
-        **town_options: see :class:`TownOptions`; without effect where a town is given.
+        **town_options: see :class:`TownOptions`; ignored if a town is given.
 
     Raises:
         OptionError: an argument is out of range, or the map is too small for the height.
@@ -321,7 +321,7 @@ def plan_flight(
 def _fly_over(
     town: Town, camera: Camera, style: FlightStyle, rng: np.random.Generator
 ) -> tuple[Motion, LocalFrame]:
-    """The motion round the map, up from the world's height 0, and the local frame about the map's centre."""
+    """The motion round the map, up from the world's height 0, and the local frame at the map's centre."""
     middle = town.pixel_to_crs @ ((town.ortho.shape[1] - 1) / 2, (town.ortho.shape[0] - 1) / 2, 1.0)
     lon, lat = transformer(town.crs_epsg).transform(*middle, direction="INVERSE")
     origin = LocalFrame(lat, lon)

@@ -1,4 +1,4 @@
-"""Delayed measurements: the filter's last seconds, so that each is fused at the time it was taken."""
+"""Delayed measurements: keep the filter's last seconds to fuse each measurement at the time it was taken."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class _Step:
 
 
 class History:
-    """A filter that fuses late measurements: it goes back to their time and repeats what followed, in order.
+    """A filter that fuses late measurements: it goes back to their time and repeats the following steps in order.
 
-    That is exact, at the cost of one prediction per step since: 12 for a fix of 120 ms ago.
+    This is exact and costs one prediction per repeated step: 12 for a fix 120 ms old.
 
     Args:
         start: the first state.
@@ -47,16 +47,16 @@ class History:
         return self._steps[-1].state if self._steps else self._before
 
     def advance(self, sample: IdealImu) -> None:
-        """Predict one step, from what the IMU measured."""
+        """Predict one step from the IMU's measurements."""
         self._steps.append(_Step(sample, predict(self.now, sample, self._suite)))
         if len(self._steps) > self._max_steps:
             self._before = self._steps.popleft().state
 
     def at(self, time_s: float) -> FilterState:
-        """The state at a time, by all measurements so far.
+        """The state at a time, using all measurements so far.
 
         Raises:
-            StateError: the time is in the future, or further back than is kept.
+            StateError: the time is in the future, or older than ``keep_s``.
         """
         back = self._back(time_s)
         return self._before if back == len(self._steps) else self._steps[len(self._steps) - 1 - back].state
@@ -65,7 +65,7 @@ class History:
         """Fuse a measurement at the time it was taken.
 
         Raises:
-            StateError: the time is in the future, or further back than is kept.
+            StateError: the time is in the future, or older than ``keep_s``.
         """
         back = self._back(time_s)
         if back == len(self._steps):

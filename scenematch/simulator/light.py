@@ -2,7 +2,7 @@
 
 Convention:
     Raster axes are right, down the picture, up; azimuths are clockwise from the raster's up direction. Strengths
-    of light are shares of the full scale that a white surface reaches, as the camera exposes it.
+    of light are shares of full scale that a white surface reaches at the camera's exposure.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Light:
     Attributes:
         azimuth_deg: of the sun, clockwise from the raster's up direction.
         elevation_deg: above the horizon.
-        sun_rgb: strength of the sun on a surface that faces it.
+        sun_rgb: strength of the sun on a surface facing it.
         sky_rgb: strength of the diffuse light, which reaches shadows too.
     """
 
@@ -58,7 +58,7 @@ def sun_visibility(height_m: Float32, gsd_m_per_px: float, light: Light) -> Floa
     """Share of the sun's light that reaches every pixel.
 
     The raster is turned until light travels along its rows; the shadow's height is then a running maximum of
-    the heights less the sun's descent, which one pass finds exactly for any length of shadow.
+    the heights less the sun's descent, which one pass computes exactly for any length of shadow.
 
     Args:
         height_m: (H, W) of the highest surface.
@@ -83,25 +83,25 @@ def sun_visibility(height_m: Float32, gsd_m_per_px: float, light: Light) -> Floa
     np.maximum.accumulate(turned, axis=1, out=turned)
     turned -= descent
     shadow: Any = cv2.warpAffine(turned, matrix, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    # Half a metre of blur in height stands for the sun's disc and keeps roofs from shadowing themselves.
+    # Blurring heights by half a metre imitates the sun's disc and keeps roofs from shadowing themselves.
     return np.asarray(np.clip(1.3 - 2.0 * (shadow - height_m), 0.0, 1.0), dtype=np.float32)
 
 
 LAMP_RGB = (0.95, 0.72, 0.42)
-"""Light right below a street lamp."""
+"""Light directly below a street lamp."""
 SHADE_REACH_M = 7.0
-"""Distance from a wall within which it blocks light of the sky."""
+"""Distance within which a wall blocks light from the sky."""
 
 
 def sky_share(height_m: Float32, gsd_m_per_px: float, shade: float) -> Float32:
     """Share of the sky that is visible beside walls and between crowns: 1 on roofs and open ground.
 
-    It is approximated by how far a pixel is below the mean height around it.
+    Approximated by a pixel's depth below the mean height around it.
 
     Args:
         height_m: (H, W) of the highest surface.
         gsd_m_per_px: pixel in metres.
-        shade: share that is lost at the foot of high walls, in [0, 1].
+        shade: share lost at the foot of high walls, in [0, 1].
 
     Returns:
         (H, W) in [0, 1].
@@ -127,7 +127,7 @@ def illuminate(
         height_m: (H, W).
         gsd_m_per_px: pixel in metres.
         light: sun and sky.
-        shade: share of the sky that is lost at the foot of high walls.
+        shade: share of the sky lost at the foot of high walls.
         lamps: (H, W) light of lamps in [0, 1].
 
     Returns:
@@ -153,14 +153,14 @@ def illuminate(
 def box_sides(
     ab_m: tuple[Array, Array], size_m: tuple[float, float], axis: Array, wall: Sequence[float], light: Light
 ) -> Image:
-    """Colours of a box's walls as :attr:`World.sides` has them, each for the pixels nearest to it.
+    """Colours of a box's walls for :attr:`World.sides`, each for its nearest pixels.
 
     Args:
         ab_m: offsets (H, W) of the pixels from the box's centre along its length and its width.
         size_m: length and width.
         axis: (2,) direction of the length in raster axes.
         wall: (3,) RGB of the plaster.
-        light: on it; walls in the shadow of others are not darkened.
+        light: on the box; shadows of other walls are ignored.
 
     Returns:
         (H, W, 4) uint8 RGB, and 255 in columns of windows.

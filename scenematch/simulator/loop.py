@@ -1,14 +1,14 @@
-"""The closed loop: a simulated vehicle that steers by its filter, whose only positions are the engine's fixes.
+"""The closed loop: fly a simulated vehicle by a filter that gets positions only from the engine's fixes.
 
-What it does when they fail:
+If fixes fail:
 
 - No fix: the filter propagates on the IMU alone, and the vehicle follows its route while the estimate's sigma
-  stays below ``hold_sigma_m``.
+stays below ``hold_sigma_m``.
 - Above that it holds: it slows down on its route and hovers by the estimate, until fixes have brought the sigma
-  below half of that limit. Then it returns to where it left the route, and flies on.
+  below half of that limit. Then it returns to where it left the route and continues.
 - Above ``give_up_sigma_m`` the estimate is too uncertain to hover by: the flight is handed over to the pilot.
-- A fix that contradicts the filter by chi-square is not fused. Where ``max_contradictions`` fixes in a row do so,
-  either the filter or the engine is wrong, and the flight is handed over as well.
+- A fix that contradicts the filter by chi-square is not fused. After ``max_contradictions`` such fixes in a row,
+either the filter or the engine is wrong, and the flight is handed over too.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ __all__ = [
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 RenderCallback = Callable[[State], Image]
-"""Returns the picture that the camera delivers at a state of the vehicle."""
+"""Returns the camera's picture at a state of the vehicle."""
 
 
 class Mode(enum.Enum):
@@ -71,7 +71,7 @@ class Mode(enum.Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class LoopOptions:
-    """How the closed loop is flown.
+    """Settings of the closed-loop flight.
 
     Attributes:
         airframe: of the vehicle.
@@ -83,12 +83,12 @@ class LoopOptions:
         start_sigma_m: standard deviation of the position at the start, per axis.
         hold_sigma_m: horizontal sigma of the estimate above which the vehicle holds.
         give_up_sigma_m: horizontal sigma of the estimate above which the flight is handed over.
-        resume_m: largest estimated distance from the route at which the vehicle flies on after a hold.
-        pace_change_per_s: how fast it slows down along its route and speeds up again; 1 is within a second.
+        resume_m: largest estimated distance from the route at which the vehicle continues after a hold.
+        pace_change_per_s: how fast it slows down along its route and speeds up again; 1 takes a second.
         gate: chi-square of two degrees of freedom, beyond which a fix contradicts the filter.
         max_contradictions: fixes in a row that contradict the filter, at which the flight is handed over.
-        healthy_s: age of the last fix, beyond its latency, up to which the engine counts as healthy.
-        gps: whether the receiver's positions are fused instead of the engine's fixes.
+        healthy_s: largest age of the last fix, beyond its latency, at which the engine counts as healthy.
+        gps: whether to fuse the receiver's positions instead of the engine's fixes.
 
     Raises:
         OptionError: a value is not above 0.
@@ -144,8 +144,8 @@ class LoopAnswer:
     Attributes:
         timestamp_ns: of its capture.
         truth: the vehicle's true state then.
-        result: of the engine.
-        state: the navigator's after it; None where the engine was killed.
+        result: the engine's.
+        state: the navigator's after it; None if the engine was killed.
         arrives_s: when the vehicle receives the answer.
     """
 
@@ -158,7 +158,7 @@ class LoopAnswer:
 
 @dataclass
 class LoopResult:
-    """A flight that was flown.
+    """A completed flight.
 
     Attributes:
         record: ten times a second.
@@ -198,12 +198,12 @@ def fly_closed_loop(
     """Fly a route by the engine's fixes.
 
     Args:
-        route: where to; about the origin of the matcher's map, up above its ground.
+        route: the route to fly, relative to the origin of the matcher's map, up from its ground.
         camera: takes the pictures.
         matcher: matches them; a :class:`engine.matching.matcher.SceneMatcher`, or a stand-in.
         seed: of wind, vibration and all sensors.
-        seconds: how long at most; None flies as long as the route takes without holding. A flight that is handed
-            over ends there.
+        seconds: maximum duration; None flies as long as the route takes without holding. A handover ends the
+            flight.
         fault: injected failure.
         options: settings.
 
@@ -256,7 +256,7 @@ class ClosedLoop:
         self.flown = LoopResult([], [], [], self._history.now.position_m)
 
     def _initial_estimate(self, rng: np.random.Generator) -> FilterState:
-        """At rest, with errors drawn from the filter's own covariance."""
+        """The state at rest, with errors drawn from the filter's own covariance."""
         sigma, white = self.options.start_sigma_m, rng.standard_normal(5)
         heading = self._instruments.heading_deg(self._state)
         attitude = Attitude(START_TILT_DEG * white[3], START_TILT_DEG * white[4], heading)
@@ -269,7 +269,7 @@ class ClosedLoop:
         return Navigator(self._map, Prior(east_m=east, north_m=north, sigma_m=estimate.sigma_m))
 
     def fly(self, seconds: float | None = None) -> Iterator[Frame]:
-        """Fly; yields every frame as the engine gets it, after its answer."""
+        """Fly; yields every frame as given to the engine, after its answer."""
         every = steps_between(self.options.frame_rate_hz)
         for k in range(1, round((self._route.duration_s if seconds is None else seconds) / STEP_S) + 1):
             self._step(k)
@@ -296,7 +296,7 @@ class ClosedLoop:
         self._sense(k)
 
     def _target(self) -> Setpoint:
-        """The setpoint; while the vehicle holds, the route's clock slows to a stop, and afterwards runs again."""
+        """The setpoint; during a hold, the route's clock slows to a stop and later runs again."""
         faster = self.options.pace_change_per_s * (1.0 if self._mode is Mode.FOLLOW else -1.0)
         pace = min(max(self._pace + faster * STEP_S, 0.0), 1.0)
         change, self._pace = (pace - self._pace) / STEP_S, pace
@@ -304,7 +304,7 @@ class ClosedLoop:
         return self._route.at(self._clock_s, pace, change)
 
     def _sense(self, k: int) -> None:
-        """Read barometer and compass, and the GPS receiver where it is used."""
+        """Read barometer and compass, and the GPS receiver if used."""
         suite, instruments, state = self.options.sensors, self._instruments, self._state
         now_s = self._history.now.time_s
         if k % steps_between(suite.barometer.rate_hz) == 0:
@@ -354,7 +354,7 @@ class ClosedLoop:
         )
 
     def _receive(self) -> None:
-        """Fuse what has arrived by now, each at its own time."""
+        """Fuse all measurements that have arrived, each at its own time."""
         now_s, options = self._state.time_s, self.options
         while self._pending and self._pending[0].arrives_s <= now_s + 0.5 * STEP_S:
             answer = self._pending.popleft()
@@ -376,7 +376,7 @@ class ClosedLoop:
             self._mode = Mode.FOLLOW
 
     def _gate(self, fix: Fix, answer: LoopAnswer) -> None:
-        """Fuse a fix that passes the chi-square gate, count any other."""
+        """Fuse a fix if it passes the chi-square gate; otherwise count it."""
         captured_s = answer.truth.time_s
         self._last_fix_s = captured_s
         if fix_chi_square(self._history.at(captured_s), fix) > self.options.gate:

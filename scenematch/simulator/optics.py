@@ -1,8 +1,8 @@
-"""The camera's image formation: exposure and noise, motion while the shutter is open, the lens.
+"""The camera's image formation: exposure, noise, motion while the shutter is open, and the lens.
 
 Convention:
-    The stamp of a picture is the middle of the exposure of its middle row. During the milliseconds of a picture
-    the vehicle moves and turns evenly.
+    A picture's timestamp is the middle of the exposure of its middle row. During these milliseconds the vehicle
+    moves and turns uniformly.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from scenematch.simulator.render import World, render_frame
 GAIN_LIMITS = (0.25, 8.0)
 """Range of the gain of automatic exposure."""
 MAX_VIEW = 4.0
-"""Sides of the pinhole picture that a lens is drawn from, as a multiple of the camera's."""
+"""Size of the pinhole picture that the lens is resampled from, as a multiple of the camera's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class Sensor:
     noise_sd: float
 
     def develop(self, seen: Image, rng: np.random.Generator) -> Image:
-        """The picture that this sensor takes of an ideal one.
+        """The ideal picture as this sensor records it.
 
         Args:
             seen: (H, W, 3) uint8 RGB.
@@ -78,12 +78,12 @@ class Optics:
     """Exposure time, shutter and gain of a camera; the defaults are an ideal one.
 
     Attributes:
-        exposure_ms: how long every row gathers light; motion meanwhile blurs it. 0 freezes it.
+        exposure_ms: exposure of each row; motion during it blurs the row. 0 freezes motion.
         readout_ms: from the first row to the last; each row sees another pose (rolling shutter). 0 is a global
             shutter.
         gain: multiplies light and noise alike.
-        target_level: mean grey level that automatic exposure aims at, on top of the gain; None leaves it alone.
-        exposure_samples: number of poses that motion blur is averaged from.
+        target_level: mean grey level that automatic exposure aims at, in addition to the gain; None disables it.
+        exposure_samples: number of poses averaged for motion blur.
 
     Raises:
         OptionError: a value is out of range.
@@ -109,7 +109,7 @@ class Optics:
 
 @dataclass(frozen=True)
 class ExposureMotion:
-    """How the vehicle moves and turns while a picture is taken.
+    """Motion and rotation of the vehicle during a picture.
 
     Attributes:
         velocity_mps: east, north, up.
@@ -134,8 +134,8 @@ def take_picture(
 ) -> Image:
     """The picture that a real camera delivers.
 
-    What each row sees at each time is resampled from one sharp pinhole picture, by way of the ground plane, which
-    misplaces a roof of 20 m seen from 150 m by 13 % of what the vehicle flies meanwhile: centimetres.
+    What each row sees at each time is resampled from one sharp pinhole picture via the ground plane. This
+    misplaces a 20 m roof seen from 150 m by 13 % of the distance flown meanwhile: centimetres.
 
     Args:
         world: what is seen.
@@ -146,7 +146,7 @@ def take_picture(
         rng: of noise and exposure.
         sensor: how light becomes grey levels.
         optics: exposure, shutter and gain; None is an ideal camera.
-        sway: motion meanwhile; None is none.
+        sway: motion during the picture; None for none.
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -163,7 +163,7 @@ def take_picture(
 
 
 def _exposed(sensor: Sensor, optics: Optics, seen: Image) -> Sensor:
-    """The sensor with its gain set, as automatic exposure sets it for what is seen."""
+    """The sensor with the gain that automatic exposure sets for the scene."""
     gain = optics.gain
     if optics.target_level is not None:
         level = 255.0 * float(np.mean((seen / 255.0) ** sensor.gamma)) * gain
@@ -176,7 +176,7 @@ def _exposed(sensor: Sensor, optics: Optics, seen: Image) -> Sensor:
 
 @lru_cache(maxsize=4)
 def lens_rays(camera: Camera) -> Float32:
-    """Optical rays of all pixels, with the lens's distortion taken out.
+    """Optical rays of all pixels, undistorted.
 
     Args:
         camera: intrinsics and distortion.
@@ -197,7 +197,7 @@ def lens_rays(camera: Camera) -> Float32:
 def _row_rays(
     camera: Camera, attitude: Attitude, height_m: float, optics: Optics, sway: ExposureMotion
 ) -> list[Float32]:
-    """For each time of the exposure the rays (H, W, 2), x / z and y / z, in the pose of the stamp.
+    """For each time of the exposure, the rays (H, W, 2), x / z and y / z, in the pose at the timestamp.
 
     A ray d of a camera displaced by s meets the ground where d - s d_z / h of the undisplaced one does.
     """
@@ -215,7 +215,7 @@ def _row_rays(
     times_s = ((np.arange(count) + 0.5) / count - 0.5) * optics.exposure_ms * 1e-3
     found = []
     for time_s in times_s.tolist():
-        # A readout lasts tens of milliseconds: between its first and its last row matrices change evenly.
+        # A readout lasts tens of milliseconds, so matrices change linearly from its first to its last row.
         first, last = (seen_after(time_s + end_s) for end_s in (-half_s, half_s))
         rows = (first + share * (last - first)).astype(np.float32)
         seen = rays @ rows.transpose(0, 2, 1)
@@ -231,14 +231,14 @@ def _resampled(
     attitude: Attitude,
     rays: list[Float32],
 ) -> Image:
-    """The mean of the pictures along all rays, resampled from one sharp pinhole picture that holds them all."""
+    """The mean of the pictures along all rays, resampled from one sharp pinhole picture that contains them all."""
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
     pixels = [ray * np.array([fx, fy], np.float32) for ray in rays]
     low = np.floor(np.min([p.min(axis=(0, 1)) for p in pixels], axis=0)) - 2.0
     high = np.ceil(np.max([p.max(axis=(0, 1)) for p in pixels], axis=0)) + 2.0
     size = (high - low + 1.0).astype(int)
     if not (size <= MAX_VIEW * max(camera.width_px, camera.height_px)).all():
-        raise OptionError(f"camera: expected a lens that a flat picture can hold, got one of {size} px in all")
+        raise OptionError(f"camera: expected a lens that fits a flat picture, got one that needs {size} px")
     matrix = np.array([[fx, 0.0, -low[0]], [0.0, fy, -low[1]], [0.0, 0.0, 1.0]])
     wide = Camera(int(size[0]), int(size[1]), matrix, mount=camera.mount)
     sharp = render_frame(world, wide, grid_m, up_m, attitude)

@@ -1,4 +1,4 @@
-"""The autopilot: a timed route, and the cascade from position over velocity to acceleration that follows it."""
+"""The autopilot: a timed route, and the cascade position, velocity, acceleration that follows it."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class Setpoint:
 
 @dataclass(frozen=True)
 class Route:
-    """A flight as it is planned, every :data:`scenematch.simulator.vehicle.COURSE_STEP_S` of its own clock.
+    """A planned flight, sampled every :data:`scenematch.simulator.vehicle.COURSE_STEP_S` of its own clock.
 
     Attributes:
         position_m: (N, 3) east, north, up.
         velocity_mps: (N, 3).
         acceleration_mps2: (N, 3).
         heading_deg: (N,), unwrapped.
-        kicks_s: times at which speeding up, braking and stopping shake the vehicle.
+        kicks_s: times when speeding up, braking and stopping shake the vehicle.
     """
 
     position_m: Array
@@ -55,8 +55,8 @@ class Route:
         """The setpoint at a time of the route's clock.
 
         Args:
-            clock_s: on the route's clock; before it and after it the vehicle hovers at the ends.
-            pace: how fast that clock runs against real time.
+            clock_s: on the route's clock; before and after the route the vehicle hovers at its ends.
+            pace: speed of that clock relative to real time.
             change_per_s: how fast the pace changes.
         """
         k = min(max(round(clock_s / COURSE_STEP_S), 0), len(self.heading_deg) - 1)
@@ -67,7 +67,7 @@ class Route:
 
 
 def plan_route(waypoints_m: Array, style: FlightStyle | None = None) -> Route:
-    """Legs between waypoints with a stop at each, as in the built-in flight, at a constant height.
+    """Legs at constant height between waypoints with a stop at each, as in the built-in flight.
 
     Args:
         waypoints_m: (N, 2) east and north.
@@ -99,10 +99,10 @@ def plan_route(waypoints_m: Array, style: FlightStyle | None = None) -> Route:
 
 
 def plan_rounds(half_m: tuple[float, float], seconds: float, style: FlightStyle | None = None) -> Route:
-    """As many rounds of a rectangle about the origin as take at least the given time.
+    """Enough circuits of a rectangle around the origin to take at least the given time.
 
     Args:
-        half_m: half of its sides, to the east and to the north.
+        half_m: half its sides, to the east and to the north.
         seconds: least duration.
         style: speed and height.
 
@@ -178,7 +178,7 @@ class Pilot:
         if flat > self._gains.max_acceleration_mps2:
             wanted[:2] *= self._gains.max_acceleration_mps2 / flat
             self._wind[2] += self._integral[2] * STEP_S * error[2]
-        else:  # at the limit the integral would wind up
+        else:  # the integral would wind up at the limit
             self._wind += self._integral * STEP_S * error
         self._wind = np.clip(self._wind, -2.0, 2.0)
         return np.asarray(wanted)

@@ -1,9 +1,9 @@
 """A quadrotor in wind: thrust along its body, a second-order attitude response, drag, and its ideal IMU.
 
 Convention:
-    World axes are east-north-up, body axes forward-right-down; ``enu_from_body`` takes the second to the first.
-    A step integrates the acceleration of its beginning over its length, so that an IMU that is integrated in
-    the same way gives the same path.
+    World axes are east-north-up, body axes forward-right-down; ``enu_from_body`` maps the second to the first. A
+    step integrates the acceleration at its beginning over its length, so that integrating the IMU in the same way
+    gives the same path.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ _PEAK_OF_SWING = 0.71  # first peak after an impulse over impulse / frequency, a
 
 @dataclass(frozen=True, kw_only=True)
 class Airframe:
-    """The vehicle: of the size of the 3DR Iris, whose mass Gazebo's model gives as 1.5 kg.
+    """The vehicle: the size of a 3DR Iris, with the 1.5 kg of Gazebo's model.
 
     Attributes:
         mass_kg: of the vehicle with its battery.
         max_thrust_n: of all four rotors.
         thrust_lag_s: time constant of the rotors.
-        drag_per_s: force of the air per mass and airspeed; 0.1 makes 8.5 m/s cost 5 degrees of tilt.
+        drag_per_s: drag per mass and airspeed; with 0.1, flying 8.5 m/s takes 5 degrees of tilt.
         swing_rps: natural frequency of roll and pitch under control, in radians per second.
         swing_damping: share of critical damping of the same; 0.25 rings for about half a second.
-        yaw_rps: natural frequency of the heading, which is damped critically.
+        yaw_rps: natural frequency of the heading, which is critically damped.
         max_tilt_deg: largest tilt that the controller commands.
-        shake_deg: largest swing that a start or a stop excites.
+        shake_deg: largest swing excited by a start or a stop.
 
     Raises:
         OptionError: a value is not above 0, or the thrust is below the weight.
@@ -143,7 +143,7 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class IdealImu:
-    """What a perfect IMU measures over one step: (3,) specific force and (3,) turn rates, both in the body."""
+    """A perfect IMU's measurement over one step: (3,) specific force and (3,) turn rates, both in the body."""
 
     force_mps2: Array
     rates_rps: Array
@@ -164,10 +164,10 @@ def hovering(position_m: Array, heading_deg: float) -> State:
 
 
 def aim(acceleration_mps2: Array, heading_deg: float, airframe: Airframe) -> tuple[Array, Array]:
-    """The attitude that gives an acceleration in still air, and the force per mass that it takes.
+    """The attitude that gives an acceleration in still air, and the force per mass it needs.
 
-    A force that would tilt beyond ``max_tilt_deg`` keeps its vertical component and gets a smaller horizontal one;
-    the rotors push up, never down.
+    If the force would tilt the vehicle beyond ``max_tilt_deg``, only its horizontal component is reduced; the
+    rotors never push down.
 
     Args:
         acceleration_mps2: (3,) east, north, up.
@@ -203,7 +203,7 @@ def advance(
 
     Returns:
         State: at its end.
-        IdealImu: what an IMU measured in between.
+        IdealImu: the IMU's measurement during the step.
     """
     wanted, force = aim(acceleration_mps2, heading_deg, airframe)
     up = -state.enu_from_body[:, 2]
@@ -225,7 +225,7 @@ def advance(
 
 
 def next_time_s(time_s: float) -> float:
-    """The time one step later, rounded to a multiple of the step, so that errors do not accumulate."""
+    """The time one step later, rounded to a multiple of the step so that errors do not accumulate."""
     return (round(time_s / STEP_S) + 1) * STEP_S
 
 

@@ -1,4 +1,4 @@
-"""A world from the user's map: an orthophoto, with or without a surface model, from which frames are drawn."""
+"""Build a world from the user's map: an orthophoto, with or without a surface model, to render frames from."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from scenematch.simulator.render import World
 from scenematch.simulator.town import Town, generator
 
 LIMIT_PX = 100 * 2**20
-"""Largest world, since it is held in memory at about 20 bytes per pixel."""
+"""Largest world; it takes about 20 bytes of memory per pixel."""
 LIMIT_SIDE_PX = 32767
 """OpenCV's remap counts in 16 bits."""
 BARE_CELL_M, BARE_REACH_M = 2.0, 40.0
 """Ground is the morphological opening of the surface by 40 m, on cells of 2 m."""
 GREEN = 12.0
-"""Grey levels by which green exceeds red and blue where a pixel counts as foliage."""
+"""Grey levels by which green must exceed red and blue in foliage."""
 
 
 def world_from_map(
@@ -39,17 +39,17 @@ def world_from_map(
     seed: int = 1,
     cache_dir: str | os.PathLike[str] | None = None,
 ) -> Town:
-    """A world of the user's rasters, flown over as a built town is; its map is the rasters themselves.
+    """A world from the user's rasters, used like a generated town; the rasters are also its map.
 
-    Colours are those of the file where it has three uint8 bands on a north-up metric grid, else grey. Walls, which
+    Colours are those of the file if it has three uint8 bands on a north-up metric grid, else grey. Walls, which
     no orthophoto shows, have the darkened colour of the roof.
 
     Args:
-        path: the orthophoto; for what may be opened see :meth:`engine.OrthoMap.open`.
+        path: the orthophoto; for supported files see :meth:`engine.OrthoMap.open`.
         surface: heights in any grid and CRS; None is flat.
-        condition: of the frames, on top of the light in the photograph; None leaves the photograph as it is.
-        seed: of the snow's patches and the bare branches.
-        cache_dir: where resampled maps are kept.
+        condition: of the frames, applied to the photograph; None leaves it unchanged.
+        seed: for snow patches and bare branches.
+        cache_dir: folder for resampled maps.
 
     Raises:
         MapError: a file cannot be read, is too large, or its grid has no EPSG code.
@@ -89,7 +89,7 @@ def _photograph(source: Source, cache_dir: str | os.PathLike[str] | None) -> tup
 def _heights(
     surface: str | os.PathLike[str] | None, grid: Grid, gsd: float
 ) -> tuple[Float32, Float32 | None, float]:
-    """Surface and bare ground (H, W) above the lowest point, and its height; flat where there is no surface."""
+    """Surface and bare ground (H, W) above the lowest point, and its height; flat without a surface."""
     shape = (grid.height_px, grid.width_px)
     if surface is None:
         return np.zeros(shape, np.float32), None, 0.0
@@ -126,7 +126,7 @@ def bare_ground(height_m: Float32, gsd_m_per_px: float) -> Float32:
 
 
 def _materials(rgb: Image, above_m: Float32) -> Image:
-    """Materials (H, W) guessed by colour and height above the ground."""
+    """Materials (H, W) guessed from colour and height above the ground."""
     red, green, blue = (rgb[..., k].astype(np.float32) for k in range(3))
     foliage = green - 0.5 * (red + blue) > GREEN
     material = np.full(above_m.shape, ASPHALT, np.uint8)

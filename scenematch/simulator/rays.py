@@ -1,7 +1,7 @@
-"""The rays of a picture against planes at any height, and where they end in the sky.
+"""Intersect the rays of a picture with planes at any height, and find where they end in the sky.
 
 Convention:
-    World pixels (x, y) have their centres at integers. Angles are off the vertical: 0 looks straight down.
+    World pixels (x, y) have their centres at integers. Angles are from the vertical: 0 looks straight down.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from engine.values import Attitude
 from scenematch.simulator.light import Array, Float32
 
 FADE_DEG, FAR_DEG = 80.0, 84.0
-"""Angles between which the ground fades into the sky; beyond, nothing else is seen."""
+"""Angles between which the ground fades into the sky; beyond them only sky is visible."""
 MAX_AXIS_DEG = 75.0
 """Largest angle of the optical axis."""
 _STRAIGHT_DEG, _MAX_STRETCH = 30.0, 2.0  # rays in a pixel cost time
@@ -30,7 +30,7 @@ class Rays:
 
     Attributes:
         reach: (2, 3) world pixels that a ray travels, linear in its pixel (x, y, 1).
-        ahead: (3,) metres that it falls meanwhile, linear in the same.
+        ahead: (3,) metres that it descends meanwhile, linear in the same.
         aside: (2, 3) metres east and north that it travels meanwhile, linear in the same.
         nadir_px: (2,) world pixel below the camera.
         camera_m: height of the camera.
@@ -87,7 +87,7 @@ class Rays:
     def per_metre(self) -> tuple[Float32, Float32]:
         """World pixels (x, y) that each ray travels per metre of height, on the picture's raster.
 
-        A ray into the sky travels as one at the angle where the sky begins.
+        A ray into the sky counts as one at the angle where the sky begins.
 
         Returns:
             Right and down, (H, W) each.
@@ -107,7 +107,7 @@ class Rays:
 
     @cached_property
     def steepness(self) -> float:
-        """Largest tangent of a ray's angle; inf where one does not meet the ground."""
+        """Largest tangent of a ray's angle; inf if one does not meet the ground."""
         x, y = (np.array([-0.5, n - 0.5]) for n in self.size)
         corners = np.stack([*np.meshgrid(x, y), np.ones((2, 2))]).reshape(3, 4)
         fall = self.ahead @ corners
@@ -120,7 +120,7 @@ class Rays:
 
     @property
     def rows_of_sky(self) -> int:
-        """How many rows at the top of the picture show nothing else."""
+        """How many rows at the top of the picture show only sky."""
         if not self.sees_sky:
             return 0
         ground = (self.sky_share() < 1.0).any(axis=1)
@@ -128,7 +128,7 @@ class Rays:
 
     @property
     def _sky_drop(self) -> Array:
-        """(H, W) metres that each ray would fall at the angle where the sky begins."""
+        """(H, W) metres that each ray would descend at the angle where the sky begins."""
         return np.maximum(self._away / math.tan(math.radians(FAR_DEG)), 1e-9)
 
     @property
@@ -136,26 +136,26 @@ class Rays:
         return np.asarray(np.hypot(*(self._at(row) for row in self.aside)))
 
     def _at(self, row: Array) -> Array:
-        """(H, W) values of what is linear in the pixel."""
+        """(H, W) values of a linear function of the pixel."""
         x, y = np.arange(self.size[0]), np.arange(self.size[1])[:, None]
         return np.asarray(row[0] * x + row[1] * y + row[2])
 
 
 def stretch(camera: Camera, attitude: Attitude) -> float:
-    """How many times larger than straight below a pixel in the middle of the picture is on the ground.
+    """How many times larger the central pixel's footprint is than straight below.
 
     Args:
         camera: intrinsics and mount.
         attitude: of the body.
 
     Returns:
-        1 up to 30 degrees off the vertical, and at most 2: a picture is not drawn more finely than that.
+        1 up to 30 degrees off the vertical, and at most 2: pictures are not rendered more finely than that.
     """
     angle_deg = _axis_deg(camera, attitude)
     return 1.0 if angle_deg <= _STRAIGHT_DEG else min(math.cos(math.radians(angle_deg)) ** -2, _MAX_STRETCH)
 
 
 def _axis_deg(camera: Camera, attitude: Attitude) -> float:
-    """Angle of the ray through the middle of the picture."""
+    """Angle of the ray through the picture's centre."""
     ray = camera.enu_from_camera(attitude) @ camera.frame_rays[4]
     return math.degrees(math.atan2(math.hypot(ray[0], ray[1]), -ray[2]))

@@ -1,10 +1,10 @@
-"""The picture that an ideal camera takes of a world: rays against a height field, the air and water between.
+"""Render an ideal camera's picture of a world: rays against a height field, with air and water.
 
 Convention:
     A world is a raster seen from straight above: colour and height of the highest surface at every pixel.
     Heights are metres above flat ground at 0. Positions are metres in the raster's projected CRS; attitude is
     about true north, so grid convergence and point scale enter through the grid's local Jacobian. Beyond its edge
-    a world continues mirrored.
+    the world is mirrored.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from scenematch.simulator.light import Array, Float32, Image, Light
 from scenematch.simulator.rays import Rays, stretch
 
 LAYER_M = 1.0
-"""Height step of the search for the first surface that a ray meets; thinner structures may be missed."""
+"""Height step in the search for a ray's first surface; thinner structures may be missed."""
 SLOPE_VARIANCE, GLINT = 0.02, 0.9
-"""Variance of the slopes of ripples in a light breeze, and the sun's brightness where all facets mirror it."""
+"""Variance of the slopes of ripples in a light breeze, and the sun's brightness if all facets mirror it."""
 SKY_RGB = (200.0, 208.0, 218.0)
-"""The sky where the air has no colour of its own."""
-_GRAZING = 1.2  # tangent of the angle off the vertical beyond which surfaces are found more finely
+"""The sky if the air has no colour of its own."""
+_GRAZING = 1.2  # tangent of the angle from the vertical beyond which surfaces are searched more finely
 FLOOR_M = 3.0
 """Height of one storey: the pitch of the rows of windows."""
 
@@ -51,10 +51,10 @@ class Atmosphere:
 
 @dataclass(frozen=True, eq=False)
 class Glint:
-    """The sun on water: facets of ripples that mirror it to the lens (Cox and Munk's Gaussian slopes).
+    """The sun on water: facets of ripples that reflect it to the lens (Cox and Munk's Gaussian slopes).
 
     Attributes:
-        light: its sun is mirrored.
+        light: with the sun to reflect.
         water: (H, W) uint8, above 0 where there is water.
     """
 
@@ -69,12 +69,12 @@ class World:
     Attributes:
         rgb: (H, W, 3) colours as seen from above, light and shadows included.
         sides: (H, W, 4) colour of the vertical face next to a pixel; the fourth is 255 in columns of windows.
-        height_m: (H, W) of the highest surface above the world's height 0, never below; 0 on flat ground.
+        height_m: (H, W) of the highest surface above the world's height 0, never negative; 0 on flat ground.
         pixel_to_crs: (2, 3) affine from pixels (x, y), centres at integers, to the projected CRS.
         crs_epsg: code of that CRS.
-        ground_m: (H, W) of the bare ground where it is not flat at 0.
-        air: between camera and ground; None is perfectly clear.
-        glint: the sun on water; None has none.
+        ground_m: (H, W) of the bare ground if it is not flat at 0.
+        air: between camera and ground; None if perfectly clear.
+        glint: the sun on water; None for none.
         gsd_m_per_px: a pixel in grid metres.
 
     Raises:
@@ -105,7 +105,7 @@ class World:
         object.__setattr__(self, "gsd_m_per_px", math.sqrt(area))
 
     def ground_at(self, grid_m: tuple[float, float]) -> float:
-        """Height of the bare ground at (easting, northing), of the nearest pixel."""
+        """Height of the bare ground at (easting, northing), from the nearest pixel."""
         if self.ground_m is None:
             return 0.0
         xy = np.linalg.inv(self.pixel_to_crs[:, :2]) @ (np.asarray(grid_m) - self.pixel_to_crs[:, 2])
@@ -148,7 +148,7 @@ def grid_from_enu(crs_epsg: int, grid_m: tuple[float, float]) -> Array:
 
 
 def _first_layer(world: World, rays: Rays) -> tuple[Image, Float32]:
-    """For every ray the first layer from the top that lies inside something, and the layers' heights.
+    """For every ray, the first layer from the top that is inside something, and the layers' heights.
 
     Returns:
         Layers (H, W), 0 for none, and heights by layer, index 0 the ground, rising.
@@ -174,7 +174,7 @@ def _nearest(raster: NDArray[Any], x: Float32, y: Float32) -> NDArray[Any]:
 
 
 def _mirrored(place: Float32, size: int) -> NDArray[np.int32]:
-    """Whole indices of places along an axis that goes to and fro."""
+    """Integer indices along an axis that is mirrored at its ends."""
     index = np.rint(place).astype(np.int32)
     if index.size and (index.min() < 0 or index.max() >= size):
         index = np.mod(index, 2 * size)
@@ -183,10 +183,10 @@ def _mirrored(place: Float32, size: int) -> NDArray[np.int32]:
 
 
 def _intersect(world: World, rays: Rays, x: Float32, y: Float32, low: Float32, step: float) -> tuple[Any, Any]:
-    """Height at which rays meet the surface, and whether they meet it from the side.
+    """Height at which rays meet the surface, and whether from the side.
 
-    Bisects between the layer inside and the free layer above it; a surface that rises above the free end is a
-    wall, any other a roof, whose own height then places the texture exactly.
+    Bisects between the layer inside and the free layer above it; a surface above the free end is a wall; any other
+    is a roof, and its own height places the texture exactly.
     """
     nadir_x, nadir_y = (np.float32(v) for v in rays.nadir_px)
     camera_m = np.float32(rays.camera_m)
@@ -217,10 +217,10 @@ def _add_glint(picture: Image, glint: Glint, x: Float32, y: Float32, toward: tup
     """Add the sun's glint on water, in place.
 
     Args:
-        picture: (H, W, 3) to be changed.
+        picture: (H, W, 3), changed in place.
         glint: sun and water.
-        x: (H, W) columns of the world that are seen.
-        y: (H, W) rows of it.
+        x: (H, W) visible columns of the world.
+        y: (H, W) visible rows.
         toward: metres (H, W) right and down that each ray travels per metre of height, seen from the lens.
     """
     where = _nearest(glint.water, x, y) > 0
@@ -228,7 +228,7 @@ def _add_glint(picture: Image, glint: Glint, x: Float32, y: Float32, toward: tup
         return
     right, down = (component[where] for component in toward)
     length = np.sqrt(right**2 + down**2 + np.float32(1.0))
-    # The facet that mirrors the sun to the lens lies halfway between both directions.
+    # The normal of the reflecting facet is halfway between both directions.
     half = [-right / length, -down / length, 1.0 / length]
     half = [part + np.float32(sun) for part, sun in zip(half, glint.light.towards_sun, strict=True)]
     slope = (half[0] ** 2 + half[1] ** 2) / half[2] ** 2
@@ -276,7 +276,7 @@ def render_frame(
     *,
     supersample: int | None = None,
 ) -> Image:
-    """The picture that a pinhole camera takes of a world, without noise and exposure.
+    """Render a pinhole camera's picture of a world, without noise and exposure.
 
     Args:
         world: what is seen; mirrored beyond its edge, and sky from 84 degrees off the vertical.
@@ -284,7 +284,7 @@ def render_frame(
         grid_m: the camera's (easting, northing) in the world's CRS.
         height_agl_m: above the world's height 0 (the flat ground), and above its highest surface.
         attitude: of the body, about true north.
-        supersample: rays per pixel and axis; None follows the world's resolution (1 to 4).
+        supersample: rays per pixel and axis; None depends on the world's resolution (1 to 4).
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -309,7 +309,8 @@ def _trace(world: World, rays: Rays) -> Image:
     """Colours (H, W, 3) along all rays, supersampled."""
     found, heights = _first_layer(world, rays)
     per_metre = x, y = rays.per_metre()
-    # On flat ground a ray that met no layer ends at 0; on hills every ray is intersected with its own ground.
+    # On flat ground, a ray that met no layer ends at 0; on hills, each ray is intersected with the ground below
+    # it.
     where = np.flatnonzero(found) if world.ground_m is None else np.arange(found.size)
     far_x, far_y = x.ravel()[where], y.ravel()[where]
     z_m, wall = _intersect(world, rays, far_x, far_y, heights[found.ravel()[where]], float(heights[1]))

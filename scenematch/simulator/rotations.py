@@ -1,4 +1,4 @@
-"""Rotations as vectors: the turn about an axis by its length in radians, there and back."""
+"""Rotation vectors: convert an axis times an angle in radians to a matrix and back."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def cross_matrix(v: Array) -> Array:
 
 
 def rotation(vector_rad: Array) -> Array:
-    """Rotation about a vector by its length (Rodrigues' formula).
+    """Rotation matrix about a vector by its length (Rodrigues' formula).
 
     Args:
         vector_rad: (3,) axis times angle in radians.

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 class Imu:
     """Accelerometer and gyroscope: white noise, and a bias (Gauss-Markov).
 
-    The defaults are the ADIS16448's as RotorS and PX4's Gazebo have it (Furrer et al., 2016); the biases at the
-    start are what levelling and a gyroscope's calibration on the ground leave.
+    The defaults are the ADIS16448's from RotorS and PX4's Gazebo (Furrer et al., 2016); the initial biases are
+    what levelling and gyroscope calibration on the ground leave.
 
     Attributes:
         accel_noise: white noise of the specific force, in m/s^2 per root Hz.
@@ -52,7 +52,7 @@ class Imu:
 
 @dataclass(frozen=True, kw_only=True)
 class Compass:
-    """Heading by the magnetic field, after declination: the HMC5883L's data sheet gives 1 to 2 degrees.
+    """Heading from the magnetic field, after declination: the HMC5883L's data sheet gives 1 to 2 degrees.
 
     Attributes:
         rate_hz: samples per second.
@@ -73,7 +73,7 @@ class Compass:
 
 @dataclass(frozen=True, kw_only=True)
 class Barometer:
-    """Height by air pressure: noise of a MS5611 (0.1 m at its finest) in the rotors' wash, and a slow drift.
+    """Height by air pressure: noise of an MS5611 (0.1 m at best) in the rotors' wash, and a slow drift.
 
     Attributes:
         rate_hz: samples per second.
@@ -96,7 +96,7 @@ class Barometer:
 
 @dataclass(frozen=True, kw_only=True)
 class Gps:
-    """A receiver of the class of u-blox's M8 (data sheet: 2.5 m horizontally, half of the time; 0.05 m/s).
+    """A receiver like u-blox's M8 (data sheet: 2.5 m horizontally, 50 %; 0.05 m/s).
 
     Attributes:
         rate_hz: samples per second.
@@ -125,10 +125,10 @@ def _check_rate(sensor: Compass | Barometer | Gps) -> None:
 
 
 def steps_between(rate_hz: float) -> int:
-    """How many steps of the simulation there are per sample.
+    """Number of simulation steps per sample.
 
     Raises:
-        OptionError: the rate is above that of the steps.
+        OptionError: the rate exceeds that of the steps.
     """
     if not 0.0 < rate_hz <= 1.0 / STEP_S:
         raise OptionError(f"rate_hz: expected above 0 and up to {1.0 / STEP_S:.0f}, got {rate_hz}")
@@ -193,7 +193,7 @@ class Instruments:
         return wrap_heading_deg(state.attitude.heading_deg + error)
 
     def height_m(self, state: State) -> float:
-        """Height by the barometer, above the ground on which it was set to 0; advances its drift."""
+        """Height by the barometer, above the ground where it was zeroed; advances its drift."""
         baro = self.suite.barometer
         white, walk = self._baro.standard_normal(2).tolist()
         measured = float(state.position_m[2]) + self.baro_drift_m + baro.noise_m * white

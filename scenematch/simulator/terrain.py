@@ -1,4 +1,4 @@
-"""Terrain: smooth hills under a town, roofs and ponds that stay level on them, and a river.
+"""Terrain: smooth hills under a town, with level roofs and ponds, and a river.
 
 Heights are metres above the lowest ground; none is below 0.
 """
@@ -14,7 +14,7 @@ from scenematch.simulator.canvas import ROOF, WATER, Canvas
 from scenematch.simulator.light import Array, Float32, Image
 
 HILL_M = 260.0
-"""Distance from one hill to the next, about."""
+"""Approximate distance between hills."""
 BANK_M = 130.0
 """Hills begin this far from a river."""
 
@@ -25,7 +25,7 @@ def hills(shape: tuple[int, int], gsd_m_per_px: float, relief_m: float, rng: np.
     Args:
         shape: (H, W) in pixels.
         gsd_m_per_px: pixel in metres.
-        relief_m: from the lowest ground to the highest.
+        relief_m: height from the lowest to the highest ground.
         rng: of the hills.
 
     Returns:
@@ -41,12 +41,12 @@ def hills(shape: tuple[int, int], gsd_m_per_px: float, relief_m: float, rng: np.
 def raise_by_ground(canvas: Canvas, ground_m: Float32, river: Image | None) -> Float32:
     """Raise everything on a canvas by the ground below it, in place.
 
-    A river's bed and banks are at 0. Every house stands on the mean of the ground below it, and ponds are level.
+    A river's bed and banks are at 0. Every house stands on the mean of its ground, and ponds are level.
 
     Args:
-        canvas: its heights are raised.
+        canvas: to raise.
         ground_m: (H, W) of the hills.
-        river: (H, W) uint8, above 0 in its water; None where there is none.
+        river: (H, W) uint8, above 0 in its water; None without a river.
 
     Returns:
         (H, W) float32 heights of the ground, levelled under houses and ponds.
@@ -70,8 +70,8 @@ def draw_river(canvas: Canvas, rng: np.random.Generator) -> Image:
     """Draw a river across the town with a path on each bank.
 
     Args:
-        canvas: is drawn on.
-        rng: of its course and width.
+        canvas: to draw on.
+        rng: for its course and width.
 
     Returns:
         (H, W) uint8, 255 in its water.
@@ -79,7 +79,7 @@ def draw_river(canvas: Canvas, rng: np.random.Generator) -> Image:
     along = np.linspace(-canvas.reach_m, canvas.reach_m, 160)
     width = rng.uniform(22.0, 30.0)
     swing = rng.uniform(26.0, 44.0) * np.sin(along / rng.uniform(70.0, 110.0) + rng.uniform(0, 6))
-    # It passes some way from the middle, where the square and the park are.
+    # It keeps away from the centre, where the square and the park are.
     line = np.column_stack([along, swing + 0.12 * along + rng.choice([-1, 1]) * rng.uniform(45.0, 95.0)])
     points = [np.rint(canvas.px(line) * 16.0).astype(np.int32)]
     water = np.zeros(canvas.shape, np.uint8)

@@ -1,8 +1,8 @@
-"""A fictional town: streets, houses, parks and fields from one seed, with its map and surface model.
+"""Build a fictional town from one seed: streets, houses, parks and fields, with map and surface model.
 
 Convention:
-    Town coordinates (u, v) are those of :mod:`scenematch.simulator.canvas`. Everything is drawn twice as fine as
-    the map.
+    Town coordinates (u, v) are those of :mod:`scenematch.simulator.canvas`. Everything is drawn at twice the map's
+    resolution.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ EXACT = 1e-3
 GROUND_AMSL_M = 155.0
 """Height of the flat or lowest ground above mean sea level."""
 MARGIN_M = 40.0
-"""How far the drawn world extends beyond the map, so that a tilted camera still sees a town."""
+"""Margin of the drawn world beyond the map, so that a tilted camera still sees a town."""
 MAP_SENSOR = Sensor(
     gamma=0.92, balance_rgb=(0.97, 0.94, 0.88), haze=8.0, vignette=0.0, exposure_sd=0.0, blur_px=0.55, noise_sd=2.2
 )
 """The camera of the map's survey: a warmer white balance and less contrast than the drone's."""
 LAMP_M = 6.0
-"""Height of street lamps: what is higher is not lit by them."""
+"""Height of street lamps: they do not light anything higher."""
 MAX_RELIEF_M = 80.0
 _EARTH: Colour = (146, 126, 98)
 _CARS: tuple[Colour, ...] = (
@@ -49,16 +49,16 @@ _CARS: tuple[Colour, ...] = (
 
 @dataclass(frozen=True)
 class Town:
-    """A map, its surface model, and the finer world from which frames are drawn.
+    """A map, its surface model, and the finer world that frames are rendered from.
 
     Attributes:
-        ortho: (H, W, 3) RGB orthophoto, another photograph than any frame.
-        surface_m: (H, W) metres above the world's height 0, which is the ground where it is flat.
+        ortho: (H, W, 3) RGB orthophoto, a different photograph from every frame.
+        surface_m: (H, W) metres above the world's height 0, which is the ground if it is flat.
         pixel_to_crs: (2, 3) affine of map pixels (x, y), centres at integers, to the CRS.
         crs_epsg: projected CRS.
         gsd_m_per_px: map pixel in grid metres.
         world: what a camera sees on the day of the flight.
-        condition: that day's light, season and air, which are in the world; its noise is the camera's.
+        condition: that day's light, season and air, already in the world; its noise applies to the camera.
         datum_amsl_m: the world's height 0 above mean sea level.
     """
 
@@ -72,7 +72,7 @@ class Town:
     datum_amsl_m: float = GROUND_AMSL_M
 
     def site(self) -> OrthoMap:
-        """The town's map as the engine takes it, with exact georeferencing and slope accuracy."""
+        """The town's map for the engine, with exact georeferencing and slope accuracy."""
         gray = np.asarray(cv2.cvtColor(self.ortho, cv2.COLOR_RGB2GRAY), np.uint8)
         return OrthoMap.from_arrays(
             gray,
@@ -85,7 +85,7 @@ class Town:
 
 
 def _streets(canvas: Canvas) -> tuple[list[float], list[float], list[tuple[Array, float]]]:
-    """Draw the streets: edges of the blocks along u and v, and every street as (centre line, width)."""
+    """Draw the streets; returns block edges along u and v, and every street as (centre line, width)."""
     rng, reach = canvas.rng, canvas.reach_m
     edges: list[list[float]] = []
     for low, high in ((62.0, 112.0), (48.0, 88.0)):
@@ -177,7 +177,7 @@ def generator(seed: int, stream: int) -> np.random.Generator:
 
 
 def _shrink(raster: NDArray[Any], times: int) -> NDArray[Any]:
-    """The raster's means over squares of so many pixels."""
+    """The raster's means over squares of pixels."""
     size = (raster.shape[1] // times, raster.shape[0] // times)
     return np.asarray(cv2.resize(raster, size, interpolation=cv2.INTER_AREA))
 
@@ -196,7 +196,7 @@ def _check_size(width_px: int, height_px: int, gsd: float) -> None:
 
 
 def _lamp_light(canvas: Canvas, roads: list[tuple[Array, float]]) -> Float32:
-    """Light (H, W) of lamps in [0, 1], one every 27 m on alternating sides, on what is lower than a lamp."""
+    """Light (H, W) in [0, 1] of lamps every 27 m on alternating sides, on everything lower than a lamp."""
     pools = np.zeros(canvas.shape, np.float32)
     for line, width in roads:
         for k, (u, v, angle) in enumerate(_stations(line, 27.0)):
@@ -230,7 +230,7 @@ class _Drawn:
 
 
 def _without(day: _Day, gone: NDArray[np.bool_], ground_m: Float32 | None, rng: np.random.Generator) -> _Day:
-    """The day with bare earth where (H, W) something is gone."""
+    """The day with bare earth where (H, W) something was removed."""
     rgb, height, material = day.rgb.copy(), day.height_m.copy(), day.material.copy()
     count = int(gone.sum())
     rgb[gone] = np.clip(np.array(_EARTH) * (1.0 + 0.07 * rng.standard_normal((count, 1))), 0, 255)
@@ -244,7 +244,7 @@ def _rebuilt(drawn: _Drawn, changed: float, rng: np.random.Generator) -> _Drawn:
     roofs = (drawn.canvas.material == ROOF).astype(np.uint8)
     count, labels = cv2.connectedComponents(roofs, connectivity=4)
     fate = rng.random(count)
-    fate[0] = 1.0  # what is no house
+    fate[0] = 1.0  # not a house
     new, gone = (fate < changed / 2)[labels], ((fate >= changed / 2) & (fate < changed))[labels]
     then, today = _without(drawn.then, new, drawn.ground_m, rng), _without(drawn.today, gone, drawn.ground_m, rng)
     return replace(drawn, then=then, today=today)
@@ -273,7 +273,7 @@ def _draw(
 
 
 def _lit(drawn: _Drawn, day: _Day, condition: Condition, rng: np.random.Generator) -> tuple[Image, Float32]:
-    """Colours and heights of a town on a day."""
+    """Colours and heights of a town on one day."""
     gsd = drawn.canvas.gsd
     dressed, height = apply_season(day.rgb, day.height_m, day.material, drawn.ground_m, condition, gsd, rng)
     lamps = drawn.lamps * np.float32(condition.lamps) if condition.lamps else None
@@ -281,10 +281,10 @@ def _lit(drawn: _Drawn, day: _Day, condition: Condition, rng: np.random.Generato
 
 
 def _world(drawn: _Drawn, condition: Condition, pixel_to_crs: Array, rng: np.random.Generator) -> World:
-    """What a camera sees of a town on a day."""
+    """The world that a camera sees on one day."""
     seen, height = _lit(drawn, drawn.today, condition, rng)
     sides, material = drawn.canvas.sides, drawn.today.material
-    if condition.shade:  # crowns are drawn as at noon; those of the two first lights stay as published
+    if condition.shade:  # crowns are drawn as at noon; the first two lights stay as published
         crowns = material == CANOPY
         sides[crowns, :3] = seen[crowns] // 2
     glint = Glint(condition.light, (material == WATER).astype(np.uint8)) if condition.shade else None
@@ -308,14 +308,14 @@ def build_town(
     """A town from a seed; the same seed gives the same bytes.
 
     Args:
-        seed: of everything random in it.
+        seed: of all randomness in it.
         width_px: columns of the map.
         height_px: rows of the map.
         gsd_m_per_px: a map pixel in metres on the grid.
         condition: day of the frames: a name of :data:`scenematch.simulator.CONDITIONS`, or one of your own.
-        map_condition: day of the map, an independent photograph even where it is the same condition.
+        map_condition: day of the map, an independent photograph even for the same condition.
         relief_m: height of the hills under the town, from the lowest ground to the highest; 0 is flat.
-        river: whether one crosses the town.
+        river: whether a river crosses the town.
         changed: share of the houses, 0 to 1, that were built or demolished between the map and the flight.
 
     Raises:
@@ -337,7 +337,7 @@ def _built(
     days: tuple[Condition, Condition],
     site: tuple[float, bool, float],
 ) -> Town:
-    """The town of checked arguments: days of the frames and the map; relief, river and changed share."""
+    """The town from checked arguments: days of the frames and the map, relief, river and changed share."""
     (width, height), (today, surveyed), (relief_m, river, changed) = map_px, days, site
     fine = max(1, round(gsd / 0.265))
     margin = math.ceil(MARGIN_M / gsd)

@@ -1,4 +1,4 @@
-"""How the drone flies and what its sensors report: a path of straight legs with stops, and noisy telemetry.
+"""The drone's flight and telemetry: a path of straight legs with stops, and noisy measurements.
 
 Convention:
     Positions are local east-north-up metres about the map's centre, up above the flat ground. The body is
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.80665
 COURSE_STEP_S = 0.01
-"""Time step by which a flight along waypoints is integrated."""
+"""Time step for integrating a flight along waypoints."""
 START_NS = 1_000_000_000
 """Timestamp at which simulated flights begin."""
 
@@ -35,7 +35,7 @@ def _check_positive(owner: object, *, zero: bool = False) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorNoise:
-    """How far telemetry is from the truth; all zero is perfect telemetry.
+    """Errors of the telemetry; all zero is perfect telemetry.
 
     Attributes:
         height_sd_m: white noise of the height.
@@ -64,15 +64,15 @@ class SensorNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class FlightStyle:
-    """How the drone is flown.
+    """The style of flying.
 
     Attributes:
         height_agl_m: above the flat ground.
         cruise_mps: speed in the middle of a leg; with the defaults legs are flown at 6.6 m/s on average.
         acceleration_mps2: on a leg; its tilt is atan(a / g).
-        ramp_s: time in which the acceleration builds up and fades, which limits the jerk.
-        pause_s: hover at each waypoint, in which the vehicle yaws.
-        peak_tilt_deg: largest tilt of the flight, where vibration adds to acceleration.
+        ramp_s: time for the acceleration to build up and fade, which limits the jerk.
+        pause_s: hover at each waypoint, during which the vehicle yaws.
+        peak_tilt_deg: largest tilt of the flight, from acceleration plus vibration.
         height_sd_m: slow variation about the set height.
 
     Raises:
@@ -226,7 +226,7 @@ def course(waypoints_m: Array, style: FlightStyle) -> tuple[Array, Array, list[f
         push = leg_accelerations(float(np.hypot(*(end - start))), style)
         pushes += [np.zeros((pause, 2)), np.outer(push, along)]
         noses += [before + turn * (nose - before), np.full(push.size, nose)]
-        # Speeding up begins, braking begins, and the stop: where the paper sees its large disturbances.
+        # Start of acceleration, start of braking, and stop: when the paper sees its large disturbances.
         braking = int(np.argmax(push < 0))
         kicks += [(count + pause + k) * COURSE_STEP_S for k in (0, braking, push.size)]
         count += pause + push.size
@@ -278,7 +278,7 @@ def simulate_telemetry(motion: Motion, noise: SensorNoise, rng: np.random.Genera
     """
     count = motion.time_s.size
     step = float(motion.time_s[1] - motion.time_s[0]) if count > 1 else 1.0
-    # Two streams, drawn frame by frame: a shortened flight has the telemetry of the whole one's beginning.
+    # Two streams, drawn frame by frame: a shortened flight has the same telemetry as the start of the full one.
     slow, fast = rng.spawn(2)
     white = fast.standard_normal((count, 6)).T
     drift = noise.height_drift_sd_m * smooth_noise(slow, count, step, noise.height_drift_time_s)

@@ -76,12 +76,12 @@ def test_a_camera_that_starts_slowly_is_waited_for(command, monkeypatch, caplog)
     """An interpreter that imports OpenCV takes longer to its first picture than a camera in use may be silent."""
     monkeypatch.setattr("scenematch.bridges.camera_stream._STALL_S", 0.05)
     assert count(taken(command(count=1, wait_s=60.0), lambda pictures: count(pictures) == 1)) == 1
-    assert "opened again" not in caplog.text
+    assert "reopened" not in caplog.text
 
 
 def test_a_camera_that_never_starts_is_opened_again(command, monkeypatch, caplog):
     monkeypatch.setattr("scenematch.bridges.camera_stream._START_S", 0.2)
-    taken(command(count=0, wait_s=60.0), lambda _: "no picture for 0.2 s; opened again" in caplog.text)
+    taken(command(count=0, wait_s=60.0), lambda _: "no picture for 0.2 s; reopened" in caplog.text)
 
 
 def test_a_picture_that_repeats_is_none(command):

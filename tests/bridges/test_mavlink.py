@@ -1217,7 +1217,7 @@ def test_the_bridge_is_no_autopilot_and_no_broadcast(number, capsys):
     given = ["--connect", "udp:14550", "--map", "m.tif", "--frames", "f", "--camera", "c.yaml"]
     assert main(["bridge", "mavlink", *given, "--settings", f"mavlink.component_id={number}"]) == 2
     assert (
-        f"--settings mavlink.component_id: expected 2 to 255, 1 is the autopilot, got {number}"
+        f"--settings mavlink.component_id: expected 2 to 255 (1 is the autopilot), got {number}"
         in capsys.readouterr().err
     )
 

@@ -147,7 +147,7 @@ def test_a_part_of_nothing_is_refused(options, words):
 
 
 def test_a_part_beside_the_map_is_refused(site):
-    with pytest.raises(OptionError, match="part: expected one on the map arrays, got one beside it"):
+    with pytest.raises(OptionError, match="part: expected one on the map arrays, got one off it"):
         plan_audit(site, CAMERA, HEIGHT_M, part=MapPart(around=around(site, [-5000, 100], 100.0)))
 
 
@@ -213,7 +213,7 @@ def test_a_huge_map_is_audited_along_a_route(huge_path, route_file, tmp_path, ca
     [
         (
             [],
-            "--around: expected LAT,LON,RADIUS_M, or a --route to audit along: the map of 12 x 12 km is not",
+            "--around: expected LAT,LON,RADIUS_M, or a --route to audit along: the map of 12 x 12 km is too",
         ),
         (["--around=40.6,-97.7"], "--around: expected LAT,LON,RADIUS_M in degrees and metres, got '40.6,-97.7'"),
         (["--around=north"], "--around: expected LAT,LON,RADIUS_M in degrees and metres, got 'north'"),

@@ -172,7 +172,7 @@ def test_a_clock_that_is_off_is_named(shift_s):
 
 @pytest.mark.parametrize(
     ("velocity", "word"),
-    [(VELOCITY[:, ::-1], "place"), (-VELOCITY, "sign"), (3.6 * VELOCITY, "km/h"), (VELOCITY / 0.5144, "knots"),
+    [(VELOCITY[:, ::-1], "swapped"), (-VELOCITY, "sign"), (3.6 * VELOCITY, "km/h"), (VELOCITY / 0.5144, "knots"),
      (VELOCITY / 1.7, "times as far")],
 )  # fmt: skip
 def test_a_velocity_that_is_wrong_is_named(velocity, word):
@@ -278,7 +278,7 @@ def test_the_share_that_contradicts_and_the_field_are_said():
     wrong, poses = radians_near_north(1)  # one picture may be placed wrong
     found = Diagnosis(findings(wrong, poses, 1.0), 16, 16, is_known(wrong, poses), contradictions(wrong, poses))
     assert found.findings == []
-    assert as_rows(found)[-1][1].endswith("they fit what is said of attitude, height, velocity, but 1 of 16 (6%) "
+    assert as_rows(found)[-1][1].endswith("they agree with the attitude, height, velocity, but 1 of 16 (6%) "
                                           "contradicts the heading")  # fmt: skip
 
 

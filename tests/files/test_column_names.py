@@ -47,7 +47,7 @@ def test_a_missing_required_column_is_asked_for(save):
         open_telemetry(save(OTHERS))
     assert (
         "line 1: lacks the column timestamp_ns: is it 'time_us'? "
-        'Say so in the settings, [telemetry_columns] timestamp_us = "time_us"; its columns are'
+        'If so, add to the settings, [telemetry_columns] timestamp_us = "time_us"; its columns are'
     ) in str(caught.value)
     with pytest.raises(TelemetryError, match="lacks the column frame: is it 'Image Name'"):
         open_telemetry(save(OTHERS), names={"timestamp_us": "time_us"})
@@ -59,13 +59,15 @@ def test_other_columns_that_look_like_ours_are_asked_for_in_one_line(save):
     found = open_telemetry(save(OTHERS), names={"timestamp_us": "time_us", "frame": "Image Name"})
     assert found.rows[0].heading_deg is None
     assert found.remarks == [
-        "telemetry.csv: columns that are not read; are they these? Say so in the settings, [telemetry_columns]: "
+        "telemetry.csv: unused columns; are they these? If so, add to the settings, [telemetry_columns]: "
         'height_agl_m = "altitude_agl [m]", heading_deg = "Yaw", lat_deg = "Latitude", lon_deg = "Longitude"'
     ]
 
 
 def test_a_name_that_the_file_lacks_is_refused(save):
-    with pytest.raises(TelemetryError, match="line 1: lacks the column alt, which is to be height_agl_m"):
+    with pytest.raises(
+        TelemetryError, match="line 1: lacks the column alt, which the settings name as height_agl_m"
+    ):
         open_telemetry(save(OTHERS), names=NAMES | {"height_agl_m": "alt"})
 
 
@@ -98,7 +100,7 @@ def test_the_settings_name_them(tmp_path):
     ("line", "words"),
     [
         ('altitude = "alt"', "telemetry_columns: expected one of timestamp_ns, "),
-        ('frame = " "', "telemetry_columns.frame: expected the name of a column, got a blank one"),
+        ('frame = " "', "telemetry_columns.frame: expected the name of a column, got an empty one"),
         ("frame = 3", "telemetry_columns.frame: expected a quoted string, got 3"),
     ],
 )

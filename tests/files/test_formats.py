@@ -163,7 +163,7 @@ def test_golden_bytes_of_telemetry(tmp_path):
 
 BAD_TELEMETRY = {
     "empty": ("", "expected a header with timestamp_ns, frame, got an empty first line"),
-    "no rows": (HEADER, "expected one row a frame, got a header and no rows"),
+    "no rows": (HEADER, "expected one row per frame, got a header and no rows"),
     "missing column": ("timestamp_ns,height_agl_m\n1,5\n", "line 1: lacks the column frame"),
     "colons": ("timestamp_ns:frame\n1:a\n", "lacks the column timestamp_ns; its columns are 'timestamp_ns:frame'"),
     "duplicate column": (
@@ -179,7 +179,7 @@ BAD_TELEMETRY = {
     "repeated stamp": (HEADER + "5,a,,,,\n5,b,,,,\n", "line 3, timestamp_ns: expected a stamp later"),
     "repeated frame": (
         HEADER + "5,a,,,,\n6,a,,,,\n",
-        "line 3, frame: expected each frame once (it stands in line 2 too)",
+        "line 3, frame: expected each frame once (it is also in line 2)",
     ),
     "blank stamp": (HEADER + ",a,,,,\n", "line 2, timestamp_ns: expected whole nanoseconds, got ''"),
     "stamp in seconds": (HEADER + "1.5,a,,,,\n", "line 2, timestamp_ns: expected a whole number, got '1.5'"),
@@ -394,7 +394,7 @@ def test_a_video_that_ends_early_is_refused(video, monkeypatch):
     assert value_of(source, "11") == 11
     for name in ("12", "14"):
         message = refusal(source.read, name)
-        assert f"frame {name}: expected 15 frames as the file says, got no more than 12" in message
+        assert f"frame {name}: expected 15 frames as the file states, got no more than 12" in message
     assert value_of(source, "3") == 3
 
 
@@ -644,7 +644,7 @@ def test_an_interrupted_run_keeps_its_rows(tmp_path):
     ("change", "expected"),
     [
         ({"status": "good"}, "line 2, status: expected fix or no_fix, got 'good'"),
-        ({"lat_deg": ""}, "line 2, lat_deg: expected a number, as the row is a fix, got ''"),
+        ({"lat_deg": ""}, "line 2, lat_deg: expected a number, since the row is a fix, got ''"),
         ({"reason": "bored"}, "line 2, reason: expected a known reason or nothing, got 'bored'"),
         ({"sigma_east_m": "-1"}, "line 2, sigma_east_m: expected a finite number of 0 or more, got '-1'"),
         ({"window_width_px": "1.5"}, "line 2, window_width_px: expected a whole number, got '1.5'"),

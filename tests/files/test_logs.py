@@ -355,7 +355,7 @@ def test_of_a_cue_a_second_each_is_of_one_picture(tmp_path):
     flight = open_flight(extracted(tmp_path / "frames", ["1.png", "2.png", "3.png"]), log)
     assert [row.timestamp_ns for row in flight.rows] == [0, S, 2 * S]
     other = extracted(tmp_path / "other", ["1.png", "31.png"])
-    assert "for each of 2 pictures, got 3; say when they were taken" in refusal(open_flight, other, log)
+    assert "for each of 2 pictures, got 3; give their times" in refusal(open_flight, other, log)
 
 
 def test_a_gimbal_of_zeros_in_subtitles_is_none(tmp_path):
@@ -538,7 +538,7 @@ def test_a_flight_is_followed_by_its_log_and_scored_by_it(flown, tmp_path, capfd
     log, table = str(flown / "flight.BIN"), str(flown / "telemetry.csv")
     assert follow("log", "--telemetry", log, "--truth", log) == 0
     stated = capfd.readouterr()
-    assert "height above ground, by source, of 3 frames: take-off 3" in stated.err
+    assert "height above ground of 3 frames, by source: take-off 3" in stated.err
     summary = json.loads(stated.out)
     assert summary["fixes"] == summary["scored_fixes"] == 3
     assert summary["settings"]["heights"] == {"take-off": 3}

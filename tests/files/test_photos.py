@@ -81,7 +81,9 @@ def test_a_gimbal_of_zeros_is_none_and_the_flights_yaw_counts(tmp_path):
     assert (none.heading_deg, none.roll_deg, none.pitch_deg) == (pytest.approx(312.4), None, None)
     assert (none.heading_sigma_deg, none.tilt_sigma_deg) == (COMPASS_SIGMA_DEG, None)
     assert (down.heading_deg, down.tilt_sigma_deg) == (pytest.approx(30.0), GIMBAL_SIGMA_DEG)
-    assert remarks == ["photographs without a gimbal's angles, whose heading is the flight's and tilt unknown: 1"]
+    assert remarks == [
+        "photographs without gimbal angles, so their heading is the flight's and their tilt unknown: 1"
+    ]
 
 
 def test_a_height_above_take_off_is_vaguer_than_one_above_ground(tmp_path):
@@ -100,7 +102,7 @@ def test_a_photograph_that_a_viewer_turned_has_no_heading(tmp_path):
     flight = open_flight(tmp_path)
     assert [row.heading_deg for row in flight.rows] == [None, pytest.approx(30.0)]
     assert [row.height_agl_m for row in flight.rows] == [80.0, 80.0]
-    assert flight.remarks == ["photographs that a viewer turned and saved, whose heading is unknown: 1"]
+    assert flight.remarks == ["photographs rotated and saved by a viewer, so their heading is unknown: 1"]
     assert flight.has_gimbal
     assert flight.heights == {"take-off": 2}
 

@@ -71,7 +71,7 @@ def test_the_command_line_counts_more_than_the_file(tmp_path):
     [
         ("marign = 1", "marign: not a setting; did you mean margin?"),
         ("[errors]\nmpa_m = 4", "errors.mpa_m: not a setting; did you mean map_m?"),
-        ("zebra = 1", "zebra: not a setting; known here are margin, "),
+        ("zebra = 1", "zebra: not a setting; expected one of margin, "),
         ('margin = "wide"', "margin: expected a number, got 'wide'"),
         ("margin = 0.5", "margin: expected 1 or more, got 0.5"),
         ("enhance_radius_px = 2.5", "enhance_radius_px: expected a whole number, got 2.5"),

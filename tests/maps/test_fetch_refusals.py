@@ -33,7 +33,7 @@ def test_the_users_own_surface_is_never_replaced_by_a_part_of_it(tmp_path, surfa
         (tmp_path / name).write_bytes(b"the user's own")
     (tmp_path / "link.tif").symlink_to(tmp_path / "s-surface.tif")
     (tmp_path / "N48_E016.tif").hardlink_to(tmp_path / "s.tif")
-    with pytest.raises(OptionError, match=r"out: .* is the `surface` that is read; choose another file"):
+    with pytest.raises(OptionError, match=r"out: .* is also the input `surface`; choose another file"):
         fetch_map(settings(surface=str(tmp_path / surface), force=True), tmp_path / "s.tif")
     assert all(path.read_bytes() == b"the user's own" for path in tmp_path.glob("*.tif"))
 
@@ -183,6 +183,6 @@ def falls_silent():
 def test_heights_are_waited_for_no_longer_than_agreed(falls_silent, monkeypatch):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     begin_s = time.monotonic()
-    with pytest.raises(MapError, match=re.escape("heights.tif: cannot be read as a GeoTIFF by ranges of bytes")):
+    with pytest.raises(MapError, match=re.escape("heights.tif: cannot be read as a GeoTIFF in byte ranges")):
         read_part([falls_silent], (0.0, 0.0, 1.0, 1.0), CRS.from_epsg(4326), None, 1.0)
     assert time.monotonic() - begin_s < 60.0  # GDAL asks again, some times

@@ -260,7 +260,7 @@ def test_an_interrupted_fetch_goes_on_where_it_was(server, settings, tmp_path):
     first_asked = list(server.asked)
     server.asked.clear()
     server.trouble[:] = [(first_asked[4], (403, {}))]
-    with pytest.raises(MapError, match="answers 403: it does not let you in"):
+    with pytest.raises(MapError, match="answers 403: access denied"):
         fetch_map(settings(source, 120.0), out)
     assert len(server.asked) == 5
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith("map.tif")] == ["map.tif.tiles"]
@@ -296,7 +296,7 @@ def test_what_is_no_picture_is_refused_in_one_line(server, settings, tmp_path):
         (b"<html><body>Please <b>log in</b></body></html>", "expected pictures, got something else"),
         (picture.getvalue(), "Incorrect size 512 x 512 of downloaded block, expected 256 x 256"),
         ("break", "expected pictures, got something else"),
-        ((401, {}), "the server answers 401: it does not let you in"),
+        ((401, {}), "the server answers 401: access denied"),
     ):
         server.trouble[:] = [("/tiles/", answer)]
         with pytest.raises(MapError, match=re.escape(text)) as error:
@@ -500,7 +500,7 @@ def test_around_photographs_the_map_holds_what_they_saw_as_fine_as_their_height_
     assert any(line.startswith("the photographs' place: 48.246") for line in said)
     with pytest.raises(OptionError, match="radius_m: expected with LAT,LON"):
         fetch_map(FetchSettings(around="48.25,16.44", source=f"{server.url}/wms"), tmp_path / "map.tif")
-    with pytest.raises(OptionError, match="got 'Duluth, MN'; names of places are not looked up"):
+    with pytest.raises(OptionError, match="got 'Duluth, MN'; place names are not looked up"):
         fetch_map(FetchSettings(around="Duluth, MN", radius_m=100.0, source=server.url), tmp_path / "map.tif")
     (tmp_path / "none").mkdir()
     photograph(tmp_path / "none" / "a.jpg")

@@ -133,7 +133,7 @@ def test_without_a_place_to_begin_at_a_map_that_is_too_large_is_refused_in_one_l
         assert isinstance(refused, NoFix)
         assert refused.reason is Reason.MAP_TOO_LARGE
         assert "9.01 x 9.01 km" in refused.detail
-    with pytest.raises(OptionError, match=r"^start: expected a place to begin at.*the map of 9.01 x 9.01 km"):
+    with pytest.raises(OptionError, match=r"^start: expected LAT,LON.*the map of 9.01 x 9.01 km"):
         check_start(None, large)
     check_start(Prior(lat_deg=48.0, lon_deg=16.0, sigma_m=10.0), large)
 

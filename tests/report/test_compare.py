@@ -81,7 +81,7 @@ def test_nothing_is_flown_or_made_before_every_run_is_found_possible(flight, tmp
     blind.write_text(beyond + "10\n", encoding="utf-8")  # a heading for the last frame alone
     assert run([*command(flight, out, *two, f"--run={tmp_path / 'far.toml'}"), f"--telemetry={blind}"]) == 2
     said = capsys.readouterr().err
-    assert "3 of 4 frames lack heading_deg, ncc refuses them; sift and auto do without" in said
+    assert "3 of 4 frames lack heading_deg, so ncc will refuse them; sift and auto do not need it" in said
     assert run([*command(flight, out, *two), f"--camera={flight / 'none.yaml'}"]) == 1
     assert "no such file" in capsys.readouterr().err
     assert run(command(flight, out, "--run=ncc", f"--run={tmp_path / 'far.toml'}")) == 2

@@ -44,10 +44,13 @@ def test_a_page_loses_frames_that_were_moved_only_where_it_may(moved, capsys):
     assert 'id="slider"' in before
     assert run(["evaluate", str(moved)]) == 2
     said = capsys.readouterr().err
-    assert re.search(r"DIR.*: .*report\.html shows frames, which are lost .* add --force to do so; .*frames", said)
+    assert re.search(
+        r"DIR.*: .*report\.html shows frames, which redrawing would lose; add --force to do it anyway; .*frames",
+        said,
+    )
     assert (moved / PAGE).read_text(encoding="utf-8") == before
     assert run(["evaluate", str(moved), "--force"]) == 0
-    assert "report.html loses the frames that it showed: " in capsys.readouterr().err
+    assert "report.html loses the frames that it shows: " in capsys.readouterr().err
     assert 'id="slider"' not in (moved / PAGE).read_text(encoding="utf-8")
     assert run(["evaluate", str(moved)]) == 0  # there is nothing more to lose
 

@@ -21,5 +21,5 @@ def test_a_mount_is_written_where_there_is_a_calibration_or_can_be():
 
 @pytest.mark.parametrize("text", [LINE + IN_CALIBRATION, "--mount nadir-tail"])
 def test_beside_a_gimbal_its_angles_are_corrected(text):
-    assert cure(text, gimbal=True).startswith("beside a gimbal's angles no mount is set: correct the angles")
+    assert cure(text, gimbal=True).startswith("the gimbal's angles replace a mount: correct the angles")
     assert cure("--correct angles=radians", gimbal=True, cause="radians") == "--correct angles=radians"

@@ -148,7 +148,7 @@ def test_a_mount_counts_more_than_the_calibrations(photos, tmp_path):
 def test_where_a_gimbal_says_where_the_camera_looks_a_mount_is_refused(tmp_path):
     photograph(tmp_path / "a.jpg", xmp=gimbal(), tags={FOCAL_35MM: 24})
     load(FlightFiles(map="m.tif", frames=tmp_path))
-    with pytest.raises(CalibrationError, match="mount: expected nadir, since the telemetry has the angles"):
+    with pytest.raises(CalibrationError, match="mount: expected nadir, since the telemetry's gimbal angles"):
         load(FlightFiles.from_flat(map="m.tif", frames=tmp_path, mount="nadir-tail"))
     photograph(tmp_path / "a.jpg", xmp=gimbal("+0.0", "+0.0", "+0.0"), tags={FOCAL_35MM: 24})
     load(FlightFiles.from_flat(map="m.tif", frames=tmp_path, mount="nadir-tail"))
@@ -161,7 +161,7 @@ def test_where_a_gimbal_says_where_the_camera_looks_a_mount_is_refused(tmp_path)
         ({"hfov_deg": 180.0}, "hfov_deg: expected above 0 and below 180, got 180"),
         ({"mount": "side"}, "mount: expected one of nadir, .*forward-45, got 'side'"),
         ({"camera_pitch_deg": 45.0}, "camera_pitch_deg: expected -90"),
-        ({"frames": "f.MP4"}, "camera: expected a calibration, or `hfov_deg`: a video has neither"),
+        ({"frames": "f.MP4"}, "camera: expected a calibration, or `hfov_deg`: a video contains neither"),
     ],
 )
 def test_what_says_nothing_of_a_camera_is_wrong_usage(options, words):
@@ -331,7 +331,7 @@ def test_without_the_request_another_size_is_refused_and_the_request_named(photo
     write_geotiff(path, noise(), [[0.5, 0, WEST + 0.25], [0, -0.5, NORTH - 0.25]], 32633)
     arguments = ["locate", str(photos / "0.jpg"), "--map", str(path), "--camera", str(calibration)]
     assert run(arguments) == 1
-    assert "made smaller or larger as a whole, add --settings input.scale_calibration" in capsys.readouterr().err
+    assert "resized without cropping, add --settings input.scale_calibration" in capsys.readouterr().err
 
 
 def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
@@ -343,7 +343,7 @@ def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
         load(files)
     unscaled = FlightFiles(map="m.tif", frames=photos, camera=calibration)
     flight = unscaled.open_flight()
-    with pytest.raises(CalibrationError, match="320 x 240; their shapes differ: give the calibration of these"):
+    with pytest.raises(CalibrationError, match="320 x 240; their aspect ratios differ: give the calibration of"):
         check_pictures(flight, unscaled.load_camera(flight))
 
 

@@ -68,5 +68,5 @@ def test_what_is_no_record_is_refused(text, tmp_path):
 
 
 def test_a_setting_within_another_is_refused():
-    with pytest.raises(OptionError, match=r"ncc\.rule: expected a setting of its own, but ncc is one"):
+    with pytest.raises(OptionError, match=r"ncc\.rule: expected a setting inside a table, but ncc is a setting"):
         nested({"ncc": 5, "ncc.rule": 1})

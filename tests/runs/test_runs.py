@@ -83,7 +83,7 @@ def test_one_frame_in_two_is_tracked_and_scored_again(flight, tmp_path):
     files = FlightFiles.from_flat(**paths, every=2)
     track(files, tmp_path / "out", progress=progress)
     assert [row.frame for row in read_track(tmp_path / "out" / "track.csv")] == names
-    assert progress.messages == ["one frame in 2 is used, 2 of all"]
+    assert progress.messages == ["using one frame in 2, 2 in all"]
     page = (tmp_path / "out" / "report.html").read_bytes()
     summary = evaluate(tmp_path / "out")
     assert (summary["settings"]["every"], summary["frames_without_truth"]) == (2, 0)
@@ -125,7 +125,7 @@ def test_progress_is_shown_what_a_run_does(flight, tmp_path):
     assert progress.updates["auto, engine profile"] == counted
     assert progress.updates["checking pictures"] == counted
     assert progress.finished[-1] == "auto, engine profile"
-    assert progress.messages == ["frames without a row in the telemetry, left out: 1"]
+    assert progress.messages == ["frames left out because the telemetry has no row: 1"]
 
 
 def test_a_task_that_is_interrupted_is_finished():
@@ -166,7 +166,7 @@ def test_errors_name_arguments(flight, tmp_path):
     assert refused(track, files, tmp_path / "out", far).startswith("start: expected a place on the map")
     place = next(iter(read_truth(flight / "truth.csv")))
     swapped = TrackSettings(start=f"{place.lon_deg},{place.lat_deg}")
-    assert refused(track, files, tmp_path / "out", swapped).endswith("; latitude and longitude are swapped?")
+    assert refused(track, files, tmp_path / "out", swapped).endswith("; are latitude and longitude swapped?")
     assert "swapped" not in refused(track, files, tmp_path / "out", far)
     assert refused(compare, files, tmp_path / "out", {"far": far}).startswith("start: expected a place on the map")
     assert refused(export_track, tmp_path, "shp").startswith("kind: expected one of gpx")

@@ -1,1 +1,1 @@
-"""Flights with faults: the bridge as a process of its own beside the stand-in, with a camera that can fail."""
+"""Flights with faults: run the bridge as a separate process beside the stand-in, with a camera that can fail."""

@@ -1,7 +1,7 @@
 """The camera of a flight: ``python -m bench.live.flights.camera FRAMES BEGIN_FILE RATE_HZ``, for ``exec:``.
 
-It writes the JPEG pictures of a folder at their times after the begin that the file states, on the monotonic
-clock; the first one until there is such a file. Faults cover it, or freeze its picture.
+It writes a folder's JPEG pictures at their times after the start given in BEGIN_FILE, on the monotonic clock;
+until that file exists, it repeats the first one. Faults cover the camera or freeze its picture.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bench.live.flights.faults import FAULTS
 
 
 def film(frames: list[bytes], begin_file: Path, rate_hz: float, out: BinaryIO) -> None:
-    """Write pictures until nobody reads them or the last was shown."""
+    """Write pictures until nobody reads them or the last one has been written."""
     size = cv2.imdecode(np.frombuffer(frames[0], np.uint8), cv2.IMREAD_COLOR).shape
     black = cv2.imencode(".jpg", np.zeros(size, np.uint8))[1].tobytes()
     number = 0
@@ -33,7 +33,7 @@ def film(frames: list[bytes], begin_file: Path, rate_hz: float, out: BinaryIO) -
 
 
 def shown_picture(frames: list[bytes], black: bytes, number: int, rate_hz: float) -> bytes:
-    """The picture of a number, or what a fault makes of it."""
+    """The picture with this number, altered by an active fault."""
     for fault in FAULTS:
         if fault.reigns(number / rate_hz):
             if fault.kind == "camera covered":
@@ -44,7 +44,7 @@ def shown_picture(frames: list[bytes], black: bytes, number: int, rate_hz: float
 
 
 def main() -> None:
-    """Film until the pipe is closed."""
+    """Write pictures until the pipe is closed."""
     folder, begin_file, rate_hz = sys.argv[1:]
     frames = [path.read_bytes() for path in sorted(Path(folder).glob("*.jpg"))]
     with contextlib.suppress(BrokenPipeError):

@@ -1,4 +1,4 @@
-"""What goes wrong in a flight, and when."""
+"""The faults of a flight, and their times."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Fault:
 
     @property
     def end_s(self) -> float:
-        """When all is well again, as far as the outside can do it."""
+        """When the fault is over, as far as an outside process can end it."""
         return self.begin_s + self.seconds
 
     def reigns(self, time_s: float) -> bool:
-        """Whether it goes on then."""
+        """Whether it is active then."""
         return self.begin_s <= time_s < self.end_s
 
     @property

@@ -1,8 +1,8 @@
 """``python -m bench.live.flights.fly FOLDER [--method auto|ncc] [--message NAME] [--town SEED]``: fly, and score.
 
-FOLDER is made where it is missing: a drawn town with the paper's flight over it. The bridge is a process of its
-own with ``--supervise``; what goes wrong and when stands in :mod:`bench.live.flights.faults`. The stand-in has no
-estimator: the figures are of the fixes and not of an EKF. It prints the tables of ``docs/results/vehicle.md``.
+Creates FOLDER if it is missing: a generated town with the paper's flight over it. The bridge is a separate process
+with ``--supervise``; :mod:`bench.live.flights.faults` lists the faults. The stand-in has no estimator: the figures
+describe the fixes, not an EKF. Prints the tables of ``docs/results/vehicle.md``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FAR_M = 5.0
 
 
 class Bridge:
-    """The bridge's process, its worker and its camera, which are killed and started together."""
+    """The bridge's process, its worker and its camera, killed and started together."""
 
     def __init__(self, folder: Path, port: int, method: str, message: str) -> None:
         start = recorded(folder)[1]
@@ -47,27 +47,27 @@ class Bridge:
         self.start()
 
     def start(self) -> None:
-        """Start it, in a group of its own."""
+        """Start it in its own process group."""
         self._process = subprocess.Popen(self._command, stdout=self._log, stderr=self._log, start_new_session=True)
 
     def is_running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether it is still running."""
         return self._process.poll() is None
 
     def kill(self) -> None:
         """All of it."""
-        with contextlib.suppress(ProcessLookupError):  # it has ended by itself
+        with contextlib.suppress(ProcessLookupError):  # it has already ended
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
     def kill_worker(self) -> None:
-        """Only the copy that matches."""
+        """Kill only the worker that matches."""
         children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children")
         os.kill(int(children.read_text(encoding="ascii").split()[-1]), signal.SIGKILL)
 
 
 def fly(folder: Path, method: str, message: str) -> list[tuple[float, float, float]]:
-    """Fly with all faults; returns of each fix when it arrived, how far off it was, how old."""
+    """Fly with all faults; returns each fix's arrival time, error and age."""
     motion, place, _ = recorded(folder)
     (folder / "begin").unlink(missing_ok=True)
     port, clock = free_port(), RealClock()
@@ -100,7 +100,7 @@ def fly(folder: Path, method: str, message: str) -> list[tuple[float, float, flo
 
 
 def plan(agenda: Agenda, begin_ns: int, fault: Fault, bridge: Bridge, pilot: Standin) -> None:
-    """Put a fault on the agenda; the camera's own are with the camera."""
+    """Start a fault; the camera handles its own."""
     begin, end = (begin_ns + round(time_s * S) for time_s in (fault.begin_s, fault.end_s))
     if fault.kind == "bridge killed":
         agenda.at(begin, bridge.kill)
@@ -132,7 +132,7 @@ def report(fixes: list[tuple[float, float, float]], begun: str) -> str:
 
 
 def longest_silence_s(arrived_s: NDArray[np.float64], begin_s: float, end_s: float) -> float:
-    """A fix that was under way when a fault began says nothing of the time after it; the gaps do."""
+    """A fix already under way when a fault began says nothing about the time after it; the gaps do."""
     within = arrived_s[(arrived_s > begin_s) & (arrived_s < end_s)]
     return float(np.diff([begin_s, *within, end_s]).max())
 

@@ -1,4 +1,4 @@
-"""The node by itself: ros2 launch scenematch_ros node.launch.py map:=site.tif params:=my.yaml namespace:=uav1."""
+"""The node alone: ros2 launch scenematch_ros node.launch.py map:=site.tif params:=my.yaml namespace:=uav1."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -10,7 +10,7 @@ NAMES = ("map", "surface", "camera", "start", "method", "firmware", "origin")
 
 
 def node(context):
-    """The node with the parameters of the file, and over them those arguments that were given."""
+    """The node with the file's parameters, overridden by the given arguments."""
     given = {name: LaunchConfiguration(name).perform(context) for name in NAMES}
     text = {name: value for name, value in given.items() if value}
     time = {"use_sim_time": LaunchConfiguration("use_sim_time").perform(context) == "true"}

@@ -1,4 +1,4 @@
-"""Gazebo Harmonic with the map, ArduPilot's IRIS, MAVROS, the truth and the node; SITL is started by itself.
+"""Gazebo Harmonic with the map, ArduPilot's IRIS, MAVROS, the truth and the node; start SITL separately.
 
 ros2 launch scenematch_ros paper_stack.launch.py map:=site.tif origin:=LAT,LON [vehicle:=false for PX4's own]
 """
@@ -46,7 +46,7 @@ def generate_launch_description():
                 condition=IfCondition(value("vehicle")),
                 package="ros_gz_sim",
                 executable="create",
-                # The nose to the north: along y, as the world is east-north-up.
+                # The nose points north: along y, since the world is east-north-up.
                 arguments=["-file", "model://iris_with_nadir_camera", "-z", "0.2", "-Y", "1.5707963267948966"],
             ),
             IncludeLaunchDescription(

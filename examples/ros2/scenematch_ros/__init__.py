@@ -1,1 +1,1 @@
-"""scenematch as a package of ROS 2."""
+"""scenematch as a ROS 2 package."""

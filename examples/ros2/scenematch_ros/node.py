@@ -1,4 +1,4 @@
-"""The node: what `scenematch bridge ros` takes as options, this takes as ROS parameters."""
+"""The node: takes the options of `scenematch bridge ros` as ROS parameters."""
 
 import sys
 
@@ -8,26 +8,26 @@ from scenematch.bridges.ros import RosTopics
 from scenematch.bridges.ros2 import Node
 
 FILES = ("map", "surface", "camera", "start", "origin", "mount")
-"""Parameters of text; an empty one is not given."""
+"""Text parameters; an empty one counts as not given."""
 TOPICS = RosTopics()
 TOPIC_NAMES = [name for name in RosTopics.__slots__ if name != "odometry_type"]
 
 
 class Printed(Progress):
-    """What the node does, a line each; ros2 launch shows them."""
+    """Prints the node's messages, one line each, for ros2 launch."""
 
     def message(self, text):
-        """Print it at once, whatever standard output is."""
+        """Print it at once, even if standard output is buffered."""
         print(text, flush=True)
 
 
 def settings_of(node):
-    """What the parameters say: of ROS, and of the matching."""
+    """The settings from the parameters: for ROS and for matching."""
     text = {name: node.parameter(name, "") or None for name in FILES}
     topics = {name: node.parameter(f"{name}_topic", getattr(TOPICS, name)) for name in TOPIC_NAMES}
     topics["odometry_type"] = node.parameter("odometry_type", TOPICS.odometry_type)
     if text["map"] is None:
-        raise OptionError("map: expected a file, got nothing; -p map:=site.tif gives it")
+        raise OptionError("map: expected a file, got nothing; give it as -p map:=site.tif")
     map_sigma_m, hfov_deg = node.parameter("map_sigma_m", 0.0), node.parameter("hfov_deg", 0.0)
     ros = RosSettings(
         map=MapInput(text["map"], surface=text["surface"], map_sigma_m=map_sigma_m or None),
@@ -53,7 +53,7 @@ def main():
         set_threads(node.parameter("threads", 1))
         ros, matching = settings_of(node)
         print(run_ros_bridge(ros, matching, node=node, progress=Printed()).line(), flush=True)
-    except KeyboardInterrupt:  # while it was loading
+    except KeyboardInterrupt:  # while loading
         print("ended before it began", flush=True)
     except EngineError as error:
         sys.exit(f"scenematch: {error}")

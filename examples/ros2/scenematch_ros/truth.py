@@ -1,7 +1,7 @@
-"""Positions of the simulated vehicle as a receiver's: /truth/fix, /truth/imu, /truth/height_agl, for bags.
+"""Publish the simulated vehicle's true state for bags: /truth/fix, /truth/imu, /truth/height_agl.
 
-Reads nav_msgs/Odometry on /truth/odometry in a world whose x is east and y is north. Metres become degrees as
-ArduPilot does it.
+Reads nav_msgs/Odometry on /truth/odometry in a world whose x is east and y is north. Converts metres to degrees
+like ArduPilot.
 """
 
 import math

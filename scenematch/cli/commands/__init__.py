@@ -1,1 +1,1 @@
-"""The commands, a file each, or a file for each group of commands: arguments in, a run called, results printed."""
+"""The commands, one file per command or group: each parses arguments, calls a run and prints the results."""

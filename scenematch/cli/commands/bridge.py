@@ -56,27 +56,27 @@ class LinkOptions:
         typer.Option(
             "--firmware",
             metavar="ardupilot|px4",
-            help="What the autopilot runs; ardupilot unless given.",
+            help="Firmware of the autopilot (default: ardupilot).",
             rich_help_panel=INPUT,
         ),
     ] = None
 
     def link(self, settings: Settings) -> MavlinkSettings:
-        """How it is reached and what it is sent."""
+        """How to reach it and what to send."""
         made: MavlinkSettings = table(settings, "mavlink", connect=self.connect or "", firmware=self.firmware)
         return made
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions(CameraOptions):
-    """The camera, or pictures that are played."""
+    """The camera, or recorded pictures."""
 
     frames: Annotated[
         Path | None,
         typer.Option(
             "--frames",
             metavar="DIR|VIDEO",
-            help="Pictures to play at their own pace.",
+            help="Recorded pictures, replayed in real time.",
             rich_help_panel=INPUT,
         ),
     ] = None
@@ -85,7 +85,7 @@ class PictureOptions(CameraOptions):
         typer.Option(
             "--telemetry",
             metavar="FILE",
-            help="telemetry.csv, whose stamps set that pace; else a video's own.",
+            help="telemetry.csv that times the replay (default: the video's own timestamps).",
             rich_help_panel=INPUT,
         ),
     ] = None
@@ -94,7 +94,7 @@ class PictureOptions(CameraOptions):
         typer.Option(
             "--camera-source",
             metavar="N|URL|exec:CMD",
-            help="A camera, or a command for JPEGs.",
+            help="A camera, a stream, or a command that writes JPEGs.",
             rich_help_panel=INPUT,
         ),
     ] = None
@@ -109,7 +109,7 @@ class MatchingOptions:
     device: DeviceOption = None
 
     def bridge_settings(self, settings: Settings) -> BridgeSettings:
-        """The same with what the settings say."""
+        """The options combined with the settings."""
         how = settings.track(method=self.method, device=self.device, start=self.start)
         made: BridgeSettings = table(
             settings,
@@ -125,7 +125,7 @@ class MatchingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class OptionalMapOptions:
-    """The map, which only fixes need."""
+    """The map, needed only to send fixes."""
 
     map: Annotated[
         Path | None,
@@ -136,7 +136,7 @@ class OptionalMapOptions:
     surface: SurfaceOption = None
 
     def map_input(self, settings: Settings) -> MapInput:
-        """The map with what the settings say of it."""
+        """The map combined with its settings."""
         if self.map is None:
             raise OptionError("map: expected a file, got none")
         return MapOptions(map=self.map, surface=self.surface).map_input(settings)
@@ -144,14 +144,14 @@ class OptionalMapOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class OtherWork:
-    """What is done in place of fixes."""
+    """What to do instead of sending fixes."""
 
     out: Annotated[
         Path | None,
         typer.Option(
             "--write-params",
             metavar="FILE",
-            help="Write the autopilot's parameters for these fixes, and end.",
+            help="Write the autopilot's parameters for these fixes, then exit.",
             rich_help_panel=OUTPUT,
         ),
     ] = None
@@ -159,7 +159,7 @@ class OtherWork:
         bool,
         typer.Option(
             "--measure-delay",
-            help="Measure how late the camera's pictures arrive, and end.",
+            help="Measure the camera's latency, then exit.",
             rich_help_panel=OUTPUT,
         ),
     ] = False
@@ -176,7 +176,7 @@ def mavlink(
         bool,
         typer.Option(
             "--supervise",
-            help="Replace a worker that is killed, with all that is loaded.",
+            help="Keep a loaded standby process that takes over if the worker dies.",
             rich_help_panel=EXPERT,
         ),
     ] = False,
@@ -185,12 +185,12 @@ def mavlink(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Fixes to an autopilot by MAVLink.
+    """Send fixes to an autopilot by MAVLink.
 
-    Reads attitude, height and velocity from the autopilot and sends it the fixes of a camera or of pictures
-    played at their own pace, until they end. With --write-params it only writes the file that tells ArduPilot or
-    PX4 to fly by these fixes. With --measure-delay it compares the turns that the pictures show with those of the
-    autopilot's attitude, while the vehicle is tilted to and fro by hand.
+    Reads attitude, height and velocity from the autopilot, matches pictures from a camera or a recording, and
+    sends fixes until the pictures end. --write-params only writes the parameter file with which ArduPilot or PX4
+    uses these fixes. --measure-delay measures the camera's latency: tilt the vehicle to and fro by hand while it
+    compares the rotation in the pictures with the autopilot's attitude.
     """
     given, hint = read_settings(settings), ""
     if other.out is not None:
@@ -215,7 +215,7 @@ def _bridge(
     shown: LiveViewTarget,
     as_json: bool,
 ) -> str:
-    """Bridge until the end; what comes after it."""
+    """Run the bridge to its end; returns the next command."""
     from scenematch.runs.bridge_files import BridgeFiles
     from scenematch.runs.mavlink_bridge import run_mavlink_bridge
 
@@ -239,7 +239,7 @@ def _bridge(
 
 
 def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings, as_json: bool) -> str:
-    """Measure and print; what comes after it."""
+    """Measure and print; returns the next command."""
     from scenematch.runs.camera_delay import measure_camera_delay
 
     source = pictures.camera_source
@@ -260,7 +260,7 @@ def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: S
 
 
 def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, force: bool, as_json: bool) -> str:
-    """Write and say so; what comes after it."""
+    """Write the file and say so; returns the next command."""
     from scenematch.runs.mavlink_parameters import write_parameter_file
 
     written = write_parameter_file(file, autopilot.link(settings), table(settings, "parameters"), force=force)
@@ -278,7 +278,9 @@ def ros(
     matching: MatchingOptions,
     ros_arguments: Annotated[
         list[str] | None,
-        typer.Argument(metavar="NAME:=VALUE", help="Of ROS: remaps; of ROS 2 after --ros-args, and parameters."),
+        typer.Argument(
+            metavar="NAME:=VALUE", help="ROS remaps; for ROS 2 after --ros-args, which also takes parameters."
+        ),
     ] = None,
     version: Annotated[
         int, typer.Option("--ros", metavar="1|2", help="rospy or rclpy.", rich_help_panel=INPUT)
@@ -288,7 +290,7 @@ def ros(
         typer.Option(
             "--image-topic",
             metavar="NAME",
-            help="sensor_msgs/Image, or CompressedImage by its name; others: --settings ros.topics.imu=NAME.",
+            help="Image topic, raw or compressed; set other topics by --settings ros.topics.imu=NAME.",
             rich_help_panel=INPUT,
         ),
     ] = None,
@@ -297,7 +299,7 @@ def ros(
         typer.Option(
             "--firmware",
             metavar="none|ardupilot|px4",
-            help="For whom the poses are, behind MAVROS; none unless given.",
+            help="Autopilot behind MAVROS that receives the poses (default: none).",
             rich_help_panel=INPUT,
         ),
     ] = None,
@@ -305,10 +307,10 @@ def ros(
     rerun: RerunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """A node of ROS 1 or ROS 2.
+    """Run as a node of ROS 1 or ROS 2.
 
-    Subscribes to images, attitude and height, and publishes poses, fixes, diagnostics and the window that was
-    searched. An empty name of a topic leaves it out.
+    Subscribes to images, attitude and height; publishes poses, fixes, diagnostics and the searched window. Leave a
+    topic out by giving it an empty name.
     """
     from dataclasses import replace
 

@@ -27,8 +27,8 @@ def check(
 ) -> None:
     """Find errors in a flight's inputs.
 
-    Places a few pictures on the map without the telemetry, and says which change of units, signs, offsets, mount,
-    focal length or clock would make the telemetry fit them. Takes the files of track.
+    Locates a few pictures on the map without using the telemetry, then reports which change of unit, sign, offset,
+    mount, focal length or clock would make the telemetry agree with them. Takes the same files as track.
     """
     from scenematch.runs.checking import as_rows, diagnose_flight
 

@@ -26,17 +26,21 @@ def compare(
     out: OutOption,
     runs: Annotated[
         list[str] | None,
-        typer.Option("--run", metavar="METHOD[/PROFILE]|FILE", help="Once a run; without it the paper's Table I."),
+        typer.Option(
+            "--run",
+            metavar="METHOD[/PROFILE]|FILE",
+            help="One run; repeat for more (default: the paper's Table I).",
+        ),
     ] = None,
     start: StartOption = None,
     settings: SettingsOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Several methods or settings over one flight.
+    """Compare methods or settings on one flight.
 
-    Follows the flight once a run, each into a folder of its own as track does, and compares them in one table
-    and one chart. --settings holds for all runs, and a run's own file counts more.
+    Tracks the flight once per run, each into its own folder, and compares the runs in one table and one chart.
+    --settings applies to all runs; a run's own file takes precedence.
     """
     from scenematch.runs.comparison import CHART, parse_runs
     from scenematch.runs.comparison import compare as compare_runs
@@ -51,7 +55,7 @@ def compare(
     else:
         tables.print_comparison(results, str(flight.frames))
         console.say(f"written to {out}")
-    # There is a page on as many runs as it has colours for, and always a chart.
+    # The chart is always drawn; the page only if it has enough colours for the runs.
     drawn = next((out / name for name in (COMPARISON, CHART) if (out / name).is_file()), out)
     following = f"track {flight_options(files, settings=settings, start=start)} --out out"
     console.next_step(following, as_json=as_json, hint=f"open {console.quoted(drawn)}")

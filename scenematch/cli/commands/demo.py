@@ -19,15 +19,15 @@ def demo(
         int | None, typer.Option("--frames", min=2, metavar="N", help="Fly only the first N frames.")
     ] = None,
     seed: Annotated[
-        int, typer.Option("--seed", min=0, metavar="N", help="Another number, another town and flight.")
+        int, typer.Option("--seed", min=0, metavar="N", help="Number of the generated town and flight.")
     ] = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Built-in flight, both methods, Table I.
+    """Track a built-in flight with both methods.
 
-    Draws a town and the paper's flight over it, follows it with NCC and SIFT, each in the paper's own recipe
-    and as this engine does it, and prints the paper's Table I beside the results. Needs no data.
+    Generates a town and the paper's flight over it, tracks it by NCC and SIFT, each with the paper's recipe and
+    with this engine's, and prints the results beside the paper's Table I. Needs no data.
     """
     from scenematch.runs.demo import run_demo
 

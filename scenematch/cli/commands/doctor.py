@@ -21,9 +21,9 @@ _EXTRA = re.compile(r"""extra == ["']([^"']+)["']""")
 
 
 _HEAD = """\
-# Settings of scenematch: every one with its default. Take the # off a key to change it; what stays commented
-# follows the defaults. Use the file with --settings FILE, or a single one with --settings NAME=VALUE, such as
-# input.every=5; options of a command count more.
+# All settings of scenematch with their defaults. To change one, remove the # before its key; a key that stays
+# commented follows the default. Use the file as --settings FILE, or a single setting as --settings NAME=VALUE,
+# such as --settings input.every=5. Options of a command take precedence.
 
 """
 
@@ -34,9 +34,9 @@ def doctor(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Versions, devices, what is missing.
+    """Show versions, devices and missing packages.
 
-    With --settings the file that the other commands take with --settings: all settings with units and defaults.
+    --settings prints the file that other commands take as --settings FILE: every setting with unit and default.
     """
     if settings:
         from scenematch.runs.settings import documented_settings
@@ -55,7 +55,7 @@ def doctor(
 
 
 def examine() -> tuple[dict[str, Any], bool]:
-    """Facts by name, and whether nothing is missing."""
+    """Facts by name, and whether all needed packages are installed."""
     from engine.runtime.tensors import torch
 
     facts: dict[str, Any] = {
@@ -80,7 +80,7 @@ def examine() -> tuple[dict[str, Any], bool]:
 
 
 def requirements() -> tuple[list[str], dict[str, list[str]]]:
-    """The packages that the engine needs, and by extra those that it can use, as its installation states them."""
+    """The packages that the engine needs, and those of each extra, read from the installed metadata."""
     from importlib import metadata
 
     needed: list[str] = []

@@ -16,24 +16,26 @@ def evaluate(
     runs: Annotated[list[Path], typer.Argument(metavar="DIR", help="Output folders of track.")],
     truth: Annotated[
         Path | None,
-        typer.Option("--truth", metavar="FILE", help="truth.csv, log or photographs; else track's."),
+        typer.Option(
+            "--truth", metavar="FILE", help="truth.csv, log or photographs (default: the one that track used)."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
             metavar="FILE",
-            help="Page on several runs; comparison.html unless given.",
+            help="Page that compares several runs (default: comparison.html).",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Score finished tracks and draw their report again.
+    """Score finished tracks and redraw their reports.
 
-    Of one run, prints the errors and rewrites the folder's summary.json and report.html. Of several,
-    draws one page: all tracks on one map and one time axis, and a table.
+    For one run: prints the errors and rewrites summary.json and report.html in its folder. For several: draws one
+        page with all tracks on one map and one time axis, and a table.
     """
     from scenematch.runs.evaluation import evaluate as evaluate_track
     from scenematch.runs.evaluation import recorded_files

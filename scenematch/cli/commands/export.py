@@ -17,19 +17,21 @@ def export(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="FILE", help="Without it track.FORMAT in the folder.", rich_help_panel=OUTPUT
+            "--out", metavar="FILE", help="File to write (default: track.FORMAT in DIR).", rich_help_panel=OUTPUT
         ),
     ] = None,
     truth: Annotated[
         Path | None,
-        typer.Option("--truth", metavar="FILE", help="Write this at the fixes' moments instead, to compare with."),
+        typer.Option(
+            "--truth", metavar="FILE", help="Export this reference at the times of the fixes instead of the track."
+        ),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """A finished track as GPX, GeoJSON, TUM.
+    """Export a finished track as GPX, GeoJSON or TUM.
 
-    Refused frames leave gaps. Times of day are written where the frames' stamps are UTC.
+    Refused frames leave gaps. Times of day are written only if the frames' timestamps are UTC.
     """
     from scenematch.runs.track_export import export_track
 

@@ -48,7 +48,7 @@ def locate(
 ) -> None:
     """Find one picture on the map.
 
-    Prints a fix and exits with 0, or prints why there is none and exits with 1.
+    Prints the fix and exits with 0, or prints why there is none and exits with 1.
     """
     from engine.values import Fix
     from scenematch.runs.single_image import locate_image

@@ -34,19 +34,19 @@ def info(
         typer.Option(
             "--map-bounds",
             metavar="W,S,E,N",
-            help="Edges of a bare picture, in degrees or in --map-crs.",
+            help="Bounds of a picture without georeference, in degrees or in --map-crs.",
             rich_help_panel=MAP,
         ),
     ] = None,
     map_crs: Annotated[
         str | None,
-        typer.Option("--map-crs", metavar="EPSG:N", help="CRS of a map that names none.", rich_help_panel=MAP),
+        typer.Option("--map-crs", metavar="EPSG:N", help="CRS, if the map names none.", rich_help_panel=MAP),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Size, ground sample distance, CRS, bounds.
+    """Show size, ground sample distance, CRS and bounds.
 
-    Other commands take bounds and CRS as --settings input.map_bounds=W,S,E,N and input.map_crs=EPSG:N.
+    Other commands take them as --settings input.map_bounds=W,S,E,N and --settings input.map_crs=EPSG:N.
     """
     from scenematch.runs.map_input import MapInput
 
@@ -62,10 +62,14 @@ def audit(
     surface: SurfaceOption = None,
     camera: Annotated[
         Path | None,
-        typer.Option("--camera", metavar="FILE", help="Calibration; without it 300 x 300 px with 60 degrees."),
+        typer.Option(
+            "--camera",
+            metavar="FILE",
+            help="Calibration file (default: 300 x 300 px with a 60 degree field of view).",
+        ),
     ] = None,
     height_agl_m: Annotated[
-        float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground; 150 unless given.")
+        float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground (default: 150).")
     ] = None,
     route: Annotated[
         Path | None,
@@ -73,25 +77,27 @@ def audit(
     ] = None,
     around: Annotated[
         str | None,
-        typer.Option("--around", metavar="LAT,LON,RADIUS_M", help="Only what lies so near to a place."),
+        typer.Option("--around", metavar="LAT,LON,RADIUS_M", help="Audit only this circle."),
     ] = None,
     corridor_m: Annotated[
         float | None,
-        typer.Option("--corridor-m", metavar="M", help="Only what lies so near to the route."),
+        typer.Option("--corridor-m", metavar="M", help="Audit only this distance to either side of the route."),
     ] = None,
     other: Annotated[
         Path | None,
-        typer.Option("--other", metavar="FILE", help="The same ground at another date; finds what is stale."),
+        typer.Option(
+            "--other", metavar="FILE", help="Map of the same ground at another date, to find stale areas."
+        ),
     ] = None,
     settings: SettingsOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Where frames can be matched, and where not.
+    """Predict where frames can be matched.
 
-    Writes matchability.tif (probability of a fix by NCC), audit.png and summary.json. With --route the
-    availability along it is predicted, and its poor stretches are listed. A huge map is audited in part: around a
-    place, along the route, or both.
+    Writes matchability.tif (probability of a fix by NCC), audit.png and summary.json. With --route it also
+    predicts availability along the route and lists poor stretches. Audit a huge map in part: around a place, along
+        the route, or both.
     """
     from scenematch.runs.map_audit import AuditFiles, audit_map
     from scenematch.runs.map_input import MapInput
@@ -121,31 +127,38 @@ class WantedMap:
     """What is fetched."""
 
     around: Annotated[
-        str, typer.Option("--around", metavar="LAT,LON|DIR", help="The middle; or photographs with positions.")
+        str,
+        typer.Option(
+            "--around", metavar="LAT,LON|DIR", help="Centre of the map, or a folder of photographs with positions."
+        ),
     ]
     source: Annotated[
         str,
-        typer.Option(
-            "--source", metavar="URL", help="Tiles as https://host/{z}/{x}/{y}.png, or a WMS or WMTS: your choice."
-        ),
+        typer.Option("--source", metavar="URL", help="Tiles as https://host/{z}/{x}/{y}.png, a WMS or a WMTS."),
     ]
     radius_m: Annotated[
         float | None,
-        typer.Option("--radius-m", metavar="M", help="To each edge, at least; else what the photographs saw."),
+        typer.Option(
+            "--radius-m",
+            metavar="M",
+            help="Minimum distance from the centre to each edge (default: what the photographs cover).",
+        ),
     ] = None
     gsd_m_per_px: Annotated[
         float | None,
         typer.Option(
-            "--gsd-m-per-px", metavar="M", help="Tiles are so fine or finer; 0.5, or as photographs need."
+            "--gsd-m-per-px", metavar="M", help="Coarsest resolution (default: 0.5, or what the photographs need)."
         ),
     ] = None
     layer: Annotated[
-        str | None, typer.Option("--layer", metavar="NAME", help="Of a WMS or WMTS that has several.")
+        str | None, typer.Option("--layer", metavar="NAME", help="Layer, if a WMS or WMTS has several.")
     ] = None
     surface: Annotated[
         str | None,
         typer.Option(
-            "--surface", metavar="FILE|URL", help="Heights to cut out as well; {lat} and {lon} as N48 and E016."
+            "--surface",
+            metavar="FILE|URL",
+            help="Surface model to fetch too; {lat} and {lon} become N48 and E016.",
         ),
     ] = None
 
@@ -158,15 +171,15 @@ def fetch(
     ],
     settings: SettingsOption = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only say what would be fetched.", rich_help_panel=EXPERT)
+        bool, typer.Option("--dry-run", help="Show what would be fetched, then exit.", rich_help_panel=EXPERT)
     ] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Fetch a map from a server that you name.
 
-    One request at a time. What was fetched stays beside the file until it is complete: the same command goes on
-    after an interruption. The server's terms decide what you may fetch, keep and use.
+    Sends one request at a time. If interrupted, run the same command again to resume. The server's terms decide
+    what you may fetch, keep and use.
     """
     from scenematch.runs.map_fetch import fetch_map
 

@@ -38,31 +38,31 @@ class WorldOptions:
     """What is flown over."""
 
     seed: Annotated[
-        int, typer.Option("--seed", min=0, metavar="N", help="Another number, another town and flight.")
+        int, typer.Option("--seed", min=0, metavar="N", help="Number of the generated town and flight.")
     ] = 1
     condition: Annotated[
         str | None,
         typer.Option(
-            "--condition", metavar="NAME", help="Light, season and air of the frames; noon unless given."
+            "--condition", metavar="NAME", help="Light, season and weather in the frames (default: noon)."
         ),
     ] = None
-    relief_m: Annotated[float, typer.Option("--relief-m", metavar="H", help="Height of a town's hills.")] = 0.0
+    relief_m: Annotated[float, typer.Option("--relief-m", metavar="H", help="Height of the town's hills.")] = 0.0
     map: Annotated[
         Path | None,
         typer.Option(
-            "--map", metavar="FILE", help="Your own map as the world, in place of a town.", rich_help_panel=MAP
+            "--map", metavar="FILE", help="Fly over this map instead of a generated town.", rich_help_panel=MAP
         ),
     ] = None
     surface: SurfaceOption = None
     camera_pitch_deg: Annotated[
         float,
         typer.Option(
-            "--camera-pitch-deg", metavar="P", help="Of the camera, as a gimbal's: -90 straight down, -45 oblique."
+            "--camera-pitch-deg", metavar="P", help="Pitch of the camera: -90 straight down, -45 oblique."
         ),
     ] = -90.0
 
     def world(self) -> WorldSettings:
-        """The same as the run takes it."""
+        """The options in the form that the run takes."""
         from scenematch.runs.simulation import WorldSettings
 
         return WorldSettings(**{each.name: getattr(self, each.name) for each in fields(self)})
@@ -73,22 +73,25 @@ class LoopOptions:
     """How the loop is closed, if it is."""
 
     closed_loop: Annotated[
-        bool, typer.Option("--closed-loop", help="Fly by the engine's fixes, with GPS off.")
+        bool, typer.Option("--closed-loop", help="Steer by the engine's fixes, with GPS off.")
     ] = False
     minutes: Annotated[
-        float | None, typer.Option("--minutes", metavar="M", help="With --closed-loop: how long; 5 unless given.")
+        float | None,
+        typer.Option("--minutes", metavar="M", help="With --closed-loop: minutes to fly (default: 5)."),
     ] = None
     method: Annotated[
         str | None,
-        typer.Option("--method", metavar="auto|ncc|sift", help="With --closed-loop; auto unless given."),
+        typer.Option(
+            "--method", metavar="auto|ncc|sift", help="With --closed-loop: matching method (default: auto)."
+        ),
     ] = None
     fault: Annotated[
         str | None,
-        typer.Option("--fault", metavar="none|killed|shifted|frozen", help="With --closed-loop: what goes wrong."),
+        typer.Option("--fault", metavar="none|killed|shifted|frozen", help="With --closed-loop: fault to inject."),
     ] = None
 
     def given(self) -> dict[str, Any]:
-        """What was said of the loop, None where nothing was."""
+        """The loop's options as given; None for each that was not."""
         return {"minutes": self.minutes, "method": self.method, "fault": self.fault}
 
 
@@ -107,10 +110,10 @@ def simulate(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """A simulated flight with its truth.
+    """Simulate a flight, with ground truth.
 
-    Writes a flight folder that track reads. With --closed-loop the vehicle steers by the engine's fixes, and the
-    folder holds its track, estimate, figures and summary too.
+    Writes a flight folder that track can read. With --closed-loop the vehicle steers by the engine's fixes, and
+    the folder also holds the track, the estimate, figures and a summary.
     """
     use_threads()
     world = town.world()
@@ -137,7 +140,7 @@ def simulate(
 def _fly_closed_loop(
     out: Path, world: WorldSettings, loop: Mapping[str, Any], shown: LiveViewTarget, force: bool
 ) -> dict[str, Any]:
-    """The figures of a flight by the engine's fixes; what is None of the loop's settings is its default."""
+    """The figures of a closed-loop flight; a setting that is None takes its default."""
     from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
 
     settings = ClosedLoopSettings(**{name: value for name, value in loop.items() if value is not None})

@@ -38,7 +38,7 @@ def track(
         typer.Option(
             "--profile",
             metavar="engine|paper",
-            help="paper is the paper's own recipe, of ncc or sift; engine unless given.",
+            help="paper: the paper's own recipe for ncc or sift (default: engine).",
             rich_help_panel=EXPERT,
         ),
     ] = None,
@@ -48,7 +48,7 @@ def track(
         typer.Option(
             "--budget-ms",
             metavar="MS",
-            help="Time that one frame may take; later answers are refused.",
+            help="Longest time per frame; later answers are refused.",
             rich_help_panel=EXPERT,
         ),
     ] = None,
@@ -57,10 +57,10 @@ def track(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Follow a flight; track.csv and a report.
+    """Track a flight; write track.csv and a report.
 
-    Writes track.csv (one row a frame), summary.json and report.html into the output folder. Without --start the
-    flight begins at the first position in the telemetry, and where that has none, anywhere on the map.
+    Writes track.csv (one row per frame), summary.json and report.html into the output folder. Without --start the
+    flight begins at the telemetry's first position, or anywhere on the map if it has none.
     """
     from scenematch.runs.tracking import track as track_flight
 

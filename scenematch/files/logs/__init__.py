@@ -1,1 +1,1 @@
-"""Flight logs: one reader a format, and the resampling of their quantities to the moments of the frames."""
+"""Flight logs: one reader per format, and resampling to the times of the frames."""

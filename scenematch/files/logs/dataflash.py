@@ -2,7 +2,7 @@
 
 Convention:
     The clock is TimeUS, microseconds since the autopilot started. Position and altitude are the EKF's (POS),
-    and the receiver's (GPS) where there is no POS; velocity is that of XKF1 or NKF1, else of GPS.
+    or the receiver's (GPS) if there is no POS; velocity is that of XKF1 or NKF1, else of GPS.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from engine.errors import TelemetryError
 from scenematch.files.resampling import FlightLog, TimeSeries, make_log, make_position_series, make_series
 
 _HEAD, _FMT = b"\xa3\x95", 0x80  # the first two bytes of each message; the type that defines the others
-_MAX_US = 1e13  # a third of a year: a later stamp is corrupt
+_MAX_US = 1e13  # a third of a year: a larger stamp is corrupt
 _FIELD_TYPES = {  # numpy dtype and divisor by format character
     "a": ("V64", 1.0),
     "b": ("<i1", 1.0),
@@ -66,7 +66,7 @@ def read_dataflash(path: Path) -> FlightLog:
     """Read a DataFlash log.
 
     Raises:
-        TelemetryError: the file is no DataFlash log, or has no usable series.
+        TelemetryError: the file is not a DataFlash log, or has no usable series.
     """
     data = path.read_bytes()
     if not data.startswith(_HEAD + bytes([_FMT])):
@@ -112,7 +112,7 @@ def _messages(data: bytes) -> dict[str, Columns]:
         body = data[at + 3 : at + known.length]
         if known.name == "FMT":
             defined = _parse_format(body)
-            if defined is not None:  # a type is defined once; a second definition is corrupt
+            if defined is not None:  # a type is defined only once; a second definition is corrupt
                 formats.setdefault(body[0], defined)
         elif known.name in bodies:
             bodies[known.name].append(body)
@@ -138,7 +138,7 @@ class _Format:
 
 
 def _parse_format(body: bytes) -> _Format | None:
-    """The format that a FMT message defines, or None where it is inconsistent."""
+    """The format that a FMT message defines, or None if it is inconsistent."""
     _, length, *texts = struct.unpack("<BB4s16s64s", body)
     name, kinds, columns = (text.split(b"\0")[0].decode("ascii", "replace") for text in texts)
     defined = _Format(name, length, kinds, tuple(columns.split(",")) if columns else ())

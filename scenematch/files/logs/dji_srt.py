@@ -1,11 +1,12 @@
 """DJI's subtitles (.SRT): telemetry that a drone writes beside its video, one cue per frame or second.
 
 Convention:
-    The clock is the video's, from its first frame. Cues say of which frame they are (FrameCnt), or are one a
-    frame; those of a second each are one a picture, where pictures were extracted. Both syntaxes are supported:
-    ``[latitude: ..] [longitude: ..] [rel_alt: .. abs_alt: ..] [gb_yaw: ..]``, and ``GPS(lon, lat, ..)
+    The clock is the video's, from its first frame. Cues name their frame (FrameCnt) or come once per frame; cues
+    of a second each match one extracted picture each. Both syntaxes are supported: ``[latitude: ..] [longitude:
+        ..] [rel_alt: .. abs_alt: ..] [gb_yaw: ..]``, and ``GPS(lon, lat, ..)
     BAROMETER: ..`` or ``H ..m``. Heights are above the take-off point. The third number of GPS() is an altitude on
-    some models and a count of satellites on others, and is ignored; so is HOME(). A gimbal of zeros only is none.
+    some models and a count of satellites on others, and is ignored; so is HOME(). Gimbal angles of only zeros mean
+    no gimbal.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _PAIR = re.compile(rf"\b([A-Za-z_.]{{1,20}})[ \t]{{0,3}}[: ][ \t]{{0,3}}{_NUMBER
 _GPS = re.compile(rf"\bGPS ?\( ?{_NUMBER} ?, ?{_NUMBER} ?(?:,[^)]{{0,40}})?\)")
 _HEIGHT = re.compile(rf"\bBAROMETER ?: ?{_NUMBER}|\bH {_NUMBER} ?m\b")
 _MARKUP = re.compile(r"<[^>]{0,200}>")
-_MAX_FRAME_NS = 120_000_000  # between two frames of a video; cues further apart are of a second or so
+_MAX_FRAME_NS = 120_000_000  # between two frames of a video; cues further apart come about once a second
 _ANGLES = ("gb_roll", "gb_pitch", "gb_yaw")
 _GIMBAL_COLUMNS = ("roll_deg", "pitch_deg", "heading_deg", "heading_sigma_deg", "tilt_sigma_deg")
 
@@ -36,7 +37,7 @@ def read_srt(path: Path) -> FlightLog:
     """Read the telemetry in a video's subtitles.
 
     Raises:
-        TelemetryError: the file is no UTF-8 text, has no cues, or its cues have no telemetry.
+        TelemetryError: the file is not UTF-8 text, has no cues, or its cues have no telemetry.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -65,7 +66,7 @@ def read_srt(path: Path) -> FlightLog:
 
 
 def _frame_numbers(stamps_ns: list[int], counts: list[float | None]) -> TimeSeries | None:
-    """Number of the video's frame at each cue, from 1; None where cues do not tell."""
+    """Number of the video's frame at each cue, from 1; None if cues do not state it."""
     if all(count is not None for count in counts) and len(counts) > 1:
         known = [count for count in counts if count is not None]
         if all(a < b for a, b in itertools.pairwise(known)):

@@ -29,7 +29,7 @@ LOG_SUFFIXES = tuple(_READERS)
 
 @dataclass(frozen=True, slots=True)
 class LogClock:
-    """Source of the capture times of a flight whose telemetry is a log.
+    """Where to get a flight's capture times if its telemetry is a log.
 
     Attributes:
         stamps: CSV file with ``timestamp_ns`` and ``frame``; None uses the times of the video or bag, the numbers
@@ -48,7 +48,9 @@ class LogClock:
             raise OptionError(f"offset_s: expected finite seconds, got {self.offset_s}")
 
 
-_SHARE_OF_ALL = 0.9  # of a video's frames: fewer without a gap were extracted at another rate
+_SHARE_OF_ALL = (
+    0.9  # of a video's frames: if fewer are numbered without a gap, they were extracted at another rate
+)
 AS_LOGGED = LogClock()
 """The frames' own stamps, without offset."""
 
@@ -59,7 +61,7 @@ def is_log(path: str | Path) -> bool:
 
 
 def is_photographs(path: str | Path) -> bool:
-    """Whether a path is a folder, and no bag."""
+    """Whether a path is a folder but not a bag."""
     return Path(path).is_dir() and not is_bag(path)
 
 
@@ -68,7 +70,7 @@ def open_log(path: str | Path, odometry_topic: str | None = None) -> FlightLog:
 
     Args:
         path: the file.
-        odometry_topic: of a bag, that has the velocity by another camera's odometry.
+        odometry_topic: topic of a bag with the velocity from another camera's odometry.
 
     Raises:
         TelemetryError: the file cannot be read, is none of these, or has no usable series.
@@ -120,7 +122,7 @@ def _unshifted_stamps(source: FrameSource, log: FlightLog, clock: LogClock) -> t
         if log.captures_ns.size != len(source.names):
             raise TelemetryError(
                 f"{log.path}: expected a camera message for each of {len(source.names)} pictures, got "
-                f"{log.captures_ns.size}; say when they were taken with `frame_stamps`"
+                f"{log.captures_ns.size}; give their times with `frame_stamps`"
             )
         return [int(stamp_ns) for stamp_ns in log.captures_ns], list(source.names)
     rows = exif_telemetry([source.path / name for name in source.names])
@@ -135,7 +137,7 @@ def _unshifted_stamps(source: FrameSource, log: FlightLog, clock: LogClock) -> t
 def _stamps_by_number(source: FrameSource, log: FlightLog, numbers: TimeSeries) -> tuple[list[int], list[str]]:
     """Times of pictures that were extracted from a video, by the number of the frame in their names.
 
-    A picture 0 makes the first frame 0, as OpenCV counts; else it is 1, as ffmpeg counts.
+    If there is a picture 0, the first frame is 0, as OpenCV counts; else it is 1, as ffmpeg counts.
     """
     found = [re.findall(r"[0-9]+", Path(name).stem) for name in source.names]
     numbered = sorted((int(digits[-1]), name) for digits, name in zip(found, source.names, strict=True) if digits)
@@ -150,7 +152,7 @@ def _stamps_by_number(source: FrameSource, log: FlightLog, numbers: TimeSeries) 
     if last - first + 1 == len(numbered) < _SHARE_OF_ALL * count and len(numbered) > 1:
         raise TelemetryError(
             f"{log.path}: {asked}, got {first} to {last} without a gap for a video of {count} frames: pictures "
-            "that were taken of it at another rate are not numbered as its frames are"
+            "extracted at another rate are not numbered like its frames"
         )
     at = np.array([number + from_1 for number, _ in numbered], np.float64)
     begin_ns = int(numbers.stamps_ns[0])
@@ -159,11 +161,11 @@ def _stamps_by_number(source: FrameSource, log: FlightLog, numbers: TimeSeries) 
 
 
 def open_truth(path: str | Path, stamp_ns: int | None = None) -> list[Truth]:
-    """Read truth from truth.csv, or from the positions of a log; from a bag's ``/truth`` topics where it has them.
+    """Read truth from truth.csv, or from the positions of a log; from a bag's ``/truth`` topics if it has them.
 
     Args:
         path: truth.csv, a log, or a folder of photographs whose EXIF has positions.
-        stamp_ns: a stamp of the frames; where it is UTC, the truth of a log is converted to UTC.
+        stamp_ns: a timestamp of the frames; if it is UTC, the truth of a log is converted to UTC.
 
     Raises:
         TelemetryError: the file cannot be read or has no positions.

@@ -1,9 +1,9 @@
 """PX4's ULog (.ulg): its attitude, heights, velocity, positions and camera messages.
 
 Convention:
-    The clock is microseconds since the autopilot started; ``timestamp_sample`` is preferred to ``timestamp``. Of
-    topics with several instances the first is read. The topic of an estimator replaces the vehicle's where a log
-    lacks that, and ``sensor_gps`` replaces ``vehicle_gps_position``.
+    The clock is microseconds since the autopilot started; ``timestamp_sample`` is preferred to ``timestamp``. If a
+    topic has several instances, the first is read. An estimator's topic replaces the vehicle's if a log lacks it,
+    and ``sensor_gps`` replaces ``vehicle_gps_position``.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _TOPICS = (
     "camera_capture",
     "camera_trigger",
 )
-_FALLBACKS = {  # topics with the same fields, in logs of few topics or of several estimators
+_FALLBACKS = {  # topics with the same fields, for logs with few topics or several estimators
     "vehicle_attitude": "estimator_attitude",
     "vehicle_local_position": "estimator_local_position",
     "vehicle_global_position": "estimator_global_position",
     "vehicle_gps_position": "sensor_gps",
 }
 _DOWN, _FIX_3D = 25, 3
-_MAX_ENDS = 16  # reads at the end of the file after which the parser is in a loop
+_MAX_ENDS = 16  # reads at the end of the file; after more the parser is in a loop
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -49,7 +49,7 @@ def read_ulog(path: Path) -> FlightLog:
 
     Raises:
         MissingExtraError: pyulog is not installed.
-        TelemetryError: the file is no ULog, or has no usable series.
+        TelemetryError: the file is not a ULog, or has no usable series.
     """
     with path.open("rb") as file:
         head = file.read(len(HEAD))
@@ -67,7 +67,7 @@ def read_ulog(path: Path) -> FlightLog:
 
 
 class _LoopGuard(io.BufferedReader):
-    """A file for pyulog, which seeks back and forth across the end of some corrupt files for ever."""
+    """A file for pyulog, which on some corrupt files seeks back and forth across the end forever."""
 
     _ends = 0
 

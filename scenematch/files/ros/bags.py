@@ -1,8 +1,8 @@
 """Bags of ROS 1 and ROS 2 (sqlite3, mcap): the images, telemetry and calibration of a flight.
 
 Convention:
-    Stamps are those of the headers, of capture. A message without a header (std_msgs/Float64), or with a zero
-    stamp, has the time of its recording. Frames are named by their index from 0, as those of a video.
+    Timestamps are capture times from the headers. A message without a header (std_msgs/Float64) or with a zero
+    stamp gets its recording time. Frames are named by their index from 0, like those of a video.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ from scenematch.files.ros.messages import (
 )
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
-"""Suffixes of bag files, in lower or upper case; a folder is a bag where it contains metadata.yaml."""
+"""Suffixes of bag files, in lower or upper case; a folder is a bag if it contains metadata.yaml."""
 IMAGE, CAMERA_INFO = "/camera/image_raw", "/camera/camera_info"
 IMU, COMPASS = "/mavros/imu/data", "/mavros/global_position/compass_hdg"
 HEIGHT, RANGE = "/mavros/global_position/rel_alt", "/mavros/rangefinder/rangefinder"
 VELOCITY, POSITION = "/mavros/local_position/velocity_local", "/mavros/global_position/global"
 TRUTH, TRUTH_ATTITUDE = "/truth/fix", "/truth/imu"
 TRUTH_HEIGHT, TRUTH_ALTITUDE = "/truth/height_agl", "/truth/alt_amsl"
-"""Topics that are written, and preferred where a bag has several of a type."""
+"""Topics to write, preferred if a bag has several of a type."""
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _FLOAT, _CALIBRATION = ("std_msgs/msg/Float64",), ("sensor_msgs/msg/CameraInfo",)
 
 Sample = tuple[int, tuple[float | None, ...]]
-"""Stamp in nanoseconds, and values; None where one is unknown."""
+"""Stamp in nanoseconds, and values; None if one is unknown."""
 
 
 def is_bag(path: str | Path) -> bool:
@@ -67,11 +67,11 @@ def is_bag(path: str | Path) -> bool:
 class BagFrames(FrameSource):
     """The images of one topic of a bag, read forward; going back restarts at the first.
 
-    Of pictures with the same stamp the first counts; names are indices among all of the topic.
+    Of pictures with the same timestamp the first counts; names are indices among all pictures of the topic.
 
     Args:
         path: the bag.
-        topic: topic of the images; None where there is only one.
+        topic: topic of the images; None if there is only one.
 
     Raises:
         TelemetryError: the bag cannot be read, has no images, or has several image topics and none was given.
@@ -84,7 +84,7 @@ class BagFrames(FrameSource):
             stamps_ns = [time_ns for _, time_ns, _ in _messages(path, reader, {self.topic}, _IMAGES)]
         if not stamps_ns:
             raise TelemetryError(f"{path}: expected pictures on {self.topic}, got none")
-        # Simulators publish a picture again where there is no new one yet.
+        # Simulators publish a picture again if there is no new one yet.
         fresh = [k for k in range(len(stamps_ns)) if k == 0 or stamps_ns[k] != stamps_ns[k - 1]]
         self.names, self._stamps_ns = [str(index) for index in fresh], [stamps_ns[index] for index in fresh]
         self._reset()
@@ -147,7 +147,7 @@ def read_bag_camera(path: str | Path, topic: str | None = None) -> Camera:
 
     Args:
         path: the bag.
-        topic: topic of the images; None where there is only one.
+        topic: topic of the images; None if there is only one.
 
     Raises:
         TelemetryError: the bag cannot be read, or has no calibration.
@@ -181,8 +181,8 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
 
     Args:
         path: the bag.
-        truth: whether the ``/truth`` topics replace these, where the bag has them.
-        odometry_topic: of another camera's odometry, whose velocity and its accuracy are used: nav_msgs/Odometry,
+        truth: whether the ``/truth`` topics replace these, if the bag has them.
+        odometry_topic: another camera's odometry, used for velocity and its accuracy: nav_msgs/Odometry,
             geometry_msgs/TwistWithCovarianceStamped or TwistStamped.
 
     Raises:
@@ -234,7 +234,7 @@ _TAKEN: dict[str, tuple[tuple[str, ...], Callable[[Any], tuple[float | None, ...
     "place": (("sensor_msgs/msg/NavSatFix",), position_from_message),
     "odometry": (tuple(ODOMETRY_TYPES.values()), body_velocity_from_message),
 }
-"""Message types of each quantity, and the function that extracts its values; None where a message has none."""
+"""Message types of each quantity, and the function that extracts its values; None if a message has none."""
 _SUFFIXES = {
     "imu": ("/imu/data", ""),
     "compass": ("/compass_hdg",),
@@ -262,7 +262,7 @@ def _odometry_topic(path: Path, reader: Any, topic: str) -> str:
 def _odometry_series(
     path: Path, topic: str, samples: list[Sample], series: Mapping[str, TimeSeries | None]
 ) -> dict[str, TimeSeries | None]:
-    """East and north velocity and its accuracy: what is along the body, turned by the attitude at that time."""
+    """East and north velocity and its accuracy: the body velocity rotated by the attitude at that time."""
     stamps_ns = np.array([time_ns for time_ns, _ in samples], np.int64)
 
     def angle_deg(name: str) -> Floats:
@@ -270,7 +270,7 @@ def _odometry_series(
         unknown = np.full(len(stamps_ns), np.nan)
         return unknown if found is None else interpolate(found, stamps_ns, is_angle=name != "pitch_deg")
 
-    # Without roll and pitch the vehicle counts as level, as a picture's does.
+    # Without roll and pitch the vehicle counts as level, as for pictures.
     roll_deg, pitch_deg = np.nan_to_num(angle_deg("roll_deg")), np.nan_to_num(angle_deg("pitch_deg"))
     attitudes = zip(roll_deg, pitch_deg, angle_deg("heading_deg"), strict=True)
     along_body = np.array([values for _, values in samples], np.float64).reshape(-1, 4)
@@ -287,7 +287,7 @@ def _odometry_series(
 
 
 def _is_same_mavros(imu: str | None, compass: str | None) -> bool:
-    """Whether both topics are of one MAVROS, whose Imu has the same heading, with the time of its measurement."""
+    """Whether both topics are from one MAVROS; its Imu has the same heading, with the time of measurement."""
     ends = "/imu/data", "/global_position/compass_hdg"
     if imu is None or compass is None or not (imu.endswith(ends[0]) and compass.endswith(ends[1])):
         return False

@@ -3,7 +3,7 @@
 Convention:
     Frames follow REP-103: the world is east-north-up, the body forward-left-up, quaternions are x, y, z, w and
     rotate the body to the world. Compass headings are degrees clockwise from true north, as in MAVROS. Messages
-    may be of rospy, rclpy or rosbags: only their fields are accessed.
+        may come from rospy, rclpy or rosbags: only their fields are accessed.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from scenematch.files.velocities import velocity_sigma_mps
 CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4}
 """Encodings of sensor_msgs/Image by channels of one byte; 8UC3 and 8UC4 are in BGR order."""
 BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
-"""Encodings of raw colour pictures, and OpenCV's name of each, which begins at its second pixel and row."""
+"""Encodings of raw colour pictures, and OpenCV's name of each, which starts at the second pixel and row."""
 DEEP = ("mono16", "16UC1")
 """Encodings of grey pictures with two bytes per pixel."""
 ENCODINGS = (*CHANNELS, *BAYER, *DEEP)
-_WHITE_PERCENTILE = 99.9  # of a deep picture: few pixels are brighter, and the others keep their contrast
-_ANY_SENSOR_M = (0.0, 1000.0)  # that MAVROS' rangefinder states of every sensor, whatever it reaches
+_WHITE_PERCENTILE = 99.9  # of a deep picture: the few brighter pixels are clipped to keep the others' contrast
+_ANY_SENSOR_M = (0.0, 1000.0)  # stated by MAVROS for any rangefinder, whatever its range
 _FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])  # its own inverse
 _NORM_TOLERANCE = 0.01  # of the squared norm of a quaternion
 _NOT_STATED = -1.0  # first element of a covariance
@@ -40,9 +40,9 @@ ODOMETRY_TYPES = {
     "TwistWithCovarianceStamped": "geometry_msgs/msg/TwistWithCovarianceStamped",
     "TwistStamped": "geometry_msgs/msg/TwistStamped",
 }
-"""Messages that have a velocity along the body, by their own names."""
+"""Messages with a velocity along the body, by name."""
 BODY_FRAME = "base_link"
-"""The vehicle's body by REP-105, forward-left-up; a prefix, as in "uav1/base_link", is a vehicle's name."""
+"""The vehicle's body by REP-105, forward-left-up; a prefix, as in "uav1/base_link", names the vehicle."""
 NO_POSITION = -1
 """NavSatStatus.status of a receiver without a fix."""
 
@@ -51,7 +51,7 @@ NO_POSITION = -1
 
 
 def stamp_ns(message: Any) -> int:
-    """The stamp of the header in nanoseconds; 0 where it is not set."""
+    """The stamp of the header in nanoseconds; 0 if not set."""
     stamp = message.header.stamp
     seconds = stamp.secs if hasattr(stamp, "secs") else stamp.sec
     nanoseconds = stamp.nsecs if hasattr(stamp, "nsecs") else stamp.nanosec
@@ -146,7 +146,7 @@ def camera_from_message(message: Any) -> Camera:
 
 
 def attitude_from_message(message: Any) -> tuple[float, float, float] | None:
-    """Roll, pitch and heading in degrees of a sensor_msgs/Imu; None where it has no orientation."""
+    """Roll, pitch and heading in degrees of a sensor_msgs/Imu; None if it has no orientation."""
     rotation = _rotation(message.orientation)
     if message.orientation_covariance[0] == _NOT_STATED or rotation is None:
         return None
@@ -158,14 +158,14 @@ def body_velocity_from_message(message: Any) -> tuple[float, float, float, float
 
     Args:
         message: nav_msgs/Odometry, whose twist is by definition along the axes of ``child_frame_id``, the body's
-            (forward-left-up). Where that is the frame of the pose as well, as some odometries publish it, the
-            pose's orientation turns the twist back into the body: where that frame has its north does not matter.
-            Or geometry_msgs/TwistWithCovarianceStamped or TwistStamped, along the axes of ``header.frame_id``.
+            (forward-left-up). If some odometry uses the pose's frame for it, the pose's orientation rotates the
+            twist back into the body; the frame's north does not matter. Or
+            geometry_msgs/TwistWithCovarianceStamped or TwistStamped, along the axes of ``header.frame_id``.
 
     Returns:
-        None where the message has no velocity that counts, by
-        :func:`scenematch.files.velocities.velocity_sigma_mps`, or no orientation where one is needed. The standard
-        deviation is per axis, and 0 where the covariance is not stated: zeros, -1, not finite, or none at all.
+        None if the message has no valid velocity, by
+        :func:`scenematch.files.velocities.velocity_sigma_mps`, or no orientation if one is needed. The standard
+        deviation is per axis, and 0 if the covariance is not stated: zeros, -1, not finite, or missing.
 
     Raises:
         TelemetryError: the frame of a twist without a pose is not :data:`BODY_FRAME`.
@@ -187,7 +187,7 @@ def body_velocity_from_message(message: Any) -> tuple[float, float, float, float
 
 
 def _twist(message: Any) -> tuple[Any, list[float]]:
-    """The linear velocity of a message and its three variances; zeros where none are stated."""
+    """The linear velocity of a message and its three variances; zeros if none are stated."""
     if not hasattr(message.twist, "covariance"):
         return message.twist.linear, [0.0] * 3
     covariance = np.asarray(message.twist.covariance, np.float64)
@@ -196,7 +196,7 @@ def _twist(message: Any) -> tuple[Any, list[float]]:
 
 
 def _check_body_frame(frame_id: str) -> None:
-    """A velocity in a world whose north nobody knows cannot be turned, nor one along a sensor's axes."""
+    """A velocity in a world of unknown north, or along a sensor's axes, cannot be rotated."""
     if frame_id.rpartition("/")[2] != BODY_FRAME:
         raise TelemetryError(
             f"frame_id: expected a velocity along {BODY_FRAME} (forward-left-up), got one along {frame_id!r}"
@@ -204,7 +204,7 @@ def _check_body_frame(frame_id: str) -> None:
 
 
 def _rotation(q: Any) -> Array | None:
-    """(3, 3) of a geometry_msgs/Quaternion, from the body (forward-left-up) to the world; None if it is none."""
+    """(3, 3) of a geometry_msgs/Quaternion, from the body (forward-left-up) to the world; None if invalid."""
     x, y, z, w = (float(v) for v in (q.x, q.y, q.z, q.w))
     square = x * x + y * y + z * z + w * w
     if not abs(square - 1.0) < _NORM_TOLERANCE:
@@ -221,7 +221,7 @@ def _rotation(q: Any) -> Array | None:
 def range_from_message(message: Any) -> float | None:
     """Distance in metres along the beam of a sensor_msgs/Range; None outside the range that it states.
 
-    None also where it states that of any sensor: beyond its reach, a sonar then reports its largest distance.
+    Also None if the stated range is MAVROS' default: a sonar then reports its largest distance beyond its reach.
     """
     range_m = float(message.range)
     if (message.min_range, message.max_range) == _ANY_SENSOR_M:
@@ -230,7 +230,7 @@ def range_from_message(message: Any) -> float | None:
 
 
 def position_from_message(message: Any) -> tuple[float, float, float | None] | None:
-    """Latitude and longitude in degrees and sigma in metres of a sensor_msgs/NavSatFix; None where unknown."""
+    """Latitude and longitude in degrees and sigma in metres of a sensor_msgs/NavSatFix; None if unknown."""
     lat_deg, lon_deg = float(message.latitude), float(message.longitude)
     if message.status.status == NO_POSITION or not (math.isfinite(lat_deg) and math.isfinite(lon_deg)):
         return None
