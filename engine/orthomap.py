@@ -63,9 +63,9 @@ class OrthoMap(Georeference):
         ground_m: level of the ground in the surface's datum: the 20th percentile of the surface over the valid
             part of the map, below most roofs and crowns; 0.0 without a surface.
         levels: number of levels of the pyramid.
-        georeference_sigma_m: georeferencing accuracy, one standard deviation per axis; None where unknown.
-        surface_datum: vertical system of a surface in metres above the sea, by its file; None where unknown.
-        slope_sigma_deg: slope accuracy of the surface under a frame, one standard deviation; None where unknown.
+        georeference_sigma_m: georeferencing accuracy, one standard deviation per axis; None if unknown.
+        surface_datum: vertical system of a surface in metres above the sea, by its file; None if unknown.
+        slope_sigma_deg: slope accuracy of the surface under a frame, one standard deviation; None if unknown.
     """
 
     georeference_sigma_m: float | None = None
@@ -161,8 +161,8 @@ class OrthoMap(Georeference):
             crs: anything that pyproj takes.
             surface_m: (H, W) heights, NaN where unknown.
             valid: (H, W) bool, all where None.
-            georeference_sigma_m: georeferencing accuracy, None where unknown.
-            slope_sigma_deg: slope accuracy, None where unknown.
+            georeference_sigma_m: georeferencing accuracy, None if unknown.
+            slope_sigma_deg: slope accuracy, None if unknown.
 
         Returns:
             OrthoMap: without a file; the arrays are not copied.
@@ -269,7 +269,7 @@ class OrthoMap(Georeference):
             shape: rows and columns of the result.
 
         Returns:
-            (h, w, 3) RGB, undefined on nodata; None where the map has no colours, or no file.
+            (h, w, 3) RGB, undefined on nodata; None if the map has no colours, or no file.
         """
         return None if self._source is None else read_colour(self._source(), self._grid, window, shape)
 

@@ -57,12 +57,12 @@ class Frame:
     Attributes:
         image: (H, W) grey or (H, W, 3) RGB, uint8, numpy or torch.
         timestamp_ns: capture time on the vehicle's clock, or None.
-        height_agl_m: height above the ground, positive, or None where unknown.
-        heading_deg: clockwise from true north, or None where unknown.
+        height_agl_m: height above the ground, positive, or None if unknown.
+        heading_deg: clockwise from true north, or None if unknown.
         roll_deg: positive right side down; None is treated as level.
         pitch_deg: positive nose up; None is treated as level.
-        east_velocity_mps: velocity over ground, or None where unknown.
-        north_velocity_mps: velocity over ground, or None where unknown.
+        east_velocity_mps: velocity over ground, or None if unknown.
+        north_velocity_mps: velocity over ground, or None if unknown.
         height_sigma_m: standard deviation of the height; None is what the matcher assumes, as of the next two.
         heading_sigma_deg: standard deviation of the heading.
         tilt_sigma_deg: standard deviation of roll and of pitch.
@@ -137,7 +137,7 @@ class Frame:
 
     @property
     def attitude(self) -> Attitude | None:
-        """The attitude with unknown roll and pitch as 0, or None where the heading is unknown."""
+        """The attitude with unknown roll and pitch as 0, or None if the heading is unknown."""
         if self.heading_deg is None:
             return None
         return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, wrap_heading_deg(self.heading_deg))
@@ -145,7 +145,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class GridPose:
-    """Height and attitude by which a frame is projected onto the map; None where unknown.
+    """Height and attitude by which a frame is projected onto the map; None if unknown.
 
     Attributes:
         height_agl_m: above the ground.
@@ -285,13 +285,13 @@ class Fix:
     """A position with its covariance, at the capture of the frame.
 
     Attributes:
-        timestamp_ns: capture time of the frame, or None where the frame had none.
+        timestamp_ns: capture time of the frame, or None if the frame had none.
         lat_deg: WGS84 latitude of the camera.
         lon_deg: WGS84 longitude of the camera.
         east_m: east of the map's origin.
         north_m: north of the map's origin.
         up_m: height of the camera in the surface model's datum (above flat ground where there is none);
-            None where the method does not measure height.
+            None if the method does not measure height.
         covariance_m2: (3, 3) in east, north, up; where ``up_m`` is None, up is that of the frame's height.
         attitude: measured by the method, or None. Where NCC searched over headings or heights without refinement,
             only the heading is measured; roll and pitch are the frame's, or 0.
@@ -330,7 +330,7 @@ class Fix:
 
     @property
     def attitude_sigma_deg(self) -> tuple[float, ...] | None:
-        """Standard deviations of roll, pitch and heading; None where the whole pose was not solved."""
+        """Standard deviations of roll, pitch and heading; None if the whole pose was not solved."""
         covariance = self.attitude_covariance_deg2
         return None if covariance is None else tuple(np.sqrt(np.diag(covariance)).tolist())
 
@@ -392,9 +392,9 @@ class NoFix:
     Attributes:
         reason: of the refusal.
         detail: one sentence with the figures behind the reason.
-        timestamp_ns: capture time of the frame, or None where the frame had none.
-        method: the method that refused, or None where none was tried.
-        score: of the best match, or None where there was none.
+        timestamp_ns: capture time of the frame, or None if the frame had none.
+        method: the method that refused, or None if none was tried.
+        score: of the best match, or None if there was none.
         window: the crop that was searched, or None.
         timings: milliseconds per stage that ran.
         candidates: a few matches that are not probable enough alone, with what they state of themselves.

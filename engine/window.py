@@ -44,7 +44,7 @@ def place_window(
         map_size_px: width and height of the map.
 
     Returns:
-        Window | None: None where the window is outside the map.
+        Window | None: None if the window is outside the map.
     """
     spans = []
     for center, size, limit in zip(center_px, size_px, map_size_px, strict=True):

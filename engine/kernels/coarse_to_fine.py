@@ -111,7 +111,7 @@ def peak(
 
     Returns:
         Peak | None: as :func:`engine.kernels.peaks.find_peak`, the second score being that of a coarse level where
-        that is higher than the refined rivals; None where positions elsewhere are not excluded.
+        that is higher than the refined rivals; None if positions elsewhere are not excluded.
     """
     wide = quick is not None and is_wide(search)
     levels = _levels(search, template, min_overlap, _MAX_LOSS if wide else 1.0)
@@ -156,7 +156,7 @@ def best_places(
         min_overlap: see :func:`peak`.
 
     Returns:
-        (x, y, score) in falling order of the score; None where there is no coarser level.
+        (x, y, score) in falling order of the score; None if there is no coarser level.
     """
     levels = _levels(search, template, min_overlap, _MAX_LOSS)
     if levels is None:
@@ -173,7 +173,7 @@ def best_places(
 
 
 def _levels(search: Search, template: FloatImage, min_overlap: float, max_loss: float) -> _Levels | None:
-    """The levels on which there is something to gain, or None where the finest is the only one.
+    """The levels on which there is something to gain, or None if the finest is the only one.
 
     Args:
         search: the window.
@@ -314,7 +314,7 @@ def _coarse_rest(
 def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak | None, bool]:
     """A coarse position at full resolution, and whether it is a summit there and not at the edge of anything.
 
-    None where it is on the border of the coarse level, or too much of it on nodata.
+    None if it is on the border of the coarse level, or too much of it on nodata.
     """
     if not (0 < y < scores.shape[0] - 1 and 0 < x < scores.shape[1] - 1):
         return None, False

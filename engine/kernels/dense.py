@@ -184,7 +184,7 @@ def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: Gaussia
         prior: of the parameters.
 
     Returns:
-        The pose, or None where too few samples are visible or the pose is not determined.
+        The pose, or None if too few samples are visible or the pose is not determined.
     """
     from engine.kernels.gauss_newton import gauss_newton  # numba takes a while to import
 
@@ -216,7 +216,7 @@ def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
         prior: the one that it was refined with.
 
     Returns:
-        (8, 8) in the order of the parameters, or None where the pose is not determined.
+        (8, 8) in the order of the parameters, or None if the pose is not determined.
     """
     from engine.kernels import gauss_newton
 

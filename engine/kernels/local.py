@@ -25,7 +25,7 @@ class LocalScores:
         image: (H, W) float32, its mean small against its standard deviation; 0 where not valid.
         template: (h, w) float32 of zero mean.
         middle: (y, x); scores can be computed within ``REACH`` of it.
-        counts: (H+1, W+1) running sums of the valid pixels, of which alone all sums are; None where all are.
+        counts: (H+1, W+1) running sums of the valid pixels, of which alone all sums are; None if all are.
         min_overlap: positions where a smaller share of the template lies on valid pixels score -1.
     """
 

@@ -56,7 +56,7 @@ def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.b
     Args:
         image: (H, W) float32, its mean small against its standard deviation.
         halvings: upper bound on the number of half-resolution levels.
-        valid: (H, W); None where all pixels are. The picture is 0 where they are not.
+        valid: (H, W); None if all pixels are. The picture is 0 where they are not.
 
     Returns:
         Search: with levels down to 48 x 48 pixels.

@@ -34,7 +34,7 @@ class Weights:
 
     Attributes:
         path: of the file.
-        kind: of :data:`KINDS`, or None where the names are of no known network.
+        kind: of :data:`KINDS`, or None if the names are of no known network.
         tensors: by the names that the networks have now.
     """
 

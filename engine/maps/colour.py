@@ -15,7 +15,7 @@ Rgb = NDArray[np.uint8]
 
 
 def read_colour(source: Source, grid: Grid, window: Window, shape: tuple[int, int]) -> Rgb | None:
-    """Colours of a window; None where the file has fewer than three bands and no colour table.
+    """Colours of a window; None if the file has fewer than three bands and no colour table.
 
     Args:
         source: the map's file.

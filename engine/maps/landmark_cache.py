@@ -56,7 +56,7 @@ def load_arrays(key: str, kinds: Kinds) -> NamedArrays | None:
         kinds: names, element types and shapes that are expected.
 
     Returns:
-        Arrays (N, ...) with a common N and finite values; None where the file is missing or not valid.
+        Arrays (N, ...) with a common N and finite values; None if the file is missing or not valid.
     """
     try:
         with cache_path(key).open("rb") as stream, np.load(stream, allow_pickle=False) as file:

@@ -251,7 +251,7 @@ def _read_list(path: Path) -> dict[str, str]:
 
 
 def _cached(path: Path, grid: Grid) -> Source | None:
-    """The cached file, or None where it is missing, broken or of another grid."""
+    """The cached file, or None if it is missing, broken or of another grid."""
     try:
         source = open_source(path)
         same = np.allclose(source.grid.pixel_to_crs, grid.pixel_to_crs, rtol=0, atol=1e-6)

@@ -42,7 +42,7 @@ class Region:
     Attributes:
         window: its extent, in pixels of the level.
         search: prepared pixels that templates are matched against.
-        valid: (H, W) bool, False on nodata; None where all pixels are valid.
+        valid: (H, W) bool, False on nodata; None if all pixels are valid.
         mask: the same on the host, which is asked without waiting for a device.
     """
 
@@ -98,7 +98,7 @@ class PreparedMap:
             level: of the map's pyramid.
 
         Returns:
-            (H, W) float32, and (H, W) bool, False on nodata; None where all pixels are valid.
+            (H, W) float32, and (H, W) bool, False on nodata; None if all pixels are valid.
         """
         region = self.cut(window, level)
         inner = np.s_[window.y0 - region.window.y0 :, window.x0 - region.window.x0 :]
@@ -162,7 +162,7 @@ def enhanced_part(
         level: of the map's pyramid.
 
     Returns:
-        (H, W) float32, and (H, W) bool, False on nodata; None where all pixels are valid.
+        (H, W) float32, and (H, W) bool, False on nodata; None if all pixels are valid.
     """
     rows, columns = site.level_shape(level)
     margin = radius_px + 2  # reach of the box, plus one for the gradient and one for the smoothing

@@ -157,7 +157,7 @@ def open_source(
 
 
 def vertical_datum(dataset: Any) -> str | None:
-    """Name of the system in which a dataset's heights are metres above the sea; None where it names no such one.
+    """Name of the system in which a dataset's heights are metres above the sea; None if it names no such one.
 
     Only a compound CRS does, such as EPSG:32636+5773; heights above the ellipsoid are the third axis of another.
     """

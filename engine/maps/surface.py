@@ -139,7 +139,7 @@ class SurfaceModel:
             reach_px: half its side.
 
         Returns:
-            The plane's level at the middle and its slope (2,) in metres up per map pixel x and y; None where less
+            The plane's level at the middle and its slope (2,) in metres up per map pixel x and y; None if less
             than half of the square is known.
         """
         from engine.kernels.lower_plane import lower_plane  # numba takes a while to import

@@ -26,7 +26,7 @@ Refusal = tuple[Reason, str]
 
 
 def judge_peak(peak: Peak, evidence: PeakEvidence, risk: float, *, is_tested: bool = True) -> Refusal | None:
-    """The reason to refuse a correlation peak, or None where it is accepted.
+    """The reason to refuse a correlation peak, or None if it is accepted.
 
     Args:
         peak: the peak.
@@ -47,7 +47,7 @@ def judge_peak(peak: Peak, evidence: PeakEvidence, risk: float, *, is_tested: bo
 
 
 def judge_pose(evidence: PoseEvidence, risk: float) -> Refusal | None:
-    """The reason to refuse a pose by matched features, or None where it is accepted.
+    """The reason to refuse a pose by matched features, or None if it is accepted.
 
     Args:
         evidence: of the pose.

@@ -90,7 +90,7 @@ def view_of(
         slope_m_per_px: (2,) rise of the plane per map pixel x and y; None is level.
 
     Returns:
-        GroundView | None: None where a ray of a corner exceeds :data:`MAX_RAY_DEG` or does not meet the plane.
+        GroundView | None: None if a ray of a corner exceeds :data:`MAX_RAY_DEG` or does not meet the plane.
     """
     enu_from_camera = camera.enu_from_camera(attitude)
     rays = camera.frame_rays @ enu_from_camera.T
@@ -139,7 +139,7 @@ def rectify(gray: NDArray[np.uint8], camera: Camera, view: GroundView, *, fracti
             heading, so that the cost of matching does not depend on the heading.
 
     Returns:
-        Patch | None: None where it is smaller than 8 x 8 map pixels.
+        Patch | None: None if it is smaller than 8 x 8 map pixels.
     """
     size = _inscribed_size(view, gray.shape, fraction)
     if size is None:
@@ -262,7 +262,7 @@ def ground_bounds_px(camera: Camera, attitude: Attitude, height_m: float, enu_ja
         enu_jacobian: (2, 2) metres east and north per map pixel x and y.
 
     Returns:
-        (2, 2) lower and upper corner in map pixels from the nadir; None where the middle of the frame looks beyond
+        (2, 2) lower and upper corner in map pixels from the nadir; None if the middle of the frame looks beyond
         that angle.
     """
     rays = camera.border_rays @ camera.enu_from_camera(attitude).T
@@ -295,7 +295,7 @@ def orthorectify(
         relief: of the ground; None is level.
 
     Returns:
-        Orthophoto | None: None where it would be too small or too large, or the middle of the frame looks beyond
+        Orthophoto | None: None if it would be too small or too large, or the middle of the frame looks beyond
         :data:`MAX_FIELD_DEG`.
     """
     bounds = ground_bounds_px(camera, attitude, height_m, enu_jacobian)

@@ -171,7 +171,7 @@ class Correlator:
         return self.prepared.cut(level_crop(self.query.site, window, level), level)
 
     def search(self, aligned: Aligned, window: Window, quick: QuickLook | None = None) -> Peak | None:
-        """The peak in a window, in pixels of the aligned level; None where the template is nowhere on the map.
+        """The peak in a window, in pixels of the aligned level; None if the template is nowhere on the map.
 
         Args:
             aligned: the hypothesis.
@@ -263,7 +263,7 @@ class Correlator:
 
         Returns:
             Scores (H', W') of the template's top-left pixel, and that place (2,) of the first in pixels of the
-            level; None where the template does not fit the window.
+            level; None if the template does not fit the window.
         """
         height, width = aligned.template.shape
         region = self.cut(window, aligned.level)

@@ -96,7 +96,7 @@ class PoseEvidence:
     Attributes:
         log10_nfa: log10 of the number of false alarms, the poses that chance would support as well.
         prior_chi_square: of the position against the prior, with two degrees of freedom; None without a prior.
-        height_chi_square: of the height against the telemetry's, with one degree of freedom; None where the
+        height_chi_square: of the height against the telemetry's, with one degree of freedom; None if the
             height is unknown or doubted.
         rival_share: votes of the best translation elsewhere over those of this one; 0 where matches did not vote,
             and ``log10_nfa`` is of the pose.

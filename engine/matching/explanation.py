@@ -139,7 +139,7 @@ def rectified_frame(query: Query) -> Patch | None:
 
 
 def _footprint(query: Query, stats: PoseStats, ground_m: float) -> Array | None:
-    """(4, 2) where the frame's corners see a level ground, in map pixels; None where one sees the horizon."""
+    """(4, 2) where the frame's corners see a level ground, in map pixels; None if one sees the horizon."""
     rays = query.camera.frame_rays[:4] @ stats.rotation
     if (rays[:, 2] >= 0.0).any():
         return None

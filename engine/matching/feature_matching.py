@@ -51,8 +51,8 @@ class Matched:
         points_m: (M, 3) metres on the ground.
         weights: (M,) relative inverse variances of the pixels.
         tolerance_px: reprojection distance in the frame up to which a match agrees with a pose.
-        start: the pose that most voted for; None where there was no vote.
-        vote: what was voted for; None where there was no vote.
+        start: the pose that most voted for; None if there was no vote.
+        vote: what was voted for; None if there was no vote.
     """
 
     view: MapView
@@ -76,7 +76,7 @@ def match_views(
 
     Args:
         query: the frame.
-        landmarks: of the map; None where a finder takes their place.
+        landmarks: of the map; None if a finder takes their place.
         options: settings.
         views: where to look.
         hypothesis: what is assumed of the telemetry.

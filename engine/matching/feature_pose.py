@@ -52,7 +52,7 @@ class FeatureMatcher:
 
     Attributes:
         query: the frame.
-        landmarks: of the map; None where a finder takes their place.
+        landmarks: of the map; None if a finder takes their place.
         options: settings.
         finder: finds the matched points in place of features.
         method: what fixes and refusals name.
@@ -65,7 +65,7 @@ class FeatureMatcher:
     method: str = METHOD
 
     def find(self) -> PoseCandidate | NoFix:
-        """The pose of the frame, or a refusal where there is none."""
+        """The pose of the frame, or a refusal if there is none."""
         query, options = self.query, self.options
         flat = query.refuse_flat(self.method, options.min_deviation)
         if flat is not None:
@@ -130,7 +130,7 @@ class FeatureMatcher:
 
         Returns:
             Points (M, 2) in pixels of the undistorted frame, their places (M, 3) on the ground in metres, and the
-            pose with its inliers, or None where there are too few or they do not determine one.
+            pose with its inliers, or None if there are too few or they do not determine one.
         """
         height_m = self.query.telemetry.height_agl_m
         assert height_m is not None  # without one there is no single view

@@ -57,7 +57,7 @@ def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak
 
 
 def _quick_level(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[GridPose]] | None:
-    """One level above, with its fewer hypotheses, which costs a sixteenth; None where too little is left there."""
+    """One level above, with its fewer hypotheses, which costs a sixteenth; None if too little is left there."""
     above = level + 1
     side_px, turns, shares = _grid_on(correlator, first, above)
     if above == correlator.query.site.levels or side_px < _MIN_QUICK_TEMPLATE_PX:

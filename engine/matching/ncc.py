@@ -219,7 +219,7 @@ class Ncc(Method):
         return explain_correlation(self._correlator(query), window)
 
     def find(self, query: Query, *, coarser: int = 0, headings: int = 1) -> PeakCandidate | NoFix:
-        """The highest peak of one frame, or a refusal where there is none.
+        """The highest peak of one frame, or a refusal if there is none.
 
         Args:
             query: the frame.
@@ -326,7 +326,7 @@ class Ncc(Method):
             window: that is looked at; None takes that of the first look, which the fix names in any case.
 
         Returns:
-            PeakCandidate | None: None where the template is nowhere on the map, or there is no time.
+            PeakCandidate | None: None if the template is nowhere on the map, or there is no time.
         """
         window = window or found.fix.window
         correlator, scheduler, work_px = self._correlator(query), query.scheduler, found.aligned.work_px(window)

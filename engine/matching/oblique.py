@@ -52,7 +52,7 @@ def oblique_patch(
         nadir_px: (2,) full-resolution pixel about which the ground is looked up; None takes it for level.
 
     Returns:
-        Patch | None: None where no 8 x 8 pixels are seen.
+        Patch | None: None if no 8 x 8 pixels are seen.
     """
     site, jacobian = query.site, query.jacobian * 2.0**level
     relief = ground_relief(site, nadir_px, level)

@@ -130,7 +130,7 @@ def _scale(query: Query) -> float:
 
 
 def template_of(query: Query, window: Window) -> Gray | None:
-    """The frame equalised, scaled (eq. 2) and turned (eq. 3), square; None where it does not fit the window."""
+    """The frame equalised, scaled (eq. 2) and turned (eq. 3), square; None if it does not fit the window."""
     assert query.telemetry.grid_heading_deg is not None  # refused before
     height, width = query.gray.shape
     scale, jacobian = _scale(query), query.jacobian

@@ -1,4 +1,4 @@
-"""Camera pose from matched points: options in, statistics out, or None where the matches do not support a pose.
+"""Camera pose from matched points: options in, statistics out, or None if the matches do not support a pose.
 
 :mod:`engine.matching.pnp` finds inliers and refines on them, and it finds some in any set of wrong matches. Here
 an a-contrario test bounds the expected number of poses with as many inliers by chance.
@@ -144,7 +144,7 @@ def solve_pose(
         start: Where the refinement begins; None searches for an initial pose.
 
     Returns:
-        None where the matches are few, collinear, behind the camera, ambiguous or not significant.
+        None if the matches are few, collinear, behind the camera, ambiguous or not significant.
 
     Raises:
         ShapeError: An array has another shape.

@@ -105,7 +105,7 @@ class Query:
         *,
         margin: float,
     ) -> Window | None:
-        """The adaptive window in map pixels (eq. 4, 5), or None where it lies outside the map.
+        """The adaptive window in map pixels (eq. 4, 5), or None if it lies outside the map.
 
         Args:
             center_px: (2,) where the middle of the footprint should lie.
@@ -218,8 +218,8 @@ class Query:
             score: of the match.
             window: that was searched.
             east_north_m: (2,) of the nadir where it is known in metres; None computes it.
-            up_m: height of the camera, or None where it is not measured.
-            grid_attitude: the heading from grid north; None where it is not measured.
+            up_m: height of the camera, or None if it is not measured.
+            grid_attitude: the heading from grid north; None if it is not measured.
             turn_covariance_rad2: (3, 3) of a small turn about the camera's axes, with a measured attitude.
             map_sigma_m: the part of the covariance that is the map's georeference.
         """

@@ -116,7 +116,7 @@ class Refinement:
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
     def refine_at_once(self, fix: Fix) -> Fix | None:
-        """The fix of a known tilt refined on the frame's own level, None where that is not beyond doubt."""
+        """The fix of a known tilt refined on the frame's own level, None if that is not beyond doubt."""
         prior = self._prior(fix)
         return self._refined(fix, prior, self._at_once(prior))
 
@@ -142,7 +142,7 @@ class Refinement:
         return self._refined(fix, prior, fit or self._through_levels(prior, _MUCH_COARSER))
 
     def _refined(self, fix: Fix, prior: GaussianPrior, fit: DenseFit | None) -> Fix | None:
-        """The fix with its pose refined, None where that failed or leads elsewhere."""
+        """The fix with its pose refined, None if that failed or leads elsewhere."""
         query, errors = self.query, self.query.errors(self.options.errors)
         pose_covariance = None if fit is None else covariance_of(fit, prior)
         if fit is None or pose_covariance is None:
@@ -233,7 +233,7 @@ class Refinement:
         return GaussianPrior(Pose(attitude_prior.rotation, center, np.zeros(2)), precision)
 
     def _footprint(self, pose: Pose, height_m: float, level: int) -> Window | None:
-        """The part of a level that the frame shows, or None where that is less than a few blocks."""
+        """The part of a level that the frame shows, or None if that is less than a few blocks."""
         query = self.query
         rays = query.camera.frame_rays[:4] @ pose.rotation
         ground_m = pose.center_m[:2] + rays[:, :2] * (height_m / -rays[:, 2:])

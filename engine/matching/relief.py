@@ -19,11 +19,11 @@ def ground_relief(site: OrthoMap, nadir_px: Array | None, level: int) -> Relief 
 
     Args:
         site: the map.
-        nadir_px: (2,) full-resolution pixel that heights count from; None where it is unknown.
+        nadir_px: (2,) full-resolution pixel that heights count from; None if it is unknown.
         level: of whose pixels the offsets are.
 
     Returns:
-        Relief | None: None where the place or the surface is unknown.
+        Relief | None: None if the place or the surface is unknown.
     """
     if nadir_px is None or not site.has_surface:
         return None

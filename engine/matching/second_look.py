@@ -62,7 +62,7 @@ def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> Se
         window: in full-resolution map pixels.
 
     Returns:
-        SecondLook | None: None where its places have to be looked at one by one.
+        SecondLook | None: None if its places have to be looked at one by one.
     """
     coarse = _on_coarser_level(correlator, aligned, window)
     if coarse is None:
@@ -91,7 +91,7 @@ def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> Se
 
 
 def _on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) -> Aligned | None:
-    """The same hypothesis on the coarsest level that serves; None where there is none."""
+    """The same hypothesis on the coarsest level that serves; None if there is none."""
     for above in (2, 1):
         level = aligned.level + above
         if level < correlator.query.site.levels and min(aligned.template.shape) >> above >= COARSE_TEMPLATE_PX:
@@ -101,7 +101,7 @@ def _on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) 
 
 
 def _peak_of(correlator: Correlator, aligned: Aligned, window: Window, own: FloatImage) -> Peak | None:
-    """The peak of the frame's own template, without what chance reaches; None where it is nowhere on the map."""
+    """The peak of the frame's own template, without what chance reaches; None if it is nowhere on the map."""
     scored = _scores(correlator, aligned, window, own)
     if scored is None or scored[0].max() <= -1.0:
         return None
@@ -119,7 +119,7 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
         window: in full-resolution map pixels.
 
     Returns:
-        SecondLook | None: None where the template is nowhere on the map.
+        SecondLook | None: None if the template is nowhere on the map.
     """
     scored = _scores(correlator, aligned, window, _templates(correlator, aligned, null=True))
     if scored is None:
@@ -149,7 +149,7 @@ def _templates(correlator: Correlator, aligned: Aligned, *, null: bool) -> Float
 def _scores(
     correlator: Correlator, aligned: Aligned, window: Window, templates: FloatImage
 ) -> tuple[FloatImage, Window] | None:
-    """Scores (T, H', W') of templates by all channels, and where they begin; None where these do not fit."""
+    """Scores (T, H', W') of templates by all channels, and where they begin; None if these do not fit."""
     query, options = correlator.query, correlator.options
     crop = level_crop(query.site, window, aligned.level)
     height, width = aligned.template.shape

@@ -131,7 +131,7 @@ class Sift(Method):
         return self._by_all_features(query)
 
     def _by_few_features(self, query: Query) -> Fix | None:
-        """A fix by half as many keypoints, a level coarser and not doubled; None where that is not accepted."""
+        """A fix by half as many keypoints, a level coarser and not doubled; None if that is not accepted."""
         scale = self._few_scale(query)
         if scale is None or not self._has_time_for_few(query):
             return None
@@ -142,7 +142,7 @@ class Sift(Method):
         return found.fix
 
     def _few_scale(self, query: Query) -> float | None:
-        """The scale of the frame at which few features are sought; None where it is not asked or the map ends."""
+        """The scale of the frame at which few features are sought; None if it is not asked or the map ends."""
         height_m = query.telemetry.height_agl_m
         if query.prior is None or height_m is None or not self.options.upright or not self._can_refine(query):
             return None
@@ -209,7 +209,7 @@ class Sift(Method):
         return explain_features(FeatureMatcher(query, self.landmarks, self.options), window)
 
     def find(self, query: Query, options: SiftOptions | None = None) -> PoseCandidate | NoFix:
-        """The pose of one frame, or a refusal where there is none.
+        """The pose of one frame, or a refusal if there is none.
 
         Args:
             query: the frame.

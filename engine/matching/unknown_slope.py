@@ -63,7 +63,7 @@ def over_unknown_slope(
         unknown_slope_deg: standard deviation of slopes of unknown ground, in degrees.
 
     Returns:
-        The pose, or None where the ground is no plane: without any knowledge of the slope the refined position is
+        The pose, or None if the ground is no plane: without any knowledge of the slope the refined position is
         then not the peak's.
     """
     wide = math.tan(math.radians(wide_slope_deg(unknown_slope_deg)))

@@ -26,7 +26,7 @@ class TelemetryHypothesis:
 
     Attributes:
         heights_m: the lowest and the highest that is searched; equal where the height is known.
-        x_axis_deg: direction of the map's x axis in the frame, from +x towards +y; None where unknown.
+        x_axis_deg: direction of the map's x axis in the frame, from +x towards +y; None if unknown.
     """
 
     heights_m: tuple[float, float]
@@ -114,7 +114,7 @@ def drawn_px(query: Query, height_m: float, scale: float) -> float:
 
 
 def coarser_scale(query: Query, height_m: float, scale: float) -> float | None:
-    """The scale to reduce a frame to for one level above that of another scale; None where the map has none."""
+    """The scale to reduce a frame to for one level above that of another scale; None if the map has none."""
     level = level_at(query, height_m, scale) + 1
     if level >= query.site.levels:
         return None

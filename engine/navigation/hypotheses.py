@@ -104,7 +104,7 @@ class Hypotheses:
         """Add the matches of one frame; each hypothesis takes the best that agrees with it.
 
         Args:
-            matches: of the frame; none where there is nothing in it.
+            matches: of the frame; none if there is nothing in it.
             now: its odometry.
             sources: what else was known, and where the matcher searched.
             map_m2: area of the window where the whole map was searched.
@@ -157,7 +157,7 @@ def _extended(
         match: that agrees with it.
         now: its odometry.
         before: where the hypothesis predicted it.
-        searched_m2: area that was searched; None where it was searched about this prediction.
+        searched_m2: area that was searched; None if it was searched about this prediction.
         height_m: above the ground.
     """
     fix = match.fix

@@ -212,7 +212,7 @@ class DriftModel:
         Args:
             start: either of the two.
             end: the other.
-            velocity: assumed where none was measured; None where none was assumed.
+            velocity: assumed where none was measured; None if none was assumed.
         """
         blind_s = abs(end.blind_s - start.blind_s)
         measured_s = max(0.0, abs(end.time_s - start.time_s) - blind_s - abs(end.stated_s - start.stated_s))
@@ -224,7 +224,7 @@ class DriftModel:
         return math.hypot(lasting_m + blind_m, math.sqrt(abs(end.noise_m2 - start.noise_m2)))
 
     def velocity(self, apart_m: Array, sigma_m: float, interval_s: float) -> VelocityEstimate | None:
-        """The velocity at the later of two fixes; None where they are so far apart that it predicts nothing.
+        """The velocity at the later of two fixes; None if they are so far apart that it predicts nothing.
 
         Args:
             apart_m: (2,) from one to the other.

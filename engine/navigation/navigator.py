@@ -134,7 +134,7 @@ class Navigator:
 
     @property
     def ground_motion(self) -> GroundMotion | None:
-        """The way to the newest frame as pictures show it; None where they do not, or were not asked."""
+        """The way to the newest frame as pictures show it; None if they do not, or were not asked."""
         return self._motion
 
     @property

@@ -247,7 +247,7 @@ class _View:
         """The motion by places (N, 2) one ahead of the lens, before and after, from a first guess (3,) of it.
 
         Returns:
-            (2,) metres east and north, and their covariance (2, 2); None where it cannot be solved for.
+            (2,) metres east and north, and their covariance (2, 2); None if it cannot be solved for.
         """
         rays = np.column_stack([begin, np.ones(len(begin))]) @ self._begin.T
         steep = -rays[:, 2] / np.linalg.norm(rays, axis=1)

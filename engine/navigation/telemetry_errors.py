@@ -21,7 +21,7 @@ _WALK_SHARE = 1e-3  # of the height, by which its error changes in a second
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What is to be added to a telemetry that is off, as far as fixes measured it; None where they did not.
+    """What is to be added to a telemetry that is off, as far as fixes measured it; None if they did not.
 
     Attributes:
         attitude: of roll, pitch and heading. A mount that is off and a principal point look the same.

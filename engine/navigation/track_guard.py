@@ -118,7 +118,7 @@ class TrackGuard:
     - by :meth:`confirm`.
 
     Args:
-        start: where the flight begins; None where that is not known.
+        start: where the flight begins; None if that is not known.
         options: those of the navigator, whose drift and gates count here, too.
     """
 

@@ -71,7 +71,7 @@ def in_order(work: Callable[[int], T], count: int, workers: int) -> Iterator[T]:
 
 
 def start_helper(work: Callable[[], None]) -> BaseProcess | None:
-    """Begin some work in a copy of this process, for its caller to end; None where such a copy is not safe."""
+    """Begin some work in a copy of this process, for its caller to end; None if such a copy is not safe."""
     if safe_count() < 2:
         return None
     with _forkable():
