@@ -15,10 +15,10 @@ _NAMES = {
     "camera_matrix": ("Camera_Matrix", "cameraMatrix", "K", "mtx"),
     "distortion_coefficients": ("Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "dist"),
 }
-"""Fields of camera_info, each with the name that OpenCV's samples and tutorials use."""
+"""Fields of camera_info, each with the names that OpenCV's samples and tutorials use."""
 _SIZES = ("image_size", "imageSize", "Image_Size", "resolution")
 _KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
-_MOST_COEFFICIENTS = 8  # after them come those of a thin prism and of a tilted sensor
+_MAX_COEFFICIENTS = 8  # after them come those of a thin prism and of a tilted sensor
 
 
 def read_calibration(path: str | Path) -> dict[str, Any]:
@@ -96,14 +96,14 @@ def _from_opencv(content: dict[str, Any]) -> dict[str, Any]:
     coefficients = _list(info.get("distortion_coefficients"))
     if "distortion_model" not in info:
         info["distortion_model"] = _model_of_opencv(content.get("fisheye_model"), len(coefficients))
-    more = coefficients[_MOST_COEFFICIENTS:]
+    more = coefficients[_MAX_COEFFICIENTS:]
     if more:
         if any(str(value).strip(" 0.+-") for value in more):
             raise CalibrationError(
                 "distortion_coefficients: expected 4, 5 or 8 numbers, got "
                 f"{len(coefficients)}, a thin prism or a tilted sensor"
             )
-        info["distortion_coefficients"] = coefficients[:_MOST_COEFFICIENTS]
+        info["distortion_coefficients"] = coefficients[:_MAX_COEFFICIENTS]
     return info
 
 

@@ -138,9 +138,9 @@ class Camera:
 
     @classmethod
     def load(cls, path: str | Path) -> Camera:
-        """Read a calibration: ROS camera_info, a file of OpenCV's or Kalibr's, with an optional ``mount``.
+        """Read a calibration file by ROS (camera_info), OpenCV or Kalibr, with an optional ``mount``.
 
-        That is 9 numbers, or a name of :data:`MOUNTS` with an optional ``camera_pitch_deg``.
+        The mount is 9 numbers, or a name of :data:`MOUNTS` with an optional ``camera_pitch_deg``.
 
         Args:
             path: see :func:`engine.calibration_files.read_calibration`.
@@ -184,7 +184,7 @@ class Camera:
             distortion = np.zeros(DISTORTION_MODELS.get(model, (5,))[-1])
         named, pitch_deg = info.get("mount", "nadir"), info.get("camera_pitch_deg")
         if not isinstance(named, str) and pitch_deg is not None:
-            raise CalibrationError("camera_pitch_deg: expected with a mount given by name, got a mount of 9 numbers")
+            raise CalibrationError("camera_pitch_deg: expected a mount by name, got one of numbers")
         if isinstance(named, str):
             mount = mount_rotation(named, None if pitch_deg is None else float(pitch_deg)).ravel()
         else:

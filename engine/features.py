@@ -29,7 +29,7 @@ from engine.sift.matching import match
 from engine.sift.scale_space import octaves_of
 from engine.sift.values import Features, Matches, SiftChoice
 
-_FARTHEST = 1e6  # of a pixel's value
+_MAX_MAGNITUDE = 1e6  # of a pixel's value
 _MAX_SPREAD = 1000
 __all__ = ["Features", "Matches", "chosen_backend", "match", "plans_created", "prepare_plans", "sift"]
 
@@ -76,7 +76,7 @@ def sift(
         max_keypoints, math.radians(up_deg) if upright else None, int(upsample), contrast_threshold, root, spread
     )
     # Sums of values far from [0, 1] may overflow, and the loops use them as indices.
-    pictures = images[:, 0].float().nan_to_num(0.0, 1.0, 0.0).clamp(-_FARTHEST, _FARTHEST)
+    pictures = images[:, 0].float().nan_to_num(0.0, 1.0, 0.0).clamp(-_MAX_MAGNITUDE, _MAX_MAGNITUDE)
     if chosen_backend(backend, images.device) == "kornia":
         return tensors.find_features(pictures, mask, choice)
     from engine.sift import loops  # numba takes a while to import

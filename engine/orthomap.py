@@ -331,7 +331,7 @@ class OrthoMap(Georeference):
     def ground_plane(self, xy_px: ArrayLike, reach_m: float) -> tuple[float, Array]:
         """The bare ground about one pixel: a plane by quantile regression, with a fifth of the surface below it.
 
-        So it is below roofs and crowns, and unlike a mere percentile not below the middle of a slope.
+        This puts it below roofs and crowns but, unlike a plain percentile, not below the middle of a slope.
 
         Args:
             xy_px: (2,) pixel of the map.
