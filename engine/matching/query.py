@@ -26,7 +26,7 @@ from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 Array = NDArray[np.float64]
 
 _AGREE_SIGMAS = 2.0  # of the telemetry's height, within which a measured one agrees with it
-_MOST_TURNED = math.radians(60.0)
+_MAX_TURNED = math.radians(60.0)
 _FOUND_HEIGHT_SHARE = 0.03  # standard deviation of a height that a search found
 _ASIDE = math.tan(math.radians(2.0))  # of an axis that is as good as vertical
 
@@ -171,7 +171,7 @@ class Query:
         if told is not None and self.telemetry.has_tilt:
             told_down = self.camera.enu_from_camera(told)[:, 2]
             turned = math.acos(min(1.0, float(told_down @ camera_down)))
-        return math.hypot(off_m * (aside + _ASIDE), measured_m * math.tan(min(turned, _MOST_TURNED)))
+        return math.hypot(off_m * (aside + _ASIDE), measured_m * math.tan(min(turned, _MAX_TURNED)))
 
     # ------------------------------------------------------------------------------- heading and height searched
 

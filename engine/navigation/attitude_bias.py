@@ -24,8 +24,8 @@ _SCATTER_SHARE = 0.2  # weight of a new difference in the mean square
 _MAX_SIGMAS = 3.0  # larger differences are clipped to this
 # Standard deviations of a tilt and of a heading if the frame does not state them.
 _ASSUMED_TILT_DEG, _ASSUMED_HEADING_DEG = 0.4, 1.0
-_LEAST_SIGMAS = 2.0  # every frame's matching allows for smaller ones
-_LEAST_FIXES = 3  # fewer are not used for correction: one of them may be wrong
+_MIN_SIGMAS = 2.0  # every frame's matching allows for smaller ones
+_MIN_FIXES = 3  # fewer are not used for correction: one of them may be wrong
 _MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
 
 
@@ -83,11 +83,11 @@ class AttitudeBias:
         """The newest frame, or a late one, without the bias; the bias's uncertainty widens its errors."""
         if frame.roll_deg is None or frame.pitch_deg is None or frame.heading_deg is None:
             return frame
-        if self._fixes < _LEAST_FIXES:
+        if self._fixes < _MIN_FIXES:
             return frame
         tilt_deg = frame.tilt_sigma_deg or _ASSUMED_TILT_DEG
         heading_deg = frame.heading_sigma_deg or _ASSUMED_HEADING_DEG
-        off = np.abs(self._mean_deg) > _LEAST_SIGMAS * np.array([tilt_deg, tilt_deg, heading_deg])
+        off = np.abs(self._mean_deg) > _MIN_SIGMAS * np.array([tilt_deg, tilt_deg, heading_deg])
         roll, pitch, heading = (self._mean_deg * off).tolist()
         wider = np.sqrt(self._variance_deg2 * off + self._scatter_deg2)
         return replace(

@@ -68,8 +68,7 @@ def new_ground_share(moved_m: float, height_m: float | None) -> float:
 def repeated_log_odds(fix: Fix, agreement: float, new_share: float) -> float:
     """What a second match of one place adds to the first.
 
-    A wrong match of repeated structure comes again, and at the same place, as long as the frame shows the same
-    ground.
+    A wrong match of repeated structure recurs at the same place as long as the frame shows the same ground.
 
     Args:
         fix: the second match.

@@ -36,7 +36,7 @@ class Match:
 
     Attributes:
         fix: the match.
-        log_odds: from the match itself and from the estimates that it agrees with or contradicts, as of a first match.
+        log_odds: as of a first match, from itself and from the estimates that it agrees with or contradicts.
         doubted: the matcher refused it.
     """
 
@@ -78,7 +78,7 @@ class Hypotheses:
 
     @property
     def pending(self) -> Hypothesis | None:
-        """The strongest hypothesis that the matcher itself supports; the search for further matches centres on it."""
+        """The strongest hypothesis that the matcher itself supports; the search centres on it."""
         vouched = [each for each in self._known if each.doubted < each.count]
         return max(vouched, key=lambda each: each.log_odds, default=None)
 

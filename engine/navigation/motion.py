@@ -194,7 +194,7 @@ class DriftModel:
     """How the error of dead reckoning grows.
 
     Attributes:
-        measured_sigma_mps: of a measured velocity. Such errors last: they grow with time, not with its square root.
+        measured_sigma_mps: of a measured velocity. Such errors last: they grow with time, not its square root.
         acceleration_mps2: the vehicle's acceleration while its velocity is not measured; its direction changes
             every second.
         max_speed_mps: speed assumed if it is unknown.

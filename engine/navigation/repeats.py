@@ -9,7 +9,7 @@ import numpy as np
 from engine.navigation.motion import OdometrySample
 from engine.values import Frame, NoFix, Reason
 
-_LEAST_M = 0.5  # a noise-free camera at rest may repeat an image
+_MIN_M = 0.5  # a noise-free camera at rest may repeat an image
 _SAMPLES = 1 << 16  # pixels of a picture that enter its digest
 
 
@@ -27,7 +27,7 @@ class Repeats:
             self._digest, self._sample = digest, now
             return None
         moved_m = float(np.hypot(*(now.moved_m - sample.moved_m)))
-        if now.blind_s != sample.blind_s or moved_m < _LEAST_M:  # movement not measured, or none
+        if now.blind_s != sample.blind_s or moved_m < _MIN_M:  # movement not measured, or none
             return None
         detail = f"the picture repeats the one {now.time_s - sample.time_s:.1f} s and {moved_m:.1f} m ago"
         return NoFix(reason=Reason.FAILED, detail=detail, timestamp_ns=frame.timestamp_ns)
