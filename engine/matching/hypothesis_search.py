@@ -27,7 +27,7 @@ from engine.values import GridPose, NoFix, Peak, Window
 Array = NDArray[np.float64]
 
 
-_MAX_COARSE_PLACES = 32_000_000  # hypotheses times places on the coarse level, unless the template becomes too small
+_MAX_COARSE_PLACES = 32_000_000  # hypotheses times places on the coarse level, unless the template gets too small
 _MAX_COARSE_PX = 4_000_000  # of the map, likewise
 _MIN_TEMPLATE_PX = 20
 _MIN_QUICK_TEMPLATE_PX = 12  # of a quick look, whose result is kept only if beyond doubt

@@ -102,7 +102,7 @@ class SceneMatcher:
         map from a file are kept for the next start. The warm-up matches frames drawn from the map.
 
         Args:
-            report: called with the number of loops compiled, or loaded from an earlier start's cache, and the total.
+            report: called with the number of loops compiled (or loaded from an earlier cache) and the total.
         """
         prepare_loops(self._method.loops, report)
         self._method.prepare()

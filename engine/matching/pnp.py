@@ -23,8 +23,8 @@ Mask = NDArray[np.bool_]
 Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
 
 _STEPS = 12  # Gauss-Newton steps at most; four or five are usual
-_STEP_SIGMAS = 2e-2  # a step this small, in standard deviations of the pose, is the last
-_PAIRS = 24  # pairs of matches that give candidate centres where the attitude is known
+_STEP_SIGMAS = 2e-2  # stop after a step this small, in standard deviations of the pose
+_PAIRS = 24  # pairs of matches that give candidate centres if the attitude is known
 _SLACK = 3.0  # factor on the tolerance at the start, for the error of a known attitude
 _REACH_SIGMAS = 4.0
 _MIN_EIGENVALUE = 1e-7  # of the correlation matrix; below it some direction is not determined
