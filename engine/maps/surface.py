@@ -16,7 +16,7 @@ from engine.values import Window
 Heights = NDArray[np.float32]
 
 GROUND_PERCENT = 20.0
-"""Percentile of the surface that is used as the level of the ground."""
+"""Percentile of the surface used as the ground level."""
 TILE_PX = 256
 """Patches of a large surface begin and end on multiples of this."""
 MAX_SPAN = 6

@@ -31,7 +31,8 @@ def judge_peak(peak: Peak, evidence: PeakEvidence, risk: float, *, is_tested: bo
     Args:
         peak: the peak.
         evidence: for it.
-        risk: allowed probability of a wrong fix. is_tested: whether the evidence was tested by the null
+        risk: allowed probability of a wrong fix.
+        is_tested: whether the evidence was tested by the null
         hypothesis.
     """
     if not peak.curvature.any():

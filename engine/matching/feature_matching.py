@@ -45,7 +45,8 @@ class Matched:
     """Points of the frame found in a view.
 
     Attributes:
-        view: the part of the map. points_px: (M, 2) pixels of the frame.
+        view: the part of the map.
+        points_px: (M, 2) pixels of the frame.
         points_m: (M, 3) metres on the ground.
         weights: (M,) relative inverse variances of the pixels.
         tolerance_px: largest reprojection distance in the frame at which a match agrees with a pose.

@@ -51,9 +51,9 @@ MIN_CORRELATION_AT_ONCE = 0.45
 By day the frames of three simulated flights reached 0.8 and more; in the evening, on a map from noon, half of them
 reached 0.6. Poses with a wrong tilt reached 0.30 to 0.35, and 0.87 as soon as the tilt was doubted.
 """
-# Tilt that may be wrong where the picture does not confirm the pose: under angles that are off by 1.5 degrees half
-# of the frames of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; under
-# right ones each was confirmed.
+# Possible tilt error if the picture does not confirm the pose: with angles off by 1.5 degrees, half of the frames
+# of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; with correct angles all
+# were confirmed.
 _UNCONFIRMED_TILT_DEG = 1.5
 # Standard deviations of an attitude that the image does not confirm.
 _DOUBTED_TILT_DEG, _DOUBTED_HEADING_DEG = 6.0, 6.0
@@ -188,7 +188,7 @@ class Refinement:
     def _through_levels(
         self, prior: GaussianPrior, coarser: int, min_correlation: float | None = None
     ) -> DenseFit | None:
-        """Refine on levels coarser than the frame's, where a few pixels reach farther; then on its own.
+        """Refine on levels coarser than the frame's, where a few pixels span more ground; then on its own.
 
         The pose must fit better than the one to begin with.
         """
