@@ -1,4 +1,4 @@
-"""Dense refinement: the camera's pose at which a picture and the map on its surface model agree best.
+"""Dense refinement: find the camera pose at which an image and the map on its surface model agree best.
 
 Gauss-Newton on grey levels: 3D samples of the map are projected into the picture, whose levels there are compared
 with the map's, up to gain and bias. Attitude and height of the telemetry, and an unknown slope of the ground,

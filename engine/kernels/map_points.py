@@ -16,13 +16,13 @@ def polynomials(points, centre, half, coefficients, out):
 
     Args:
         points: (N, 2).
-        centre: (2,) of the box where they hold.
+        centre: (2,) of their domain.
         half: (2,) half its sides.
         coefficients: (P, P, 2) of the powers of x, of y, and of which polynomial; of points in units of the box.
         out: (N, 2) takes the values.
 
     Returns:
-        Whether all points are inside the box; where not, the rest of ``out`` is undefined.
+        Whether all points are inside the box; if not, the rest of ``out`` is undefined.
     """
     last = coefficients.shape[0] - 1
     for n in range(points.shape[0]):

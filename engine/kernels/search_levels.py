@@ -18,7 +18,7 @@ MAX_HALVINGS = 3
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Part of a map prepared for matching: what does not depend on the frame. Arrays on the CPU, tensors on a GPU.
+    """Part of a map prepared for matching, independent of the frame. Arrays on the CPU, tensors on a GPU.
 
     Attributes:
         image: (H, W) float32, its mean small against its standard deviation.
@@ -38,7 +38,7 @@ class Search:
     def crop(self, x0: int, y0: int, width: int, height: int) -> Search:
         """Crop columns [x0, x0 + width) and rows [y0, y0 + height), without a copy.
 
-        The half-resolution level is kept where the crop begins on an even pixel.
+        The half-resolution level is kept if the crop begins on an even pixel.
         """
         rows, columns = slice(y0, y0 + height), slice(x0, x0 + width)
         half = None
