@@ -18,7 +18,7 @@ _NAMES = {
 """Fields of camera_info, each with the names that OpenCV's samples and tutorials use."""
 _SIZES = ("image_size", "imageSize", "Image_Size", "resolution")
 _KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
-_MAX_COEFFICIENTS = 8  # after them come those of a thin prism and of a tilted sensor
+_MAX_COEFFICIENTS = 8  # further ones describe a thin prism and a tilted sensor
 
 
 def read_calibration(path: str | Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The settings of matching and of navigation, and what is assumed if telemetry and map do not state it."""
+"""Settings of matching and navigation, and errors to assume if telemetry and map do not state them."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class NccOptions:
     Attributes:
         margin: the 1.3 of equations 4 and 5.
         fraction: size of the rectified patch relative to the frame.
-        score: what is correlated: "grey", "local", "gradient" or "mixed", see ``docs/scores.md``.
+        score: the correlated quantity: "grey", "local", "gradient" or "mixed", see ``docs/scores.md``.
         enhance_radius_px: neighbourhood of the local normalisation; 0 leaves it out. "grey" has none.
         min_valid_share: a place counts only if this share of the patch lies on valid map.
         exhaustive: score every place of the window at full resolution.
@@ -124,7 +124,7 @@ class NccOptions:
         refine: refine the pose densely after the peak, if heading and height are trusted.
         exclusion_m: rivals nearer than this are the peak itself.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
-        errors: what is assumed of the telemetry and the map.
+        errors: assumed errors of the telemetry and the map.
     """
 
     margin: float = 1.3
@@ -208,7 +208,7 @@ class SiftOptions:
             errors; a few features alone hardly separate a tilt from a displacement.
         refine: refine the pose densely after PnP, if height, heading, tilt and surface are known.
         pose: settings of PnP and RANSAC.
-        errors: what is assumed of the telemetry and the map.
+        errors: assumed errors of the telemetry and the map.
     """
 
     margin: float = 1.3
@@ -327,7 +327,7 @@ class MatcherOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NavigatorOptions:
-    """How a position is carried from frame to frame, and what is accepted; ``docs/integrity.md`` has the rules.
+    """Settings of dead reckoning between frames and of acceptance; ``docs/integrity.md`` has the rules.
 
     Attributes:
         measured_velocity_sigma_mps: standard deviation of a velocity that came with the frame.

@@ -1,7 +1,7 @@
 """NCC on the CPU: OpenCV's transforms in blocks that fit the cache, and compiled loops around them.
 
-In float32 OpenCV's transforms take as little as half of MKL's time, and less than those of ``matchTemplate``, most
-of which are in float64. Weak patches in a window of strong contrast need float64, and their blocks get it.
+In float32 OpenCV's transforms take as little as half of MKL's time, and less than ``matchTemplate``'s, which are
+mostly in float64. Blocks with weak patches in a window of strong contrast use float64.
 """
 
 from __future__ import annotations
@@ -259,13 +259,13 @@ def _scratch(name: str, shape: tuple[int, ...], kind: DTypeLike = np.float32) ->
 def transform(values: NDArray[np.floating], flags: int, rows: int) -> None:
     """Transform in place.
 
-    OpenCV hands whole pictures to IPP where it is built with it, which is three to four times as fast as its own
-    transform of a part of the rows.
+    If built with IPP, OpenCV passes whole pictures to it; that is three to four times as fast as its own transform
+    of a part of the rows.
 
     Args:
         values: (H, W) float32 or float64, or (H, W, 2) complex numbers.
         flags: of ``cv2.dft``.
-        rows: how many are not zero, or of an inverse are wanted.
+        rows: number of rows that are not zero, or for an inverse that are wanted.
     """
     cv2.dft(values, values, flags, 0 if _uses_ipp() else rows)
 

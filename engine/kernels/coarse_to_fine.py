@@ -1,12 +1,12 @@
 """The peak of one template coarse to fine: all positions at reduced resolution, the best few at full resolution.
 
-The error of the coarse scores is bounded by twice the largest error at the refined positions, and by at least what
-a match between coarse pixels loses. Where that bound does not exclude every other position, all of them have to be
-scored at full resolution; unless the window is wide and a :class:`QuickLook` already decides about the frame.
+The error bound of the coarse scores is twice the largest error at the refined positions, and at least the loss of
+a match between coarse pixels. If that bound does not exclude every other position, all must be scored at full
+resolution, unless the window is wide and a :class:`QuickLook` already decides about the frame.
 
-On a coarse level nodata is 0 in a picture about its mean, and costs positions that are mostly on the map little:
-their scores are divided by the share that is on the map, which makes up for that and more, where the template's
-contrast is spread evenly. At full resolution nodata is left out of all sums.
+On a coarse level nodata is 0 in a picture with zero mean, and hardly lowers positions that are mostly on the map:
+their scores are divided by the share on the map, which more than compensates if the template's contrast is spread
+evenly. At full resolution nodata is left out of all sums.
 """
 
 from __future__ import annotations
@@ -110,8 +110,8 @@ def peak(
         quick: which peaks of a wide window to keep beyond the certain ones.
 
     Returns:
-        Peak | None: as :func:`engine.kernels.peaks.find_peak`, the second score being that of a coarse level where
-        that is higher than the refined rivals; None if positions elsewhere are not excluded.
+        Peak | None: as :func:`engine.kernels.peaks.find_peak`, but the second score is a coarse level's if that is
+        higher than the refined rivals; None if positions elsewhere are not excluded.
     """
     wide = quick is not None and is_wide(search)
     levels = _levels(search, template, min_overlap, _MAX_LOSS if wide else 1.0)

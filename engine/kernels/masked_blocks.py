@@ -1,7 +1,7 @@
 """Masked NCC on the CPU for whole templates: positions wholly on valid pixels are scored without a mask.
 
-Only where a template reaches over the mask's edge are the sums of :mod:`engine.kernels.masked_tensors` needed. Of
-their six correlations a template without a mask leaves three; the others are sums over boxes.
+The sums of :mod:`engine.kernels.masked_tensors` are needed only where a template crosses the mask's edge. A
+template without a mask needs three of their six correlations; the others are sums over boxes.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from engine.kernels.transform_sizes import FLAT_SHARE
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_SMALL_PX = 1 << 17  # windows up to this size are scored without division
+_SMALL_PX = 1 << 17  # windows up to this size are neither split nor scored in two ways
 _DIVISIONS = (1, 2, 3, 4, 6, 8, 12, 16)  # of a surface along each axis
-_SHARED = 0.4  # of the transforms of a block: those of the template, and the memory that is touched
-_MAX_CACHED_PX = 1 << 21  # transforms of more cost half as much again per pixel
+_SHARED = 0.4  # share of a block's cost: transforms of the template, and memory access
+_MAX_CACHED_PX = 1 << 21  # larger transforms cost 50 % more per pixel
 
 
 class _Model(NamedTuple):

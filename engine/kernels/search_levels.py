@@ -26,8 +26,8 @@ class Search:
             None on the coarsest level.
         sums: (2, H+1, W+1) float64 running sums of the picture and of its square on a GPU; None on the CPU, where
             the sums of a window take one pass.
-        counts: (H+1, W+1) int32 running sums of its valid pixels, of which the others are 0 in the picture; None
-            where all are valid, on a GPU, and at half resolution.
+        counts: (H+1, W+1) int32 running sums of its valid pixels; invalid ones are 0 in the picture. None if all
+            are valid, on a GPU, and at half resolution.
     """
 
     image: Picture

@@ -167,7 +167,7 @@ def shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], Ar
         scale: size on the ground of the picture's pixel over the map's.
 
     Returns:
-        The picture (h, w), ``gray`` itself where it is not much finer; and the homography (3, 3) from pixels of
+        The picture (h, w), ``gray`` itself if it is not much finer; and the homography (3, 3) from pixels of
         ``gray`` to its pixels.
     """
     if scale >= _MAX_SHRINK:

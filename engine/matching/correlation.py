@@ -308,7 +308,7 @@ def _about(quick: QuickLook, window: Window) -> QuickLook:
 def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:
     """Expected pixels of the window per level above the frame's own; the cost is proportional to them."""
     site, camera, height_m = query.site, query.camera, query.telemetry.height_agl_m
-    assert height_m is not None  # asked for before
+    assert height_m is not None  # checked before
     assert query.prior is not None
     own = query.level_of(height_m)
     out = {}

@@ -26,7 +26,7 @@ RELIABILITY = 0.99
 _SEARCHED = (2.0 * SPREAD_SIGMAS) ** 2 / (2.0 * math.pi)
 """Area of a window over that of the prior's Gaussian: how much more probable its middle is than other places."""
 _MAX_NATS = 30.0  # above it a probability is 1 to the last digit
-_PLACE_PX = 4.0  # side of the area whose scores are one place's: an enhanced picture changes over so many pixels
+_PLACE_PX = 4.0  # side of the area that counts as one place: enhanced pictures vary on this scale
 
 
 @dataclass(frozen=True, slots=True)

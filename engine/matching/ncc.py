@@ -92,7 +92,7 @@ class Ncc(Method):
         self.locate(query if query.prior is None else doubted)
 
     def locate(self, query: Query) -> Result:
-        """A fix on the finest level of the map that there is time for, refined where there is time for that."""
+        """A fix on the finest level of the map that time allows, refined if time remains."""
         return self.refine(query, self.begin(query))
 
     def begin(self, query: Query, *, try_turns: bool = True) -> Result:

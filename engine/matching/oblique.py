@@ -96,7 +96,7 @@ def largest_rectangle(valid: Mask) -> Window:
         valid: (H, W).
 
     Returns:
-        Window: empty where there is none.
+        Window: empty if there is none.
     """
     step = max(1, max(valid.shape) // _CELLS)
     rows, columns = (n // step for n in valid.shape)

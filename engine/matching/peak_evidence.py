@@ -151,7 +151,7 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
     query, pose = correlator.query, aligned.pose
     errors = query.errors(correlator.options.errors)
     height_m = pose.height_agl_m
-    assert height_m is not None  # asked for before
+    assert height_m is not None  # checked before
     rows, columns = aligned.template.shape
     peak_px2 = peak_covariance_px(peak, rows * columns)
     peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), height_m, errors)

@@ -140,7 +140,7 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
 
 
 def _templates(correlator: Correlator, aligned: Aligned, *, null: bool) -> FloatImage:
-    """Channels (3, T, h, w) of the frame, and of the null-hypothesis templates if asked for."""
+    """Channels (3, T, h, w) of the frame, and of the null-hypothesis templates if requested."""
     patches = [aligned.patch.gray, *(correlator.nowhere(aligned) if null else [])]
     radius_px = correlator.options.enhance_radius_px
     return np.stack([_channels(patch, radius_px, None) for patch in patches], axis=1)

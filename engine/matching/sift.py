@@ -104,7 +104,7 @@ class Sift(Method):
     def locate(self, query: Query) -> Result:
         """A refined fix by few features, else one by all at the highest resolution that time allows.
 
-        Few features take a fifth of the time, and refinement makes up for what their pose lacks in accuracy.
+        Few features take a fifth of the time, and refinement restores the accuracy that their pose lacks.
         """
         few = self._by_few_features(query)
         if few is None:

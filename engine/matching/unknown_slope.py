@@ -29,7 +29,7 @@ _WIDTHS = (0.175, 0.35, 0.7, 1.4)
 # 98 % of poses agreed to this share of the height (the peak is as inexact), over hills of 8 to 30 m 19 to 33 %.
 _MAX_APART_SHARE = 0.0067
 _MAX_DEG = 20.0  # of the assumed slope: twice as steep is a wall
-_REACH_SHARE = 1.0  # of the height: ground that slopes by so much rises or falls by that times its slope beside it
+_REACH_SHARE = 1.0  # of the height: sloping ground nearby rises or falls by this distance times its slope
 
 
 @dataclass(frozen=True, slots=True)

@@ -116,7 +116,7 @@ class Sources:
     searched: PositionEstimate | None = None
     prior: Prior | None = None
 
-    def vouching(
+    def evidence_of(
         self, estimate: PositionEstimate | None, fix: Fix, window_m2: float, gate: float, trusted_sigma_m: float
     ) -> float:
         """What an estimate adds to the log-odds of a match.

@@ -79,8 +79,8 @@ class Hypotheses:
     @property
     def pending(self) -> Hypothesis | None:
         """The strongest hypothesis that the matcher itself supports; the search centres on it."""
-        vouched = [each for each in self._known if each.doubted < each.count]
-        return max(vouched, key=lambda each: each.log_odds, default=None)
+        supported = [each for each in self._known if each.doubted < each.count]
+        return max(supported, key=lambda each: each.log_odds, default=None)
 
     def clear(self) -> None:
         """Forget all of them."""

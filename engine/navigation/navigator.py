@@ -287,7 +287,7 @@ class Navigator:
             self._forget_way(now)
             sources = replace(sources, own=self._reckoned(now), pending=None)
         required, against = self._options.min_log_odds, self._against(fix, now)
-        own, given = (self._vouching(source, fix, sources) for source in (sources.own, sources.given))
+        own, given = (self._evidence_of(source, fix, sources) for source in (sources.own, sources.given))
         disputed = given < 0.0
         if self._anchor is not None and self._anchor.disputed:
             given = 0.0  # an error of the other source lasts: ignore it until it agrees again
@@ -324,10 +324,10 @@ class Navigator:
             return fix
         return replace(fix, confidence=probability(min(found.log_odds, log_odds(MAX_PROBABILITY))))
 
-    def _vouching(self, estimate: PositionEstimate | None, fix: Fix, sources: Sources) -> float:
+    def _evidence_of(self, estimate: PositionEstimate | None, fix: Fix, sources: Sources) -> float:
         """What an estimate adds to the log-odds of a match."""
         options = self._options
-        return sources.vouching(estimate, fix, self._map_m2(fix), options.gate, options.trusted_sigma_m)
+        return sources.evidence_of(estimate, fix, self._map_m2(fix), options.gate, options.trusted_sigma_m)
 
     def _map_m2(self, fix: Fix) -> float:  # area of the window
         return float(fix.window.area_px * self._matcher.site.gsd_m_per_px**2)

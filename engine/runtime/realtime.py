@@ -205,7 +205,7 @@ def _use_fifo(priority: int) -> None:
             raise BackendError(f"realtime: this system has no SCHED_FIFO: {error.strerror}") from None
         where = ""
         if os.geteuid() == 0:  # the kernel has RT_GROUP_SCHED
-            where = "; root may where the control group has real time (cpu.rt_runtime_us)"
+            where = "; root may if its control group has real-time budget (cpu.rt_runtime_us)"
         raise BackendError(f"realtime: SCHED_FIFO is not permitted; it needs {_FIFO_CURE}{where}") from None
 
 

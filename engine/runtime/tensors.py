@@ -57,7 +57,7 @@ def download(tensors: Sequence[Tensor]) -> list[AnyArray]:
 
 
 def _packed(tensors: Sequence[Tensor]) -> Tensor:
-    """The bytes of tensors, each beginning on a multiple of what the largest element needs."""
+    """The bytes of tensors, each aligned for the largest element."""
     parts = [tensor.contiguous().view(-1).view(torch.uint8) for tensor in tensors]
     return torch.cat([functional.pad(part, (0, -len(part) % _ALIGNMENT)) for part in parts])
 

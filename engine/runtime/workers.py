@@ -139,7 +139,7 @@ def _start(work: Callable[[int], Any], started: _Workers) -> None:
 
 def _serve(work: Callable[[int], Any], pipe: Connection, inherited: list[Connection]) -> None:
     """The worker's process: tasks in, results out, until its parent ends it or is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is asked, and ends us
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and ends us
     for end in inherited:
         end.close()
     try:
