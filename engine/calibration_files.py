@@ -134,7 +134,7 @@ def _from_kalibr(content: dict[str, Any]) -> dict[str, Any]:
     names = _cameras(content)
     if len(names) > 1:
         raise CalibrationError(
-            f"expected one camera, got {', '.join(names)}: keep only the block of the downward camera"
+            f"expected one camera, got {', '.join(names)}: keep the block of the downward camera"
         )
     block = content[names[0]]
     kind, model = block.get("camera_model", "pinhole"), str(block.get("distortion_model", "none"))

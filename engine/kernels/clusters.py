@@ -14,7 +14,7 @@ _REACH = 2  # cells to either side counted with each cell
 
 @compiled("(f8[:, ::1], f8)")
 def densest(points, radius):
-    """Mark the points within a radius of the place about which most lie.
+    """Mark the points within a radius of the place with the most points.
 
     The fullest 5 x 5 cells of a histogram, whose cells are half a radius wide, give the place nearly; from there
     the mean of the points within the radius is followed.
@@ -46,7 +46,7 @@ def densest(points, radius):
 
 @inlined
 def _mark_near(points, x, y, radius, near):
-    """Mark the points within a radius of a place; how many there are, and their mean."""
+    """Mark the points within a radius of a place; return their number and mean."""
     held, east, north = 0, 0.0, 0.0
     for n in range(len(points)):
         off_x, off_y = points[n, 0] - x, points[n, 1] - y

@@ -36,7 +36,7 @@ _MAX_LOSS = 0.5  # of a perfect match between pixels, on the coarsest level usab
 
 @dataclass(frozen=True, slots=True)
 class QuickLook:
-    """Which peaks of a wide window are kept although not every position was scored at full resolution.
+    """Which peaks of a wide window to keep although not every position was scored at full resolution.
 
     Attributes:
         is_clear: whether a peak holds even if its rival is as high as the coarse scores allow elsewhere.
@@ -78,7 +78,7 @@ class _Levels:
 
     @property
     def loss(self) -> float:
-        """What a perfect match loses at most between the coarsest level's pixels."""
+        """The most that a perfect match loses between the coarsest level's pixels."""
         return _phase_loss(self.models[-2], self.models[-1])
 
     @property
@@ -173,7 +173,7 @@ def best_places(
 
 
 def _levels(search: Search, template: FloatImage, min_overlap: float, max_loss: float) -> _Levels | None:
-    """The levels on which there is something to gain, or None if the finest is the only one.
+    """The levels worth searching, or None if that is only the finest.
 
     Args:
         search: the window.

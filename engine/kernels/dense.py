@@ -175,7 +175,7 @@ def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> floa
 
 
 def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: GaussianPrior) -> DenseFit | None:
-    """Gauss-Newton from a start whose reprojection is off by a few pixels at most.
+    """Gauss-Newton from a start with a reprojection error of at most a few pixels.
 
     Args:
         picture: of the camera.

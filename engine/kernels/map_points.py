@@ -1,6 +1,6 @@
 """Points of a map: polynomials of its georeference and bilinear heights, compiled by numba.
 
-One point costs a microsecond and not the thirty of as many NumPy calls; a frame asks for some dozens.
+One point costs a microsecond instead of thirty by NumPy calls; a frame needs some dozens.
 """
 
 from __future__ import annotations
