@@ -1,4 +1,4 @@
-"""scenematch: position fixes from a downward camera and a georeferenced map, where GNSS is gone."""
+"""scenematch: position fixes without GNSS, from a downward camera and a georeferenced map."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -103,7 +103,7 @@ _NAMES = {
 
 _imported = imported_on_use(__name__, _NAMES)
 
-if not TYPE_CHECKING:  # checkers of types know the names above, and refuse others
+if not TYPE_CHECKING:  # type checkers see the names above and reject others
 
     def __getattr__(name: str) -> Any:
         if name in ("features", "ncc_fft"):  # public modules

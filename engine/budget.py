@@ -14,11 +14,11 @@ _SPENT_MS = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Budget:
-    """Milliseconds that one frame may take from call to answer; infinite by default.
+    """Milliseconds that one frame may take, from call to answer; unlimited by default.
 
     Attributes:
         total_ms: of a frame with a prior.
-        search_ms: of a frame that searches the whole map, for it has no prior, or headings and heights
+        search_ms: of a frame that searches the whole map, because it has no prior, or headings and heights
             (:attr:`engine.Frame.is_doubted`); None is ``total_ms``.
 
     Raises:
@@ -35,7 +35,7 @@ class Budget:
                 raise OptionError(f"{name}: expected more than 0 ms, got {value}")
 
     def after(self, elapsed_ms: float) -> Budget:
-        """What is left after so many milliseconds; of a spent one too little for any answer."""
+        """The budget left after so many milliseconds; once spent, too little for any answer."""
         search_ms = None if self.search_ms is None else max(self.search_ms - elapsed_ms, _SPENT_MS)
         return Budget(total_ms=max(self.total_ms - elapsed_ms, _SPENT_MS), search_ms=search_ms)
 

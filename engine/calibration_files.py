@@ -1,4 +1,4 @@
-"""Calibration files: ROS camera_info, what OpenCV writes (YAML, XML, JSON), Kalibr's camchain, as one mapping."""
+"""Calibration files of ROS (camera_info), OpenCV (YAML, XML, JSON) and Kalibr (camchain), read as one mapping."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _NAMES = {
     "camera_matrix": ("Camera_Matrix", "cameraMatrix", "K", "mtx"),
     "distortion_coefficients": ("Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "dist"),
 }
-"""Of camera_info, with what OpenCV's samples and tutorials write in their place."""
+"""Fields of camera_info, each with the names that OpenCV's samples and tutorials use."""
 _SIZES = ("image_size", "imageSize", "Image_Size", "resolution")
 _KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
-_MOST_COEFFICIENTS = 8  # after them come those of a thin prism and of a tilted sensor
+_MAX_COEFFICIENTS = 8  # further ones describe a thin prism and a tilted sensor
 
 
 def read_calibration(path: str | Path) -> dict[str, Any]:
@@ -28,7 +28,7 @@ def read_calibration(path: str | Path) -> dict[str, Any]:
         path: a ROS camera_info YAML file; YAML, XML or JSON of OpenCV's FileStorage; or Kalibr's camchain.
 
     Returns:
-        The fields by camera_info's names; what the file lacks is missing, others stay as they are.
+        The fields by camera_info's names; fields that the file lacks are missing, others stay unchanged.
 
     Raises:
         CalibrationError: the file is missing, in none of these formats, or of several cameras.
@@ -65,12 +65,12 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def _plain_yaml(text: str) -> str:
-    """Without the first line of OpenCV's, ``%YAML:1.0``, which is not YAML's own directive."""
+    """Drop OpenCV's first line ``%YAML:1.0``, which is not a valid YAML directive."""
     return text.split("\n", 1)[1] if text.startswith("%YAML:") and "\n" in text else text
 
 
 def _from_xml(text: str) -> Any:
-    """Elements as a mapping: text is a number or a word, that of a matrix's ``data`` a list of numbers."""
+    """Elements as a mapping: text becomes a number or a word, a matrix's ``data`` a list of numbers."""
     from xml.etree import ElementTree
 
     def value(element: ElementTree.Element) -> Any:
@@ -96,19 +96,19 @@ def _from_opencv(content: dict[str, Any]) -> dict[str, Any]:
     coefficients = _list(info.get("distortion_coefficients"))
     if "distortion_model" not in info:
         info["distortion_model"] = _model_of_opencv(content.get("fisheye_model"), len(coefficients))
-    more = coefficients[_MOST_COEFFICIENTS:]
+    more = coefficients[_MAX_COEFFICIENTS:]
     if more:
         if any(str(value).strip(" 0.+-") for value in more):
             raise CalibrationError(
                 "distortion_coefficients: expected 4, 5 or 8 numbers, got "
                 f"{len(coefficients)}, a thin prism or a tilted sensor"
             )
-        info["distortion_coefficients"] = coefficients[:_MOST_COEFFICIENTS]
+        info["distortion_coefficients"] = coefficients[:_MAX_COEFFICIENTS]
     return info
 
 
 def _list(value: Any) -> list[Any]:
-    """The numbers of a matrix or a list, (1, N) or (N, 1) as one."""
+    """The numbers of a matrix or a list; (1, N) and (N, 1) become one list."""
     if isinstance(value, dict):
         value = value.get("data")
     if not isinstance(value, list):
@@ -134,7 +134,7 @@ def _from_kalibr(content: dict[str, Any]) -> dict[str, Any]:
     names = _cameras(content)
     if len(names) > 1:
         raise CalibrationError(
-            f"expected one camera, got {', '.join(names)}: keep the block of the one that looks down"
+            f"expected one camera, got {', '.join(names)}: keep the block of the downward camera"
         )
     block = content[names[0]]
     kind, model = block.get("camera_model", "pinhole"), str(block.get("distortion_model", "none"))

@@ -1,4 +1,4 @@
-"""The camera: pinhole intrinsics, lens distortion, and how it is mounted on the body.
+"""The camera: pinhole intrinsics, lens distortion and mount on the body.
 
 Convention:
     Pixels (x, y) have their centres at integers, the origin at the centre of the top-left pixel (as in OpenCV).
@@ -37,17 +37,17 @@ MOUNTS = {
     "nadir-left": (270.0, NADIR_PITCH_DEG),
     "forward-45": (0.0, -45.0),
 }
-"""Mounts by name: the side of the vehicle, clockwise from the nose, to which the top of the picture points in a
-camera that looks down, and the pitch; both in degrees."""
+"""Mounts by name, each two angles in degrees: the side of the vehicle, clockwise from the nose, to which the top
+of the picture points if the camera looks down; and the pitch."""
 
 
 def mount_rotation(name: str = "nadir", pitch_deg: float | None = None) -> Array:
-    """Rotation from the optical frame to the body of a camera that is mounted as a name says.
+    """Rotation from the optical frame to the body, for a mount by name.
 
     Args:
         name: a key of :data:`MOUNTS`.
-        pitch_deg: of the optical axis against the body's horizontal: -90 looks straight down, -60 is turned up
-            from there by 30 degrees towards the side to which the top of the picture pointed. None is the name's.
+        pitch_deg: pitch of the optical axis from the body's horizontal: -90 looks straight down, -60 is turned up
+            by 30 degrees towards the side to which the top of the picture points. None takes the name's.
 
     Returns:
         (3, 3) v_body = mount @ v_camera.
@@ -88,7 +88,7 @@ class Camera:
         mount: (3, 3) rotation, v_body = mount @ v_camera.
 
     Raises:
-        CalibrationError: a field is of the wrong shape, not finite, or not a rotation.
+        CalibrationError: a field has the wrong shape, is not finite, or is not a rotation.
     """
 
     width_px: int
@@ -138,9 +138,9 @@ class Camera:
 
     @classmethod
     def load(cls, path: str | Path) -> Camera:
-        """Read a calibration: ROS camera_info, a file of OpenCV's or Kalibr's, with an optional ``mount``.
+        """Read a calibration file by ROS (camera_info), OpenCV or Kalibr, with an optional ``mount``.
 
-        That is 9 numbers, or a name of :data:`MOUNTS` with an optional ``camera_pitch_deg``.
+        The mount is 9 numbers, or a name of :data:`MOUNTS` with an optional ``camera_pitch_deg``.
 
         Args:
             path: see :func:`engine.calibration_files.read_calibration`.
@@ -184,7 +184,7 @@ class Camera:
             distortion = np.zeros(DISTORTION_MODELS.get(model, (5,))[-1])
         named, pitch_deg = info.get("mount", "nadir"), info.get("camera_pitch_deg")
         if not isinstance(named, str) and pitch_deg is not None:
-            raise CalibrationError("camera_pitch_deg: expected with a mount by name, got one of numbers")
+            raise CalibrationError("camera_pitch_deg: expected a mount by name, got one of numbers")
         if isinstance(named, str):
             mount = mount_rotation(named, None if pitch_deg is None else float(pitch_deg)).ravel()
         else:
@@ -201,21 +201,21 @@ class Camera:
         )
 
     def scaled_to(self, width_px: int, height_px: int) -> Camera:
-        """The same camera with its pictures made smaller or larger as a whole, without a part cut off.
+        """The same camera with its pictures resized as a whole, without cropping.
 
-        The edges of the frame stay where they are, which are half a pixel outside the outer pixels' centres.
+        The frame's edges stay in place: half a pixel outside the centres of the outer pixels.
 
         Args:
             width_px: columns of the pictures.
             height_px: rows.
 
         Raises:
-            CalibrationError: the pictures are of another shape than the calibrated ones.
+            CalibrationError: the aspect ratio differs from the calibrated one.
         """
         across, down = width_px / self.width_px, height_px / self.height_px
         if min(abs(height_px - across * self.height_px), abs(width_px - down * self.width_px)) > 1.0:
             raise CalibrationError(
-                f"camera: calibrated for {self.width_px} x {self.height_px}, expected pictures of that shape to "
+                f"camera: calibrated for {self.width_px} x {self.height_px}, expected that aspect ratio to "
                 f"scale it to, got {width_px} x {height_px}: a part may have been cut off"
             )
         matrix = np.diag([across, down, 1.0]) @ self.matrix
@@ -231,7 +231,7 @@ class Camera:
         """Rotation from the camera's axes to east, north, up.
 
         Args:
-            attitude: of the body, its heading from the north that is meant.
+            attitude: of the body; its heading counts from the north of the result.
 
         Returns:
             (3, 3) v_enu = R v_camera.
@@ -248,7 +248,7 @@ class Camera:
 
     @cached_property
     def border_rays(self) -> Array:
-        """(N, 3) optical rays through the border of the frame, and last the one through its middle."""
+        """(N, 3) optical rays through the border of the frame; the last goes through its middle."""
         share = np.linspace(0.0, 1.0, _BORDER_RAYS, endpoint=False)
         zero, one = np.zeros_like(share), np.ones_like(share)
         sides = [(share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share)]
@@ -276,7 +276,7 @@ class Camera:
         return maps
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture that a pinhole camera of the same matrix would have taken.
+        """The picture that a pinhole camera with the same matrix would have taken.
 
         The lookup table is computed once per camera.
 
@@ -284,7 +284,7 @@ class Camera:
             image: (H, W) or (H, W, 3).
 
         Returns:
-            The same shape, 0 outside the lens's field of view; ``image`` itself where there is no distortion.
+            The same shape, 0 outside the lens's field of view; ``image`` itself if there is no distortion.
 
         Raises:
             CalibrationError: the picture's size is not the camera's.
@@ -298,13 +298,13 @@ class Camera:
         return np.asarray(undistorted, dtype=np.uint8)
 
     def undistort_points(self, xy_px: Array) -> Array:
-        """Places on the plane one ahead of the lens, on which a pinhole camera of matrix 1 has its pixels.
+        """Normalised image coordinates: where the pixels' rays meet the plane z = 1.
 
         Args:
             xy_px: (N, 2) pixels of pictures as they were taken.
 
         Returns:
-            (N, 2) x and y over z of the rays that the pixels see.
+            (N, 2) x / z and y / z of the pixels' rays.
         """
         import cv2
 
@@ -318,7 +318,7 @@ class Camera:
         return np.asarray(flat, np.float64)[:, 0]
 
     def check_size(self, shape: tuple[int, ...]) -> None:
-        """Refuse a picture of another resolution than the calibration's.
+        """Refuse a picture whose resolution differs from the calibration's.
 
         Raises:
             CalibrationError: the sizes differ.

@@ -6,7 +6,7 @@
     ├── ShapeError        (ValueError)  an array of the wrong shape
     ├── DtypeError        (TypeError)   an array of the wrong element type
     ├── OptionError       (ValueError)  an option or argument outside its range, or an unknown name
-    ├── DeviceError                     a device that was asked for and is not there
+    ├── DeviceError                     a device that was requested but is missing
     ├── MapError                        a map or surface model that cannot be read or placed on the Earth
     ├── CalibrationError                a camera file that cannot be read, or does not fit its frames
     ├── TelemetryError                  telemetry, truth or frames that cannot be read or contradict each other
@@ -14,8 +14,8 @@
     └── BackendError                    something outside the engine that could not do its work
         └── MissingExtraError           a package of an extra that is not installed
 
-A message is one line and names the argument, what was expected and what came.
-A frame that cannot be matched is no error: it is the value :class:`engine.values.NoFix`.
+A message is one line and names the argument, what was expected and what it got.
+A frame that cannot be matched is not an error: the result is :class:`engine.values.NoFix`.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class BackendError(EngineError):
 
 
 class MissingExtraError(BackendError):
-    """A package that an extra of the distribution brings is not installed."""
+    """A package from an extra of the distribution is not installed."""
 
 
 def require(module: str, extra: str, package: str | None = None) -> Any:
@@ -73,8 +73,8 @@ def require(module: str, extra: str, package: str | None = None) -> Any:
 
     Args:
         module: its full name.
-        extra: of the distribution that brings it.
-        package: that holds it, where that is not the part of the module's name before its first dot.
+        extra: of the distribution that installs it.
+        package: that contains it, if it differs from the module's name before its first dot.
 
     Returns:
         The module.

@@ -29,7 +29,7 @@ from engine.sift.matching import match
 from engine.sift.scale_space import octaves_of
 from engine.sift.values import Features, Matches, SiftChoice
 
-_FARTHEST = 1e6  # of a pixel's value
+_MAX_MAGNITUDE = 1e6  # of a pixel's value
 _MAX_SPREAD = 1000
 __all__ = ["Features", "Matches", "chosen_backend", "match", "plans_created", "prepare_plans", "sift"]
 
@@ -54,13 +54,13 @@ def sift(
         max_keypoints: Number of slots N.
         backend: "compiled" loops (CPU) or "kornia" (any device); "auto" takes the first on a CPU, else the second.
         upright: Use ``up_deg`` as every angle instead of the dominant gradient's; faster, for a known heading.
-        up_deg: From +x towards +y; that of two pictures must differ by the rotation between them.
+        up_deg: From +x towards +y; the angles of two pictures must differ by the rotation between them.
         mask: (B, 1, H, W) bool, True where keypoints are allowed.
         upsample: Samples per image pixel of the first octave: 1, or 2. The scales are the same. kornia's: 2.
         contrast_threshold: Lowe's, as OpenCV counts it: a keypoint's DoG is at least a third of it.
         root: Return RootSIFT (square roots of the L1-normalised descriptor), also of unit L2 norm.
         spread: Cells along each side of the image; keypoints beyond a cell's double share rank after all others. 1
-            ranks by strength alone, which is contrast times the root of scale.
+            ranks by strength alone: contrast times the square root of scale.
 
     Returns:
         Features on the images' device; no value is NaN.
@@ -75,8 +75,8 @@ def sift(
     choice = SiftChoice(
         max_keypoints, math.radians(up_deg) if upright else None, int(upsample), contrast_threshold, root, spread
     )
-    # Sums of what is not near [0, 1] may overflow, and the loops index by them.
-    pictures = images[:, 0].float().nan_to_num(0.0, 1.0, 0.0).clamp(-_FARTHEST, _FARTHEST)
+    # Sums of values far from [0, 1] may overflow, and the loops use them as indices.
+    pictures = images[:, 0].float().nan_to_num(0.0, 1.0, 0.0).clamp(-_MAX_MAGNITUDE, _MAX_MAGNITUDE)
     if chosen_backend(backend, images.device) == "kornia":
         return tensors.find_features(pictures, mask, choice)
     from engine.sift import loops  # numba takes a while to import
@@ -107,7 +107,7 @@ def chosen_backend(backend: str, device: torch.device) -> str:
 
 
 def prepare_plans(sides_px: Iterable[int]) -> None:
-    """Compute the compiled backend's filters of pictures whose sides are among these, so that none is in flight.
+    """Compute the compiled backend's filters for pictures with these sides, so that none is computed in flight.
 
     Args:
         sides_px: of the pictures.

@@ -22,11 +22,11 @@ WGS84_A_M = 6378137.0
 """Semi-major axis of the WGS84 ellipsoid (NIMA TR8350.2)."""
 WGS84_E2 = 6.69437999014e-3
 """First eccentricity squared of the WGS84 ellipsoid."""
-_SINGULAR = 1e-12  # a determinant over that of the diagonal, below which rounding makes the difference
+_SINGULAR = 1e-12  # determinant over that of the diagonal; below it rounding dominates
 
 
 def ecef_from_geodetic(lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLike = 0.0) -> Array:
-    """Earth-centred, Earth-fixed coordinates of geodetic ones.
+    """Earth-centred, Earth-fixed coordinates from geodetic ones.
 
     Args:
         lat_deg: (...,) WGS84 latitude.
@@ -46,7 +46,7 @@ def ecef_from_geodetic(lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLi
 
 
 def geodetic_from_ecef(ecef_m: Array) -> tuple[Array, Array, Array]:
-    """Geodetic coordinates of Earth-centred ones.
+    """Geodetic coordinates from Earth-centred, Earth-fixed ones.
 
     Fixed-point iteration on the latitude; after five rounds the error near the ground is below a nanometre.
 
@@ -113,8 +113,8 @@ class LocalFrame:
     def convergence_deg(self, lat_deg: float, lon_deg: float) -> float:
         """Direction of true north at a position, clockwise from this frame's north, in [-180, 180].
 
-        A heading in these axes is the true heading plus this. It is 0 at the origin; east of it about the negative
-        sine of latitude times the difference of longitude.
+        A heading in these axes is the true heading plus this. It is 0 at the origin; elsewhere it is about the
+        longitude difference times the negative sine of latitude.
 
         Args:
             lat_deg: of the position.
@@ -166,7 +166,7 @@ def enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Arra
     return _enu_from_body(roll_deg, pitch_deg, heading_deg).copy()
 
 
-@lru_cache(maxsize=16)  # the steps of a frame ask for the same one
+@lru_cache(maxsize=16)  # the steps of one frame share it
 def _enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Array:
     sr, sp, sh = (math.sin(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
     cr, cp, ch = (math.cos(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
@@ -250,12 +250,12 @@ def chi_square(difference: Array, covariance: Array) -> float:
         covariance: (2, 2) of the difference, positive semidefinite.
 
     Returns:
-        0 or more; infinite for a difference in a direction in which the covariance allows none.
+        0 or more; infinite for a difference along a direction in which the covariance is zero.
     """
-    (a, b), (c, d) = covariance.tolist()  # a tenth of the time of NumPy's solver
+    (a, b), (c, d) = covariance.tolist()  # ten times as fast as NumPy's solver
     x, y = difference.tolist()
     across, determinant = d * x * x - (b + c) * x * y + a * y * y, a * d - b * c
-    if determinant <= _SINGULAR * a * d:  # what lies along the one direction that it allows, if any
+    if determinant <= _SINGULAR * a * d:  # only a difference along its one direction, if any, is finite
         allowed, squared = a + d, x * x + y * y
         if across > _SINGULAR * allowed * squared or squared > 0.0 >= allowed:
             return math.inf
@@ -264,10 +264,10 @@ def chi_square(difference: Array, covariance: Array) -> float:
 
 
 def inverse_2x2(matrix: Array) -> Array:
-    """The inverse of a small matrix, in a tenth of the time of NumPy's.
+    """The inverse of a 2 x 2 matrix, ten times as fast as NumPy's.
 
     Args:
-        matrix: (2, 2), of a determinant that is not 0.
+        matrix: (2, 2) with a non-zero determinant.
 
     Returns:
         (2, 2).

@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 FloatImage = NDArray[np.float32]
-Given = TypeVar("Given", NDArray[Any], "Tensor")  # answers are of the kind of what is asked about
+Given = TypeVar("Given", NDArray[Any], "Tensor")  # the result has the same kind as the inputs
 
 _TYPES = ("uint8", "int16", "uint16", "int32", "float16", "float32", "float64")
 _DOUBLE = ("float64", "int32")  # float32 would round these
@@ -54,7 +54,7 @@ def ncc(
 ) -> Given:
     """Scores in [-1, 1]: normalised cross-correlation of templates with every position in a window.
 
-    All arguments are tensors, or all are arrays. What is on the CPU is computed without torch, but for float64.
+    All arguments are tensors, or all are arrays. On the CPU torch is used only for float64.
 
     Args:
         search: (B, H, W), any of uint8, int16, uint16, int32, float16, float32, float64.
@@ -67,7 +67,7 @@ def ncc(
 
     Returns:
         (B, T, H-h+1, W-w+1), float64 if either input is float64, else float32. A perfect match scores 1, an
-        inverted one -1; where patch or template is flat the score is 0, never NaN.
+        inverted one -1; if patch or template is flat the score is 0, never NaN.
 
     Raises:
         ShapeError: the shapes do not fit each other.
@@ -79,7 +79,7 @@ def ncc(
     if search_valid is not None or templates_valid is not None:
         masks = _mask("search_valid", search, search_valid), _mask("templates_valid", templates, templates_valid)
         if not zero_mean:
-            raise OptionError("zero_mean: expected True where masks are given, got False")
+            raise OptionError("zero_mean: expected True with masks, got False")
         if not 0.0 < min_overlap <= 1.0:
             raise OptionError(f"min_overlap: expected above 0 and at most 1, got {min_overlap}")
         pictures = plain(search, masks[0], templates, masks[1])
@@ -115,7 +115,7 @@ def _check(search: Picture, templates: Picture) -> None:
 
 
 def _mask(name: str, picture: Picture, mask: Picture | None) -> Picture:
-    """A mask, all True where none was given."""
+    """The mask, or one that is all True if none was given."""
     if mask is None:
         return (
             np.ones(picture.shape, bool)
@@ -155,7 +155,7 @@ def _check_fit(search: Search, templates: Picture) -> None:
 
 
 def surfaces(search: Search, templates: Given, *, group: int) -> Iterator[Given]:
-    """Zero-mean NCC for a group of templates at a time, which bounds the memory of many templates on a large map.
+    """Zero-mean NCC, a group of templates at a time, to bound memory for many templates on a large map.
 
     Args:
         search: (H, W) from :func:`prepare`.
@@ -163,7 +163,7 @@ def surfaces(search: Search, templates: Given, *, group: int) -> Iterator[Given]
         group: number of templates per tensor.
 
     Returns:
-        Yields (group, H-h+1, W-w+1) float32, the last one with the remainder of T.
+        Yields (group, H-h+1, W-w+1) float32; the last group holds the remainder of T.
     """
     inverse_norms = kernels.inverse_norm(search.image, search.sums, *templates.shape[-2:])
     for first in range(0, len(templates), group):
@@ -173,15 +173,15 @@ def surfaces(search: Search, templates: Given, *, group: int) -> Iterator[Given]
 
 
 def _of_kind(search: Search, template: Picture) -> Picture:
-    """A template as an array where the map is one; else as it is."""
+    """The template as an array if the map is one; else unchanged."""
     return plain(template)[0] if isinstance(search.image, np.ndarray) else template
 
 
 def match_template(search: Search, template: Picture, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
-    """The peak of one template in a prepared part of a map, all pixels of which are taken for valid.
+    """The peak of one template in a prepared part of a map; all its pixels count as valid.
 
-    Coarse to fine, see :mod:`engine.kernels.coarse_to_fine`. Where that is not certain, and with ``exhaustive`` or
-    on another device than the CPU, all positions are scored at full resolution.
+    Coarse to fine, see :mod:`engine.kernels.coarse_to_fine`. If that is not certain, with ``exhaustive``, or off
+    the CPU, all positions are scored at full resolution.
 
     Args:
         search: from :func:`prepare`.
@@ -210,9 +210,9 @@ def match_template(search: Search, template: Picture, *, exclusion_px: float, ex
 def match_templates(
     searches: Sequence[Search], templates: Sequence[Picture], *, exclusion_px: float
 ) -> list[Peak]:
-    """The peaks of many templates, each in its own part of a map: one copy from a GPU for all of them.
+    """The peaks of many templates, each in its own part of a map, with one copy from a GPU for all.
 
-    On a GPU pairs of equal shapes are matched at once.
+    On a GPU pairs of equal shapes are matched in one batch.
 
     Args:
         searches: from :func:`prepare`, on one device.
@@ -220,7 +220,7 @@ def match_templates(
         exclusion_px: radius about a peak within which no rival is counted.
 
     Returns:
-        Those of :func:`match_template`, in the same order.
+        The peaks as :func:`match_template` finds them, in the same order.
 
     Raises:
         ShapeError: there are not as many templates as parts of a map, or one of them does not fit its part.

@@ -1,4 +1,4 @@
-"""The settings of matching and of navigation, and what is assumed where telemetry and map do not say it."""
+"""Settings of matching and navigation, and errors to assume if telemetry and map do not state them."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from engine.values import MAX_SIGMA_M, Frame, GridPose, check_positive
 PROFILES = ("engine", "paper")
 MAP_FEATURES = ("prepared", "per_frame")
 MIN_HEIGHT_M = 1.0
-"""The lowest height that is searched where the height is unknown."""
-# How far compasses and altimeters are off at most: a declination, a motor's current, another ground.
+"""The lowest height to search if the height is unknown."""
+# The largest errors of compasses and altimeters: declination, a motor's current, a different ground level.
 _DOUBTED_HEADING_DEG, _DOUBTED_HEIGHT_SHARE = 24.0, 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AssumedErrors:
-    """One standard deviation of the telemetry, the map and the ground, where they do not state their own.
+    """Standard deviations of the telemetry, the map and the ground, used if they do not state their own.
 
     Attributes:
         height_m: of the height, besides its share below.
         height_share: of the height, as a share of it.
         heading_deg: of the heading.
-        tilt_deg: of roll and of pitch, where the frame came with them.
-        unknown_tilt_deg: of roll and of pitch, where it did not: nothing holds a camera level in flight.
-        map_m: georeferencing accuracy per axis, where the map does not state it (:func:`with_map_accuracy`): that
-            of web maps and of public orthophotos.
-        surface_slope_deg: slope accuracy of the surface model under one frame, where it does not state it.
-        unknown_slope_deg: slope of the ground where flat ground is assumed: the scale of a mixture of slopes from
-            nearly none to larger ones (:mod:`engine.matching.unknown_slope`).
+        tilt_deg: of roll and of pitch, if the frame came with them.
+        unknown_tilt_deg: of roll and of pitch, if it did not: nothing holds a camera level in flight.
+        map_m: georeferencing accuracy per axis, if the map does not state it (:func:`with_map_accuracy`); the
+            default is typical of web maps and public orthophotos.
+        surface_slope_deg: slope accuracy of the surface model under one frame, if it does not state its own.
+        unknown_slope_deg: slope of the ground if flat ground is assumed: the scale of a mixture of small and
+            larger slopes (:mod:`engine.matching.unknown_slope`).
     """
 
     height_m: float = 0.5
@@ -63,7 +63,7 @@ class AssumedErrors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseOptions:
-    """Inlier tolerance, effort of the search, and thresholds of acceptance.
+    """Inlier tolerance, search effort and acceptance thresholds.
 
     Attributes:
         reprojection_px: Largest reprojection distance of an inlier.
@@ -73,11 +73,11 @@ class PoseOptions:
         distinct_px: Matches in one square cell of this side count once, since their errors are correlated.
         max_log10_nfa: Upper bound on log10 of the number of false alarms, the expected number of poses with as
             many inliers by chance.
-        min_spread_px: Smallest standard deviation of the inliers in the image, in the direction where it is
-            smallest; below it they are nearly collinear.
-        min_cost_gap: Chi-square by which the pose must be better than the other pose of a plane.
-        noise_floor_px: Lower bound on the standard deviation taken for an image point's x and y.
-        seed: Of RANSAC's samples; equal inputs and seeds give equal poses.
+        min_spread_px: Smallest standard deviation of the inliers in the image, in the direction of smallest
+            spread; below it they are nearly collinear.
+        min_cost_gap: Chi-square by which the pose must beat the second pose that a plane allows.
+        noise_floor_px: Lower bound on the standard deviation assumed for an image point's x and y.
+        seed: Seeds RANSAC's samples; equal inputs and seeds give equal poses.
     """
 
     reprojection_px: float = 3.0
@@ -113,18 +113,18 @@ class NccOptions:
 
     Attributes:
         margin: the 1.3 of equations 4 and 5.
-        fraction: the rectified patch's size against the frame's.
-        score: what is correlated: "grey", "local", "gradient" or "mixed", see ``docs/scores.md``.
+        fraction: size of the rectified patch relative to the frame.
+        score: the correlated quantity: "grey", "local", "gradient" or "mixed", see ``docs/scores.md``.
         enhance_radius_px: neighbourhood of the local normalisation; 0 leaves it out. "grey" has none.
-        min_valid_share: a place counts only where this share of the patch lies on map that is not nodata.
+        min_valid_share: a place counts only if this share of the patch lies on valid map.
         exhaustive: score every place of the window at full resolution.
-        heading_search_deg: the frame's heading may be off by this much; 0 trusts it, 180 searches all around,
-            also where the frame has none.
-        height_search_share: the height may be off by this share; 0 trusts it.
-        refine: refine the pose densely after the peak, where heading and height are trusted.
+        heading_search_deg: how far the frame's heading may be off; 0 trusts it, 180 searches all headings, even if
+            the frame has none.
+        height_search_share: the share by which the height may be off; 0 trusts it.
+        refine: refine the pose densely after the peak, if heading and height are trusted.
         exclusion_m: rivals nearer than this are the peak itself.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
-        errors: what is assumed of the telemetry and the map.
+        errors: assumed errors of the telemetry and the map.
     """
 
     margin: float = 1.3
@@ -157,7 +157,7 @@ class NccOptions:
             raise OptionError(f"enhance_radius_px: expected 0 or more, got {self.enhance_radius_px}")
 
     def of_frame(self, frame: Frame) -> NccOptions:
-        """The same with what is searched for a frame whose heading and height are doubted."""
+        """These options, searching headings and heights as for a frame whose own are doubted."""
         if not frame.is_doubted:
             return self
         return replace(
@@ -179,36 +179,36 @@ class SiftOptions:
         margin: the 1.3 of equations 4 and 5.
         scale: the frame is reduced to this before detection; the paper's 0.5.
         max_keypoints: features taken from a frame of usual size; the map's are as dense.
-        keypoints_per_px: features taken from a larger one, per pixel of the map's level that it covers.
-        backend: of the features of frame and map: "compiled" loops (CPU) or "kornia" (any device); "auto" takes
-            "compiled" on the CPU, else "kornia".
-        upsample: samples per pixel of the first octave of a frame that is drawn in the map's pixels: with 2 small
-            keypoints are found more exactly, at three times the time. The map's always have 2.
+        keypoints_per_px: features taken from a larger frame, per map pixel that it covers on its level.
+        backend: computes the features of frame and map: "compiled" loops (CPU) or "kornia" (any device); "auto"
+            takes "compiled" on the CPU, else "kornia".
+        upsample: samples per pixel in the first octave of a frame that is drawn in the map's pixels. 2 locates
+            small keypoints more exactly and takes three times as long. The map always has 2.
         contrast_threshold: Lowe's, of frame and map; bare ground has little contrast.
         map_features: "prepared" once for the map, or found "per_frame" in the window, as the paper does.
         max_map_keypoints: upper limit for a window that is described per frame.
-        ratio: best against second-best descriptor distance (Lowe's test), where RANSAC must find what agrees.
-        vote_ratio: the same where matches vote for a translation, which finds it among many wrong ones.
+        ratio: best over second-best descriptor distance (Lowe's test), if RANSAC must find the matches that agree.
+        vote_ratio: the same if matches vote for a translation; a vote tolerates many wrong matches.
         vote_share: matches agree on a translation within this share of the distance to the ground.
-        tolerance_px: pixels of the map's level within which matches agree on the pose that was voted for.
-        upright: where the heading is known, turn the descriptors by it and not by each keypoint's gradients.
-        max_turn_deg: where the heading is known and descriptors are not upright, how far the angles of a match may
-            contradict it; None does not ask.
-        max_scale_factor: where the height is known, by which factor the scales of a match may contradict it; None
-            does not ask.
-        second_look: where nothing is found, look again without the heading and with heights up to
-            ``height_factor`` off.
-        height_factor: see above; 1 trusts the height also then.
-        max_height_m: where the height is unknown, it is at most this.
-        matcher: takes the place of features: it is given the reduced frame and the crop of the map, and what it
-            matches is lifted and solved for the pose as features are.
+        tolerance_px: distance, in pixels of the map's level, within which a match agrees with the voted pose.
+        upright: if the heading is known, turn descriptors by it instead of by each keypoint's gradients.
+        max_turn_deg: how far the angles of a match may contradict a known heading if descriptors are not upright;
+            None skips the test.
+        max_scale_factor: the factor by which the scales of a match may contradict a known height; None skips the
+            test.
+        second_look: if nothing is found, search again without the heading and with heights off by up to
+            ``height_factor``.
+        height_factor: see above; 1 trusts the height even then.
+        max_height_m: the largest height to search if the height is unknown.
+        matcher: replaces the features: it gets the reduced frame and the map's crop; its matches are lifted and
+            solved for the pose like those of features.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
-        max_tilt_deg: a pose further off the vertical is taken for a wrong one.
-        use_attitude: let what is known of heading, roll and pitch weigh in the pose by its assumed errors; a few
-            features alone hardly separate a tilt from a displacement.
-        refine: refine the pose densely after PnP, where height, heading, tilt and surface are known.
+        max_tilt_deg: a pose tilted further off the vertical is considered wrong.
+        use_attitude: use the known heading, roll and pitch as a prior of the pose, weighted by their assumed
+            errors; a few features alone hardly separate a tilt from a displacement.
+        refine: refine the pose densely after PnP, if height, heading, tilt and surface are known.
         pose: settings of PnP and RANSAC.
-        errors: what is assumed of the telemetry and the map.
+        errors: assumed errors of the telemetry and the map.
     """
 
     margin: float = 1.3
@@ -269,16 +269,16 @@ class SiftOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearnedOptions:
-    """Settings of the learned method; all others are SIFT's.
+    """Settings of the learned method; it takes all others from SIFT's.
 
     Attributes:
         weights: files of LoFTR, or of LightGlue with DISK, ALIKED or SuperPoint.
-        max_picture_px: on the level of the map where a frame is matched it covers at most so many pixels.
-        max_keypoints: of a frame; LoFTR has none.
-        max_map_keypoints: of a window.
-        max_window_px: a window with more pixels of its level is not searched.
-        tolerance_px: in place of SIFT's; networks place points less exactly.
-        min_match_confidence: of a match by LoFTR.
+        max_picture_px: most pixels that a frame covers on the map level it is matched on.
+        max_keypoints: most keypoints of a frame; LoFTR has none.
+        max_map_keypoints: most keypoints of a window.
+        max_window_px: a window with more pixels on its level is not searched.
+        tolerance_px: replaces SIFT's; networks locate points less exactly.
+        min_match_confidence: lowest confidence of a LoFTR match.
     """
 
     weights: tuple[str, ...] = ()
@@ -306,7 +306,7 @@ class MatcherOptions:
 
     Attributes:
         profile: "engine", or "paper" for the paper's own recipe with OpenCV.
-        risk: probability of a wrong fix that is allowed, see :mod:`engine.matching.evidence`.
+        risk: allowed probability of a wrong fix, see :mod:`engine.matching.evidence`.
         ncc: settings of the NCC method.
         sift: settings of the SIFT method.
         learned: settings of the learned method.
@@ -327,31 +327,31 @@ class MatcherOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NavigatorOptions:
-    """How a position is carried from frame to frame, and what is accepted; ``docs/integrity.md`` has the rules.
+    """Settings of dead reckoning between frames and of acceptance; ``docs/integrity.md`` has the rules.
 
     Attributes:
-        measured_velocity_sigma_mps: of a velocity that came with the frame.
-        acceleration_mps2: how hard the vehicle accelerates, for a second at a time, while its velocity is taken
-            from its last fixes.
-        max_speed_mps: assumed while nothing is known of the velocity.
-        growth: factor on the uncertainty that the window is made for, for every refusal in a row.
-        default_interval_s: time between frames that carry no stamp.
+        measured_velocity_sigma_mps: standard deviation of a velocity that came with the frame.
+        acceleration_mps2: acceleration of the vehicle, for a second at a time, while its velocity comes from its
+            last fixes.
+        max_speed_mps: speed assumed while the velocity is unknown.
+        growth: factor by which the window's uncertainty grows with every refusal in a row.
+        default_interval_s: time between frames without a timestamp.
         gate: chi-square of two degrees of freedom, beyond which a fix contradicts a prediction.
-        trusted_sigma_m: a prediction that is better known than this may contradict a fix.
-        min_confidence: probability of being right that is asked of a fix, by all the evidence for it.
+        trusted_sigma_m: only a prediction more certain than this may contradict a fix.
+        min_confidence: lowest probability, by all evidence, that a fix is right.
         lost_after: refusals in a row after which the whole map is searched again.
-        lost_sigma_m: uncertainty of the prediction at which the same is done.
-        search_every: while lost, of so many frames one searches the whole map; the others look where dead
+        lost_sigma_m: uncertainty of the prediction above which the whole map is searched as well.
+        search_every: while lost, one frame in so many searches the whole map; the others search where dead
             reckoning leads.
-        hold_s: how long dead reckoning by measured velocities may contradict fixes that agree with each other.
+        hold_s: how long dead reckoning by measured velocities overrules fixes that agree with each other.
         late_s: how much older than the newest frame a frame may be.
-        attitude_lag_s: standard deviation of how late the telemetry's attitude is, while no picture measured it.
-        attitude_jitter_s: of a single frame's lag about its mean.
-        tilt_bias_deg: standard deviation of a lasting error of roll and of pitch while no picture measured it.
-        heading_bias_deg: of the heading.
+        attitude_lag_s: standard deviation of the attitude telemetry's delay before images have measured it.
+        attitude_jitter_s: standard deviation of one frame's delay about the mean delay.
+        tilt_bias_deg: standard deviation of a lasting error in roll and in pitch before images have measured it.
+        heading_bias_deg: the same for the heading.
         healthy_s: age of the last fix up to which the navigator calls itself healthy.
-        odometry: whether frames that come without a velocity are followed from one to the next, as
-            ``docs/odometry.md`` says.
+        odometry: whether to measure motion from image to image for frames without a velocity; see
+            ``docs/odometry.md``.
     """
 
     measured_velocity_sigma_mps: float = 0.5
@@ -395,4 +395,4 @@ ACCEPT_ALL = NavigatorOptions(
     tilt_bias_deg=1e-9,
     heading_bias_deg=1e-9,
 )
-"""Every match is accepted, as by the paper's recipe: the baseline."""
+"""Accept every match, as the paper's recipe does: the baseline."""

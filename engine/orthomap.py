@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 GROUND_REACH_M = 30.0
-"""Half side of the square over which the ground is fitted: wider than a house, narrower than a hill."""
+"""Half the side of the square to which the ground is fitted: wider than a house, narrower than a hill."""
 SEARCH_LIMIT_PX = 1 << 29
-"""Largest map, in pixels, that is searched as a whole where the position is unknown."""
-_MIN_KNOWN = 100  # heights from which the level of the ground is taken
-_ROUGH_M = 1.0  # range of the heights around a pixel at which its weight is one half
+"""Largest map, in pixels, that is searched as a whole if the position is unknown."""
+_MIN_KNOWN = 100  # known heights needed to determine the ground level
+_ROUGH_M = 1.0  # height range around a pixel that halves its weight
 
 
 class OrthoMap(Georeference):
@@ -57,15 +57,15 @@ class OrthoMap(Georeference):
         width_px, height_px: columns and rows.
         crs, source_crs: of the metric grid in use, and of the file.
         frame: local east-north-up; its origin is the centre of the map.
-        gsd_m_per_px: true metres on the ground per pixel at the centre: the root of the area of a pixel.
+        gsd_m_per_px: true metres on the ground per pixel at the centre: the square root of a pixel's area.
         bounds_deg: west, south, east, north of the outer edges.
         has_surface: whether it has a surface model.
-        ground_m: level of the ground in the surface's datum: the 20th percentile of the surface over the valid
-            part of the map, below most roofs and crowns; 0.0 without a surface.
+        ground_m: ground level in the surface's datum: the 20th percentile of the surface over the valid map, below
+            most roofs and crowns; 0.0 without a surface.
         levels: number of levels of the pyramid.
-        georeference_sigma_m: georeferencing accuracy, one standard deviation per axis; None where unknown.
-        surface_datum: vertical system of a surface in metres above the sea, by its file; None where unknown.
-        slope_sigma_deg: slope accuracy of the surface under a frame, one standard deviation; None where unknown.
+        georeference_sigma_m: georeferencing accuracy, one standard deviation per axis; None if unknown.
+        surface_datum: vertical system of a surface in metres above the sea, by its file; None if unknown.
+        slope_sigma_deg: slope accuracy of the surface under a frame, one standard deviation; None if unknown.
     """
 
     georeference_sigma_m: float | None = None
@@ -106,10 +106,10 @@ class OrthoMap(Georeference):
             surface: heights in any grid and CRS.
             bounds_deg: west, south, east, north of the outer edges of a picture without georeference.
             bounds_crs: the same in the units of ``crs``.
-            crs: of a file that names none.
+            crs: used if the file names none.
             cache_dir: None is ``$XDG_CACHE_HOME/scenematch``, else ``~/.cache/scenematch``.
-            georeference_sigma_m: georeferencing accuracy; None is that of the file's metadata.
-            slope_sigma_deg: slope accuracy; None is that of the surface file's metadata.
+            georeference_sigma_m: georeferencing accuracy; None takes it from the file's metadata.
+            slope_sigma_deg: slope accuracy; None takes it from the surface file's metadata.
             on_copy: called while a resampled copy is created.
 
         Raises:
@@ -135,7 +135,7 @@ class OrthoMap(Georeference):
         source: Source | None = None,
         heights_file: Source | None = None,
     ) -> None:
-        """Take the accuracies that are given, or else those of the files' metadata."""
+        """Take the given accuracies, or those in the files' metadata."""
         self.georeference_sigma_m = stated_sigma(
             georeference_sigma_m, source, GEOREFERENCE_TAG, "georeference_sigma_m"
         )
@@ -160,9 +160,9 @@ class OrthoMap(Georeference):
             pixel_to_crs: (2, 3) affine from pixels, centres at integers, to a projected north-up grid.
             crs: anything that pyproj takes.
             surface_m: (H, W) heights, NaN where unknown.
-            valid: (H, W) bool, all where None.
-            georeference_sigma_m: georeferencing accuracy, None where unknown.
-            slope_sigma_deg: slope accuracy, None where unknown.
+            valid: (H, W) bool; None means all.
+            georeference_sigma_m: georeferencing accuracy, None if unknown.
+            slope_sigma_deg: slope accuracy, None if unknown.
 
         Returns:
             OrthoMap: without a file; the arrays are not copied.
@@ -193,7 +193,7 @@ class OrthoMap(Georeference):
         self.ground_m = float(np.percentile(known, GROUND_PERCENT))
 
     def _known_heights(self, surface: SurfaceModel, xy_px: Array) -> Array:
-        """The surface's heights at those of the pixels (N, 2) where surface and map are known."""
+        """The surface's heights at those pixels (N, 2) at which surface and map are both known."""
         last = np.array([self.width_px - 1, self.height_px - 1])
         xy = np.rint(xy_px)
         xy = np.clip(xy, 0, last)[((xy >= -1) & (xy <= last + 1)).all(axis=1)]
@@ -202,7 +202,7 @@ class OrthoMap(Georeference):
 
     @property
     def is_large(self) -> bool:
-        """Whether it is read from its file window by window, instead of being held in memory."""
+        """Whether it is read from its file window by window instead of held in memory."""
         return self._pyramid.is_large
 
     @property
@@ -222,13 +222,13 @@ class OrthoMap(Georeference):
 
     @property
     def inner_px(self) -> Array:
-        """(2,) the middle pixel where it is valid, else the valid pixel that is farthest from any nodata."""
+        """(2,) the middle pixel if it is valid, else the valid pixel farthest from any nodata."""
         middle = np.array([self.width_px - 1, self.height_px - 1]) / 2.0
         return middle if bool(self._pyramid.valid_at(middle)) else self._pyramid.innermost_px()
 
     @property
     def fully_valid(self) -> bool:
-        """Whether no pixel is nodata; of a large map only where its file format cannot mark nodata."""
+        """Whether no pixel is nodata; true for a large map only if its file format cannot mark nodata."""
         return self._pyramid.fully_valid
 
     def gray(self, window: Window, level: int = 0) -> Gray:
@@ -269,7 +269,7 @@ class OrthoMap(Georeference):
             shape: rows and columns of the result.
 
         Returns:
-            (h, w, 3) RGB, undefined on nodata; None where the map has no colours, or no file.
+            (h, w, 3) RGB, undefined on nodata; None if the map has no colours, or no file.
         """
         return None if self._source is None else read_colour(self._source(), self._grid, window, shape)
 
@@ -331,7 +331,7 @@ class OrthoMap(Georeference):
     def ground_plane(self, xy_px: ArrayLike, reach_m: float) -> tuple[float, Array]:
         """The bare ground about one pixel: a plane by quantile regression, with a fifth of the surface below it.
 
-        So it is below roofs and crowns, and unlike a mere percentile not below the middle of a slope.
+        This puts it below roofs and crowns but, unlike a plain percentile, not below the middle of a slope.
 
         Args:
             xy_px: (2,) pixel of the map.
@@ -339,7 +339,7 @@ class OrthoMap(Georeference):
 
         Returns:
             The level at the pixel in the surface's datum, and the slope (2,) in metres up per pixel x and y:
-            ``ground_m`` and 0 where less than half of the square is known, 0.0 and 0 without a surface.
+            ``ground_m`` and 0 if less than half of the square is known, 0.0 and 0 without a surface.
         """
         found = None
         if self._surface is not None:
@@ -349,7 +349,7 @@ class OrthoMap(Georeference):
     def roughness_weight_at(self, xy_px: ArrayLike, reach_px: float) -> Array:
         """Weight of pixels by the roughness of the surface: 1 on level ground, less at walls, edges and crowns.
 
-        Where heights ``reach_px`` away differ by a metre, the weight is one half.
+        The weight is one half if heights ``reach_px`` away differ by a metre.
 
         Args:
             xy_px: (..., 2) pixels of the map.

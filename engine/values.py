@@ -34,7 +34,7 @@ class Attitude:
     """Attitude of the body (forward-right-down), in aerospace order: yaw, then pitch, then roll.
 
     Convention:
-        ``heading_deg`` clockwise from true north in [0, 360), or from grid north where a name says ``grid_``;
+        ``heading_deg`` clockwise from true north in [0, 360), or from grid north if a name says ``grid_``;
         ``pitch_deg`` positive nose up;
         ``roll_deg`` positive right side down.
     """
@@ -57,22 +57,22 @@ class Frame:
     Attributes:
         image: (H, W) grey or (H, W, 3) RGB, uint8, numpy or torch.
         timestamp_ns: capture time on the vehicle's clock, or None.
-        height_agl_m: height above the ground, positive, or None where unknown.
-        heading_deg: clockwise from true north, or None where unknown.
+        height_agl_m: height above the ground, positive, or None if unknown.
+        heading_deg: clockwise from true north, or None if unknown.
         roll_deg: positive right side down; None is treated as level.
         pitch_deg: positive nose up; None is treated as level.
-        east_velocity_mps: velocity over ground, or None where unknown.
-        north_velocity_mps: velocity over ground, or None where unknown.
-        height_sigma_m: standard deviation of the height; None is what the matcher assumes, as of the next two.
+        east_velocity_mps: velocity over ground, or None if unknown.
+        north_velocity_mps: velocity over ground, or None if unknown.
+        height_sigma_m: standard deviation of the height; None takes the matcher's assumption, as for the next two.
         heading_sigma_deg: standard deviation of the heading.
         tilt_sigma_deg: standard deviation of roll and of pitch.
-        velocity_sigma_mps: standard deviation of the velocity, per axis; None is what the navigator assumes.
+        velocity_sigma_mps: standard deviation of the velocity, per axis; None takes the navigator's assumption.
         tilt_lag_deg: by how much roll and pitch may have changed since they were measured; adds to their
             standard deviation.
-        heading_lag_deg: the same of the heading.
-        height_correction_m: what was added to the vehicle's own height because pictures showed another one. The
-            focal length may be what is wrong, so that a fix is less certain by it.
-        is_doubted: heading and height may be far off, so that NCC searches for both; a navigator sets it.
+        heading_lag_deg: the same for the heading.
+        height_correction_m: added to the vehicle's own height because images showed a different one. The cause may
+            be a wrong focal length, so the correction also makes a fix less certain.
+        is_doubted: heading and height may be far off, so NCC searches for both; set by a navigator.
 
     Raises:
         ShapeError: the image is not (H, W) or (H, W, 3), or is empty.
@@ -137,7 +137,7 @@ class Frame:
 
     @property
     def attitude(self) -> Attitude | None:
-        """The attitude with unknown roll and pitch as 0, or None where the heading is unknown."""
+        """The attitude with unknown roll and pitch as 0, or None if the heading is unknown."""
         if self.heading_deg is None:
             return None
         return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, wrap_heading_deg(self.heading_deg))
@@ -145,11 +145,11 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class GridPose:
-    """Height and attitude by which a frame is projected onto the map; None where unknown.
+    """Height and attitude by which a frame is projected onto the map; None if unknown.
 
     Attributes:
         height_agl_m: above the ground.
-        grid_heading_deg: clockwise from grid north, the north of the map's plane. From true north it differs by
+        grid_heading_deg: clockwise from grid north, the north of the map's plane. It differs from true north by
             the meridian convergence (:meth:`engine.geo.LocalFrame.convergence_deg`).
         roll_deg: positive right side down.
         pitch_deg: positive nose up.
@@ -285,19 +285,19 @@ class Fix:
     """A position with its covariance, at the capture of the frame.
 
     Attributes:
-        timestamp_ns: capture time of the frame, or None where the frame had none.
+        timestamp_ns: capture time of the frame, or None if the frame had none.
         lat_deg: WGS84 latitude of the camera.
         lon_deg: WGS84 longitude of the camera.
         east_m: east of the map's origin.
         north_m: north of the map's origin.
-        up_m: height of the camera in the surface model's datum (above flat ground where there is none);
-            None where the method does not measure height.
-        covariance_m2: (3, 3) in east, north, up; where ``up_m`` is None, up is that of the frame's height.
-        attitude: measured by the method, or None. Where NCC searched over headings or heights without refinement,
-            only the heading is measured; roll and pitch are the frame's, or 0.
-        attitude_covariance_deg2: (3, 3) in roll, pitch, heading where the whole pose was solved, else None.
-        score: NCC in [-1, 1]: of the peak, or of picture and map at a refined pose; the share of inliers of
-            matched points.
+        up_m: height of the camera in the surface model's datum (above flat ground if there is none);
+            None if the method does not measure height.
+        covariance_m2: (3, 3) in east, north, up; if ``up_m`` is None, up is the variance of the frame's height.
+        attitude: measured by the method, or None. If NCC searched headings or heights without refinement, only the
+            heading is measured; roll and pitch are the frame's, or 0.
+        attitude_covariance_deg2: (3, 3) in roll, pitch, heading if the whole pose was solved, else None.
+        score: NCC in [-1, 1], of the peak or of image and map at a refined pose; for features, the share of
+            matches that are inliers.
         method: "ncc", "sift" or "learned".
         window: the crop of the map that was searched.
         timings: milliseconds per stage.
@@ -305,9 +305,9 @@ class Fix:
         stage: last stage within the budget: "coarse" at reduced resolution, "fine" at full, "refined" in all of
             the pose, "verified" by both methods.
         confidence: probability in (0, 1) that the position is correct, see ``docs/integrity.md``; None if the
-            method states none, as the paper's does.
-        map_sigma_m: the part of ``covariance_m2`` that is the map's georeference, one standard deviation per axis:
-            one error, which all fixes on a map share.
+            method states none, as in the paper's profile.
+        map_sigma_m: the georeference's part of ``covariance_m2``, one standard deviation per axis. All fixes on a
+            map share this one error.
     """
 
     timestamp_ns: int | None
@@ -330,13 +330,13 @@ class Fix:
 
     @property
     def attitude_sigma_deg(self) -> tuple[float, ...] | None:
-        """Standard deviations of roll, pitch and heading; None where the whole pose was not solved."""
+        """Standard deviations of roll, pitch and heading; None if the whole pose was not solved."""
         covariance = self.attitude_covariance_deg2
         return None if covariance is None else tuple(np.sqrt(np.diag(covariance)).tolist())
 
     @property
     def relative_covariance_m2(self) -> NDArray[np.float64]:
-        """(2, 2) east and north against the map, and against other fixes on it: without the map's own error."""
+        """(2, 2) east and north relative to the map and to other fixes on it: without the map's own error."""
         out = self.covariance_m2[:2, :2].copy()
         out[0, 0] -= self.map_sigma_m**2
         out[1, 1] -= self.map_sigma_m**2
@@ -353,19 +353,19 @@ class Fix:
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2[:2, :2])[-1]))
 
     def protection_level_m(self, risk: float = 1e-4) -> float:
-        """The horizontal radius about the fix beyond which the vehicle is with no more than this probability.
+        """Horizontal radius around the fix that the vehicle exceeds with at most this probability.
 
-        It counts that the place may be a wrong one, by :attr:`confidence`, and else the ellipse of the covariance,
-        taken for a circle of its larger axis.
+        It allows for a wrong place, by :attr:`confidence`, and for the covariance, as a circle with the ellipse's
+        larger axis.
 
         Args:
-            risk: probability that is allowed, above 0 and below 1.
+            risk: the allowed probability, above 0 and below 1.
 
         Returns:
-            float: infinite where the place alone is wrong more often than that, or how often is not known.
+            float: infinite if a wrong place alone is more probable than that, or if its probability is unknown.
 
         Raises:
-            OptionError: the risk is no such probability.
+            OptionError: the risk is not such a probability.
         """
         if not 0.0 < risk < 1.0:
             raise OptionError(f"risk: expected a probability above 0 and below 1, got {risk}")
@@ -373,7 +373,7 @@ class Fix:
         return self.sigma_m * math.sqrt(-2.0 * math.log(left)) if left > 0.0 else math.inf
 
     def refused(self, reason: Reason, detail: str) -> NoFix:
-        """The refusal of this fix, with what was measured of it."""
+        """Turn this fix into a refusal that keeps its measurements."""
         return NoFix(
             reason=reason,
             detail=detail,
@@ -392,12 +392,12 @@ class NoFix:
     Attributes:
         reason: of the refusal.
         detail: one sentence with the figures behind the reason.
-        timestamp_ns: capture time of the frame, or None where the frame had none.
-        method: the method that refused, or None where none was tried.
-        score: of the best match, or None where there was none.
+        timestamp_ns: capture time of the frame, or None if the frame had none.
+        method: the method that refused, or None if none was tried.
+        score: of the best match, or None if there was none.
         window: the crop that was searched, or None.
         timings: milliseconds per stage that ran.
-        candidates: a few matches that are not probable enough alone, with what they state of themselves.
+        candidates: a few matches that are not probable enough alone, with their own confidence and covariance.
     """
 
     reason: Reason
@@ -440,7 +440,7 @@ Result = Fix | NoFix
 
 
 def check_positive(options: object, *names: str) -> None:
-    """Refuse options of which one is not a finite number above 0.
+    """Check that all options are finite numbers above 0.
 
     Raises:
         OptionError: names the first that is not.

@@ -9,7 +9,7 @@ from engine.orthomap import OrthoMap
 from engine.values import Window
 
 SPREAD_SIGMAS = 3.0
-"""Standard deviations of the prior that a window covers to each side."""
+"""How many standard deviations of the prior a window covers to each side."""
 
 
 def window_size_px(
@@ -44,7 +44,7 @@ def place_window(
         map_size_px: width and height of the map.
 
     Returns:
-        Window | None: None where the window is outside the map.
+        Window | None: None if the window is outside the map.
     """
     spans = []
     for center, size, limit in zip(center_px, size_px, map_size_px, strict=True):
@@ -63,8 +63,8 @@ def level_crop(site: OrthoMap, window: Window, level: int, *, step_px: int = 1) 
         site: the map.
         window: in full-resolution pixels, inside the map.
         level: of the pyramid.
-        step_px: width and height are rounded up to a multiple of this where the level is large enough, so that
-            a flight meets few different sizes and nothing is planned again in flight.
+        step_px: width and height are rounded up to a multiple of this if the level is large enough, so that a
+            flight uses few different sizes and plans none in flight.
     """
     rows, columns = site.level_shape(level)
     spans = []

@@ -244,7 +244,7 @@ def test_a_calibration_may_name_its_mount(save):
         ("mount: up\n", "mount: expected one of nadir"),
         (
             "mount: [1, 0, 0, 0, 1, 0, 0, 0, 1]\ncamera_pitch_deg: -30\n",
-            "camera_pitch_deg: expected with a mount by",
+            "camera_pitch_deg: expected a mount by",
         ),
         ("camera_pitch_deg: steep\n", "could not convert"),
     ):
@@ -279,5 +279,5 @@ def test_undistortion_of_a_smaller_picture_is_the_smaller_undistorted_picture(mo
 
 @pytest.mark.parametrize("size", [(640, 360), (320, 320), (480, 640)])
 def test_a_frame_of_another_shape_is_not_scaled_to(size):
-    with pytest.raises(CalibrationError, match="calibrated for 640 x 480, expected pictures of that shape"):
+    with pytest.raises(CalibrationError, match="calibrated for 640 x 480, expected that aspect ratio"):
         camera().scaled_to(*size)

@@ -151,7 +151,7 @@ def test_a_name_that_is_no_device_is_an_option_error(name):
 def test_a_device_that_is_missing_is_a_device_error(name):
     if torch.cuda.is_available() and torch.cuda.device_count() > int(name[5:] or 0):
         pytest.skip("this machine has that device")
-    with pytest.raises(DeviceError, match=rf"^device: {name} was asked for, but this machine offers \d"):
+    with pytest.raises(DeviceError, match=rf"^device: {name} was requested, but this machine has \d"):
         resolve(name)
 
 

@@ -1,4 +1,4 @@
-"""Kernels: NCC's are tensor ops and compiled loops behind :mod:`engine.kernels.ncc`, all others compiled loops.
+"""Kernels: tensor ops and compiled loops for NCC behind :mod:`engine.kernels.ncc`; compiled loops for the rest.
 
 Tests compare every kernel of NCC with :mod:`engine.kernels.reference`, which is slow, float64 and obvious.
 

@@ -1,7 +1,7 @@
 """NCC on the CPU: OpenCV's transforms in blocks that fit the cache, and compiled loops around them.
 
-In float32 OpenCV's transforms take as little as half of MKL's time, and less than those of ``matchTemplate``, most
-of which are in float64. Weak patches in a window of strong contrast need float64, and their blocks get it.
+In float32 OpenCV's transforms take as little as half of MKL's time, and less than ``matchTemplate``'s, which are
+mostly in float64. Blocks with weak patches in a window of strong contrast use float64.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def prepared_surface(image: FloatImage, inverse_norms: FloatImage, templates: Fl
 class _Block(NamedTuple):
     """The transform of part of a window, and where its scores lie on the surface."""
 
-    spectrum: NDArray[np.floating]  # float64 where some patch is too weak for float32
+    spectrum: NDArray[np.floating]  # float64 if some patch is too weak for float32
     rows: slice
     columns: slice
 
@@ -177,7 +177,7 @@ def _finish_pair(
     largest: float,
     model: FloatImage,
 ) -> None:
-    """The scores of what :func:`surface_loops.pack` wrote: both pictures in one transform, of equal norm."""
+    """The scores of two pictures of equal norm that :func:`surface_loops.pack` wrote, in one transform."""
     mean, energy = moments
     size = packed.shape[:2]
     if _is_weak(energy, largest):
@@ -214,7 +214,7 @@ def fast_side(n: int) -> int:
 def _window_spectrum(
     window: FloatImage, mean: float, size: tuple[int, int], inverse_norms: FloatImage
 ) -> NDArray[np.floating]:
-    """The transform of a window less a mean, in float64 where some patch is too weak for float32."""
+    """The transform of a window minus a mean, in float64 if some patch is too weak for float32."""
     values: NDArray[np.floating] = np.empty(size, np.float32)
     energy = surface_loops.centre(values, window, mean)
     if _is_weak(energy, float(inverse_norms.max())):
@@ -246,7 +246,7 @@ _kept = threading.local()
 
 
 def _scratch(name: str, shape: tuple[int, ...], kind: DTypeLike = np.float32) -> NDArray[Any]:
-    """An array that the thread keeps between calls: fresh pages of memory cost as much as a transform."""
+    """An array that the thread keeps between calls: fresh memory pages cost as much as a transform."""
     count, name = math.prod(shape), f"{name} {np.dtype(kind).char}"
     memory: NDArray[Any] | None = getattr(_kept, name, None)
     if memory is None or memory.size < count:
@@ -259,13 +259,13 @@ def _scratch(name: str, shape: tuple[int, ...], kind: DTypeLike = np.float32) ->
 def transform(values: NDArray[np.floating], flags: int, rows: int) -> None:
     """Transform in place.
 
-    OpenCV hands whole pictures to IPP where it is built with it, which is three to four times as fast as its own
-    transform of a part of the rows.
+    If built with IPP, OpenCV passes whole pictures to it; that is three to four times as fast as its own transform
+    of a part of the rows.
 
     Args:
         values: (H, W) float32 or float64, or (H, W, 2) complex numbers.
         flags: of ``cv2.dft``.
-        rows: how many are not zero, or of an inverse are wanted.
+        rows: number of rows that are not zero, or for an inverse that are wanted.
     """
     cv2.dft(values, values, flags, 0 if _uses_ipp() else rows)
 

@@ -1,4 +1,4 @@
-"""Points of the plane that lie together, compiled by numba: of a few hundred, NumPy's calls cost the most."""
+"""Clusters of points in the plane, compiled by numba: for a few hundred points NumPy's call overhead dominates."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from engine.runtime.jit import compiled, inlined
 
 _MAX_SIDE = 2048  # cells along a side of the histogram
 _ROUNDS = 4  # of the mean shift from the fullest cells to the middle of the points
-_FIRST_REACH = 1.25  # of the radius about the fullest cells, whose middle is off by up to half a cell
-_REACH = 2  # cells to either side that are counted with one
+_FIRST_REACH = 1.25  # of the radius, around the fullest cells, whose middle is off by up to half a cell
+_REACH = 2  # cells to either side counted with each cell
 
 
 @compiled("(f8[:, ::1], f8)")
 def densest(points, radius):
-    """Mark the points within a radius of the place about which most lie.
+    """Mark the points within a radius of the place with the most points.
 
     The fullest 5 x 5 cells of a histogram, whose cells are half a radius wide, give the place nearly; from there
     the mean of the points within the radius is followed.
@@ -46,7 +46,7 @@ def densest(points, radius):
 
 @inlined
 def _mark_near(points, x, y, radius, near):
-    """Mark the points within a radius of a place; how many there are, and their mean."""
+    """Mark the points within a radius of a place; return their number and mean."""
     held, east, north = 0, 0.0, 0.0
     for n in range(len(points)):
         off_x, off_y = points[n, 0] - x, points[n, 1] - y
@@ -69,7 +69,7 @@ def _place_of_fullest_cells(points, radius):
     rows, columns = int((bottom - top) / cell) + 1, int((right - left) / cell) + 1
     margin = 2 * _REACH
     sums = np.zeros((rows + margin, columns + margin), np.int32)
-    for n in range(len(points)):  # each point counts for the cells about its own
+    for n in range(len(points)):  # each point counts for the cells around its own
         row = min(int((points[n, 1] - top) / cell), rows - 1)
         column = min(int((points[n, 0] - left) / cell), columns - 1)
         for i in range(margin + 1):

@@ -1,12 +1,12 @@
 """The peak of one template coarse to fine: all positions at reduced resolution, the best few at full resolution.
 
-The error of the coarse scores is bounded by twice the largest error at the refined positions, and by at least what
-a match between coarse pixels loses. Where that bound does not exclude every other position, all of them have to be
-scored at full resolution; unless the window is wide and a :class:`QuickLook` settles what becomes of the frame.
+The error bound of the coarse scores is twice the largest error at the refined positions, and at least the loss of
+a match between coarse pixels. If that bound does not exclude every other position, all must be scored at full
+resolution, unless the window is wide and a :class:`QuickLook` already decides about the frame.
 
-On a coarse level nodata is 0 in a picture about its mean, and costs positions that are mostly on the map little:
-their scores are divided by the share that is on the map, which makes up for that and more, where the template's
-contrast is spread evenly. At full resolution nodata is left out of all sums.
+On a coarse level nodata is 0 in a picture with zero mean, and hardly lowers positions that are mostly on the map:
+their scores are divided by the share on the map, which more than compensates if the template's contrast is spread
+evenly. At full resolution nodata is left out of all sums.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ _MIN_HALVED_PX = 128 * 128
 _CANDIDATES, _CANDIDATES_WIDE = 6, 64
 _SEPARATION_PX = 2  # of candidates, on the coarsest level
 _UPHILL_STEPS = 4  # within the reach of one LocalScores
-_MAX_LOSS = 0.5  # of a perfect match between the pixels of the coarsest level that serves a quick look
+_MAX_LOSS = 0.5  # of a perfect match between pixels, on the coarsest level usable for a quick look
 
 
 @dataclass(frozen=True, slots=True)
 class QuickLook:
-    """Which peaks of a wide window are kept although not every position was scored at full resolution.
+    """Which peaks of a wide window to keep although not every position was scored at full resolution.
 
     Attributes:
-        is_clear: whether a peak stands whose rival is taken to be as high as the coarse scores allow elsewhere.
-        is_hopeless: whether a peak is of no use even if nothing elsewhere is higher than the refined rivals.
+        is_clear: whether a peak holds even if its rival is as high as the coarse scores allow elsewhere.
+        is_hopeless: whether a peak is useless even if nothing elsewhere is higher than the refined rivals.
     """
 
     is_clear: Callable[[Peak], bool]
@@ -78,7 +78,7 @@ class _Levels:
 
     @property
     def loss(self) -> float:
-        """What a perfect match loses at most between the coarsest level's pixels."""
+        """The most that a perfect match loses between the coarsest level's pixels."""
         return _phase_loss(self.models[-2], self.models[-1])
 
     @property
@@ -107,16 +107,16 @@ def peak(
         template: (h, w) float32.
         exclusion_px: radius about the peak within which no rival is counted.
         min_overlap: positions where a smaller share of the template lies on valid pixels do not count.
-        quick: what is kept in a wide window beyond what is certain.
+        quick: which peaks of a wide window to keep beyond the certain ones.
 
     Returns:
-        Peak | None: as :func:`engine.kernels.peaks.find_peak`, the second score being that of a coarse level where
-        that is higher than the refined rivals; None where positions elsewhere are not excluded.
+        Peak | None: as :func:`engine.kernels.peaks.find_peak`, but the second score is a coarse level's if that is
+        higher than the refined rivals; None if positions elsewhere are not excluded.
     """
     wide = quick is not None and is_wide(search)
     levels = _levels(search, template, min_overlap, _MAX_LOSS if wide else 1.0)
     if levels is None:
-        return None  # nothing to gain
+        return None  # no gain
     scores = _coarse_scores(levels)
     count = _CANDIDATES_WIDE if wide else _CANDIDATES
     candidates = best_positions(scores, _SEPARATION_PX, count + 1)
@@ -146,7 +146,7 @@ def peak(
 def best_places(
     search: Search, template: FloatImage, separation_px: float, count: int, *, min_overlap: float = 0.0
 ) -> list[tuple[int, int, float]] | None:
-    """The highest positions of a wide window among those that are highest at reduced resolution.
+    """The highest positions of a wide window, out of the highest at reduced resolution.
 
     Args:
         search: (H, W) arrays.
@@ -156,7 +156,7 @@ def best_places(
         min_overlap: see :func:`peak`.
 
     Returns:
-        (x, y, score) in falling order of the score; None where there is no coarser level.
+        (x, y, score) in falling order of the score; None if there is no coarser level.
     """
     levels = _levels(search, template, min_overlap, _MAX_LOSS)
     if levels is None:
@@ -173,7 +173,7 @@ def best_places(
 
 
 def _levels(search: Search, template: FloatImage, min_overlap: float, max_loss: float) -> _Levels | None:
-    """The levels on which there is something to gain, or None where the finest is the only one.
+    """The levels worth searching, or None if that is only the finest.
 
     Args:
         search: the window.
@@ -222,7 +222,7 @@ def surfaces_over_nodata(
 
 
 def _coarse_scores(levels: _Levels) -> FloatImage:
-    """Scores on the coarsest level, of what lies partly on nodata about as at full resolution."""
+    """Scores on the coarsest level; positions partly on nodata score about as at full resolution."""
     coarse, model = levels.parts[-1], levels.models[-1]
     inverse_norms = kernels.inverse_norm(coarse.image, coarse.sums, *model.shape)
     counts, (h, w), step = levels.parts[0].counts, levels.models[0].shape, levels.scale
@@ -237,7 +237,7 @@ def _coarse_scores(levels: _Levels) -> FloatImage:
 def _scores_by_share(
     part: Search, models: FloatImage, inverse_norms: FloatImage, share: FloatImage, least: float
 ) -> FloatImage:
-    """Scores (T, H', W') divided by the share that is on the map; -1 where that is less than ``least``."""
+    """Scores (T, H', W') divided by the share on the map; -1 where that is less than ``least``."""
     is_off = share < max(least, 1e-3)
     inverse_norms[is_off] = 0.0
     scores: FloatImage = kernels.prepared_surface(part.image, inverse_norms, models)
@@ -266,8 +266,8 @@ def _refined_candidates(
     Args:
         levels: of window and template.
         scores: on the coarsest level.
-        candidates: in falling order, one more than ``count`` where there are as many.
-        count: upper bound on what is refined.
+        candidates: in falling order, one more than ``count`` if available.
+        count: upper bound on the refined candidates.
         stops: return nothing as soon as it is known that they do not exclude every other position.
     """
     loss = levels.loss
@@ -290,7 +290,7 @@ def _refined_candidates(
 
 
 def _phase_loss(fine: FloatImage, coarse: FloatImage) -> float:
-    """What a perfect match loses on the coarser of two levels where it is between that level's pixels."""
+    """Loss of a perfect match on the coarser of two levels if it lies between that level's pixels."""
     between = kernels.halved(fine[1:, 1:]).ravel()
     model = coarse[: (fine.shape[0] - 1) // 2, : (fine.shape[1] - 1) // 2].ravel()
     norm = math.sqrt(float(np.dot(between, between)) * float(np.dot(model, model)))
@@ -314,7 +314,7 @@ def _coarse_rest(
 def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak | None, bool]:
     """A coarse position at full resolution, and whether it is a summit there and not at the edge of anything.
 
-    None where it is on the border of the coarse level, or too much of it on nodata.
+    None if it is on the border of the coarse level, or too much of it on nodata.
     """
     if not (0 < y < scores.shape[0] - 1 and 0 < x < scores.shape[1] - 1):
         return None, False

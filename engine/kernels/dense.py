@@ -1,4 +1,4 @@
-"""Dense refinement: the camera's pose at which a picture and the map on its surface model agree best.
+"""Dense refinement: find the camera pose at which an image and the map on its surface model agree best.
 
 Gauss-Newton on grey levels: 3D samples of the map are projected into the picture, whose levels there are compared
 with the map's, up to gain and bias. Attitude and height of the telemetry, and an unknown slope of the ground,
@@ -175,7 +175,7 @@ def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> floa
 
 
 def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: GaussianPrior) -> DenseFit | None:
-    """Gauss-Newton from a start whose reprojection is off by a few pixels at most.
+    """Gauss-Newton from a start with a reprojection error of at most a few pixels.
 
     Args:
         picture: of the camera.
@@ -184,7 +184,7 @@ def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: Gaussia
         prior: of the parameters.
 
     Returns:
-        The pose, or None where too few samples are visible or the pose is not determined.
+        The pose, or None if too few samples are visible or the pose is not determined.
     """
     from engine.kernels.gauss_newton import gauss_newton  # numba takes a while to import
 
@@ -216,7 +216,7 @@ def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
         prior: the one that it was refined with.
 
     Returns:
-        (8, 8) in the order of the parameters, or None where the pose is not determined.
+        (8, 8) in the order of the parameters, or None if the pose is not determined.
     """
     from engine.kernels import gauss_newton
 

@@ -11,7 +11,7 @@ from engine.runtime.jit import compiled, inlined
 
 _BIWEIGHT = 4.685  # standard deviations at which the weight of Tukey's biweight reaches 0
 _MAD = 1.4826  # standard deviation of normal noise over its median absolute value
-_MEDIAN_STEP = 3  # the median is taken over every third difference
+_MEDIAN_STEP = 3  # the median uses every third difference
 
 
 @compiled(

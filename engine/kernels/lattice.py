@@ -6,7 +6,7 @@ import numpy as np
 
 from engine.runtime.jit import compiled, inlined
 
-_SEEN = 0.999  # of the weights of nodes that the frame can show, below which one of them is hidden
+_SEEN = 0.999  # total weight of visible nodes, below which one of them is hidden
 
 
 @compiled("(f4[:, :, ::1], f4, f4, f4[:, ::1], f4[:, ::1], u1[:, ::1])")

@@ -25,7 +25,7 @@ class LocalScores:
         image: (H, W) float32, its mean small against its standard deviation; 0 where not valid.
         template: (h, w) float32 of zero mean.
         middle: (y, x); scores can be computed within ``REACH`` of it.
-        counts: (H+1, W+1) running sums of the valid pixels, of which alone all sums are; None where all are.
+        counts: (H+1, W+1) running sums of the valid pixels; all sums use only these. None if all pixels are valid.
         min_overlap: positions where a smaller share of the template lies on valid pixels score -1.
     """
 
@@ -91,7 +91,7 @@ class LocalScores:
         return scores.clip(-1.0, 1.0)
 
     def _masked(self, products: Sums, j: Index, i: Index) -> Sums:
-        """Scores over the valid pixels alone, by the products of the picture, 0 elsewhere, with the template."""
+        """Scores over only the valid pixels, from products of the picture (0 elsewhere) with the template."""
         assert self._count is not None
         size, places = self._template.size, (j * self._row + i).tolist()
         sums = np.array([np.dot(self._valid[k : k + size], self._template) for k in places], np.float64)

@@ -10,8 +10,8 @@ import numpy as np
 from engine.runtime.jit import compiled, inlined
 
 MAX_RADIUS_PX = 180
-"""Of the largest neighbourhood whose sum of squares fits into int32."""
-_MIDDLE = 128  # from which levels are counted: squares lose fewer digits
+"""Radius of the largest neighbourhood whose sum of squares fits into int32."""
+_MIDDLE = 128  # subtracted from levels, so that squares lose fewer digits
 
 
 @compiled("(u1[:, ::1], i8, f8)")
@@ -28,7 +28,7 @@ def normalised(picture, radius_px, noise_variance):
     """
     height, width = picture.shape
     out = np.empty((height, width), np.float32)
-    left = np.empty(radius_px, np.int64)  # columns that stand for those beyond the edges
+    left = np.empty(radius_px, np.int64)  # columns that replace those beyond the edges
     right = np.empty(radius_px, np.int64)
     for n in range(radius_px):
         left[n], right[n] = _mirrored(n - radius_px, width), _mirrored(width + n, width)
@@ -86,7 +86,7 @@ def _replace(down, squares, new, old):
 
 @inlined
 def _accumulate(along, values, left, right):
-    """Write running sums along a row and what is beyond its edges; 0 comes first."""
+    """Write running sums along a row extended beyond its edges; the first is 0."""
     total, at = np.int32(0), 1
     for n in range(left.size):
         total += values[left[n]]

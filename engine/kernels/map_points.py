@@ -1,6 +1,6 @@
 """Points of a map: polynomials of its georeference and bilinear heights, compiled by numba.
 
-One point costs a microsecond and not the thirty of as many NumPy calls; a frame asks for some dozens.
+One point costs a microsecond instead of thirty by NumPy calls; a frame needs some dozens.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ def polynomials(points, centre, half, coefficients, out):
 
     Args:
         points: (N, 2).
-        centre: (2,) of the box where they hold.
+        centre: (2,) of their domain.
         half: (2,) half its sides.
         coefficients: (P, P, 2) of the powers of x, of y, and of which polynomial; of points in units of the box.
         out: (N, 2) takes the values.
 
     Returns:
-        Whether all points are inside the box; where not, the rest of ``out`` is undefined.
+        Whether all points are inside the box; if not, the rest of ``out`` is undefined.
     """
     last = coefficients.shape[0] - 1
     for n in range(points.shape[0]):

@@ -1,7 +1,7 @@
-"""Masked NCC on the CPU of templates that are whole: what lies wholly on valid pixels is scored without a mask.
+"""Masked NCC on the CPU for whole templates: positions wholly on valid pixels are scored without a mask.
 
-Only where a template reaches over the mask's edge are the sums of :mod:`engine.kernels.masked_tensors` needed. Of
-their six correlations a template without a mask leaves three; the others are sums over boxes.
+The sums of :mod:`engine.kernels.masked_tensors` are needed only where a template crosses the mask's edge. A
+template without a mask needs three of their six correlations; the others are sums over boxes.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from engine.kernels.transform_sizes import FLAT_SHARE
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_SMALL_PX = 1 << 17  # windows up to this size are scored in one way
+_SMALL_PX = 1 << 17  # windows up to this size are neither split nor scored in two ways
 _DIVISIONS = (1, 2, 3, 4, 6, 8, 12, 16)  # of a surface along each axis
-_SHARED = 0.4  # of the transforms of a block: those of the template, and the memory that is touched
-_MAX_CACHED_PX = 1 << 21  # transforms of more cost half as much again per pixel
+_SHARED = 0.4  # share of a block's cost: transforms of the template, and memory access
+_MAX_CACHED_PX = 1 << 21  # larger transforms cost 50 % more per pixel
 
 
 class _Model(NamedTuple):
@@ -46,7 +46,7 @@ def ncc_surface(
         min_overlap: positions where a smaller share of the template lies on valid pixels score -1.
 
     Returns:
-        (B, T, H-h+1, W-w+1) in [-1, 1]: float32 where both pictures are, else float64.
+        (B, T, H-h+1, W-w+1) in [-1, 1]: float32 if both pictures are, else float64.
     """
     windows = zip(search, search_valid, templates, strict=True)
     return np.stack([_surfaces(*window, min_overlap) for window in windows])
@@ -62,7 +62,7 @@ def _surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_ov
         min_overlap: positions where a smaller share of the template lies on valid pixels score -1.
 
     Returns:
-        (T, H-h+1, W-w+1) in [-1, 1]: float32 where both pictures are, else float64.
+        (T, H-h+1, W-w+1) in [-1, 1]: float32 if both pictures are, else float64.
     """
     h, w = templates.shape[1:]
     common = counts_inside(counts(valid), h, w)
@@ -86,7 +86,7 @@ def _surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_ov
 def _score_whole(
     out: NDArray[np.float32], centred: NDArray[np.float32], templates: NDArray[np.float32], whole: Mask
 ) -> None:
-    """Write the scores of places without an invalid pixel, and 0 elsewhere."""
+    """Write the scores of places without invalid pixels, and 0 elsewhere."""
     moments = surface_loops.moments(centred, True)
     models = [surface_loops.unit(template, True)[0] for template in templates]
     inverse_norms = surface_loops.inverse_norms(centred, *moments, *templates.shape[1:], True)
@@ -97,7 +97,7 @@ def _score_whole(
 def _score_partial(
     out: NDArray[Any], picture: tuple[NDArray[Any], Mask, float], templates: NDArray[Any], asked: Mask
 ) -> None:
-    """Write the scores of the places that are asked for, in float64, in blocks of which many have none."""
+    """Write the scores of the requested places, in float64, block by block; many blocks have none."""
     h, w = templates.shape[1:]
     (rows, columns), corners = _blocks(asked, h, w)
     size = fast_side(rows + h - 1), fast_side(columns + w - 1)

@@ -1,4 +1,4 @@
-"""Masked NCC by the FFT: pixels that are invalid in either picture are left out of all sums.
+"""Masked NCC by the FFT: all sums leave out pixels that are invalid in either picture.
 
 Padfield, Masked object registration in the Fourier domain, IEEE TIP 2012, doi:10.1109/TIP.2011.2181402. Every
 sum of the correlation coefficient is itself a correlation, of a picture, its square or its mask with another's;

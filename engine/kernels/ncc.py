@@ -1,4 +1,4 @@
-"""The interface to NCC's kernels: a function with several kernels selects one with plain ifs.
+"""Interface to NCC's kernels: a function with several kernels selects one with plain ifs.
 
 Arrays are the CPU's, and go to OpenCV and to compiled loops; tensors go to tensor ops. Kernels are
 imported where they are selected: torch and numba take a while.

@@ -12,7 +12,7 @@ FORBIDDEN = -1e30
 
 @compiled("(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4, f4, i8, f4[::1], i8[::1], f4[::1], b1[::1])")
 def two_nearest(cosine, own, other, least_cos, most_log, start, best, index, second, mutual):
-    """For each query the largest cosine among the allowed pairs, its row, and the second largest, of rows so far.
+    """For each query: the largest cosine among allowed pairs so far, its row, and the second largest.
 
     Args:
         cosine: (M, N) float32 of M others with N queries; those of pairs that are not allowed are overwritten.
@@ -20,10 +20,10 @@ def two_nearest(cosine, own, other, least_cos, most_log, start, best, index, sec
         other: (3, M) float32 likewise of the others, by the known rotation and scale.
         least_cos: of the difference of two angles; -2 allows all.
         most_log: difference of two logarithms of scale; infinite allows all.
-        start: of these rows among all.
-        best: (N,) float32 the largest cosine of the rows before, minus infinity where there is none; updated.
+        start: index of the first of these rows among all.
+        best: (N,) float32 the largest cosine of the rows before, minus infinity if there is none; updated.
         index: (N,) int64 its row among all, the first of equal ones; updated.
-        second: (N,) float32 the second largest, minus infinity where there is one row; updated.
+        second: (N,) float32 the second largest, minus infinity if there is only one row; updated.
         mutual: (N,) bool whether no other query has a larger cosine with that row; updated.
     """
     for m in range(len(cosine)):

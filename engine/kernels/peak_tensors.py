@@ -1,4 +1,4 @@
-"""Peaks on a GPU: what they are made of, found where the surfaces are, so that few numbers are copied."""
+"""Peaks on a GPU: find the numbers that define them on the device, so that few are copied."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from engine.runtime.tensors import Tensor, torch
 Array = NDArray[np.float64]
 Group: TypeAlias = Sequence[tuple[Tensor, Tensor, Tensor]]
 
-_REACH_PX = 2  # of the scores about a peak, on either side, that refine it
+_REACH_PX = 2  # scores around a peak, on either side, that refine it
 
 
 def summits(products: Tensor, inverse_norms: Tensor, *, exclusion_px: float) -> Tensor:
-    """What the peaks of surfaces are made of, where the surfaces are: nothing is copied from a GPU.
+    """The numbers that define the surfaces' peaks, on their device: nothing is copied from a GPU.
 
     Args:
         products: (T, H', W') float32 numerators.
@@ -79,7 +79,7 @@ def _matched(group: Group, exclusion_px: float) -> Tensor:
 
 
 def match(images: Tensor, sums: Tensor, templates: Tensor, exclusion_px: float) -> Tensor:
-    """Match a batch where its tensors are: fixed shapes, no copy, and nothing to wait for.
+    """Match a batch on its device: fixed shapes, no copy, no waiting.
 
     Args:
         images: (B, H, W) float32 of :class:`engine.ncc_fft.Search`.

@@ -67,7 +67,7 @@ def fit_pose(
         matrix: (3, 3) pinhole.
         weights: (N,) relative inverse variances.
         attitude: (3, 3) known rotation.
-        precision: (3, 3) inverse covariance of its angles, 0 where it is not known.
+        precision: (3, 3) inverse covariance of its angles, 0 if unknown.
         tolerance_px: of an inlier.
         noise_floor_px: least standard deviation of a pixel.
         least: number of inliers with which to go on.
@@ -163,7 +163,7 @@ def normal_equations(tangents, projected, squared, pixels, matrix, weights, reac
 
 @inlined
 def _mark_within(squared, reach, inliers):
-    """Mark the matches of which the squared distance is within a reach; returns how many they are."""
+    """Mark the matches with a squared distance within a reach; return their number."""
     count = 0
     for n in range(squared.size):
         inliers[n] = squared[n] <= reach
@@ -173,7 +173,7 @@ def _mark_within(squared, reach, inliers):
 
 @inlined
 def _invert(information, precision, out):
-    """Write the inverse of what the matches and the known attitude say; False where that is not definite."""
+    """Write the inverse information of matches and known attitude; False if it is not definite."""
     total, right = np.empty((_SIX, _SIX)), np.empty(_SIX)
     for column in range(_SIX):
         for i in range(_SIX):

@@ -1,4 +1,4 @@
-"""NCC as the equation is written, in float64: the reference of the other kernels' tests."""
+"""NCC literally by the equation, in float64: the reference for the other kernels' tests."""
 
 from __future__ import annotations
 

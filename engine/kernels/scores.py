@@ -1,4 +1,4 @@
-"""The scores: what of the grey levels of frame and map is correlated, the paper's "enhance" step."""
+"""The scores: which quantity of frame and map is correlated, the paper's "enhance" step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _STRUCTURE_NOISE = 20.0  # squared grey levels, so that sensor noise on flat gro
 
 
 def check_score(score: str) -> None:
-    """Raise OptionError where no score has this name."""
+    """Raise OptionError if no score has this name."""
     if score not in SCORES:
         raise OptionError(f"score: expected one of {', '.join(SCORES)}, got {score!r}")
 
@@ -28,7 +28,7 @@ def check_score(score: str) -> None:
 def enhance(
     gray: NDArray[np.uint8], *, radius_px: int = 8, score: str = "local", valid: NDArray[np.bool_] | None = None
 ) -> FloatImage:
-    """The paper's "enhance" step: what of the grey levels is correlated, the same for frame and map.
+    """The paper's "enhance" step: computes the quantity to correlate, the same for frame and map.
 
     The picture is first smoothed by the binomial 1-2-1, since aliasing of sampled edges biases correlation peaks
     towards whole pixels. ``docs/scores.md`` compares the scores.
@@ -102,7 +102,7 @@ def orientation(
 
 
 def _smoothed(gray: NDArray[np.uint8], weight: FloatImage | None) -> NDArray[np.uint8] | FloatImage:
-    """The picture smoothed by 1-2-1: in uint8, which is faster, or in float32 where there is a mask."""
+    """The picture smoothed by 1-2-1: in uint8, which is faster, or in float32 with a mask."""
     if weight is None:
         return np.asarray(cv2.GaussianBlur(gray, (3, 3), 0))
     share = np.maximum(cv2.GaussianBlur(weight, (3, 3), 0), 1e-6)

@@ -18,7 +18,7 @@ MAX_HALVINGS = 3
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Part of a map prepared for matching: what does not depend on the frame. Arrays on the CPU, tensors on a GPU.
+    """Part of a map prepared for matching, independent of the frame. Arrays on the CPU, tensors on a GPU.
 
     Attributes:
         image: (H, W) float32, its mean small against its standard deviation.
@@ -26,8 +26,8 @@ class Search:
             None on the coarsest level.
         sums: (2, H+1, W+1) float64 running sums of the picture and of its square on a GPU; None on the CPU, where
             the sums of a window take one pass.
-        counts: (H+1, W+1) int32 running sums of its valid pixels, of which the others are 0 in the picture; None
-            where all are valid, on a GPU, and at half resolution.
+        counts: (H+1, W+1) int32 running sums of its valid pixels; invalid ones are 0 in the picture. None if all
+            are valid, on a GPU, and at half resolution.
     """
 
     image: Picture
@@ -38,7 +38,7 @@ class Search:
     def crop(self, x0: int, y0: int, width: int, height: int) -> Search:
         """Crop columns [x0, x0 + width) and rows [y0, y0 + height), without a copy.
 
-        The half-resolution level is kept where the crop begins on an even pixel.
+        The half-resolution level is kept if the crop begins on an even pixel.
         """
         rows, columns = slice(y0, y0 + height), slice(x0, x0 + width)
         half = None
@@ -56,7 +56,7 @@ def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.b
     Args:
         image: (H, W) float32, its mean small against its standard deviation.
         halvings: upper bound on the number of half-resolution levels.
-        valid: (H, W); None where all pixels are. The picture is 0 where they are not.
+        valid: (H, W); None if all pixels are. The picture is 0 where they are not.
 
     Returns:
         Search: with levels down to 48 x 48 pixels.

@@ -14,7 +14,7 @@ import numpy as np
 from engine.runtime.jit import compiled, inlined
 
 _BOUND = 0.2  # of an entry before the last normalisation
-_LEAST = 1e-24  # which keeps an empty descriptor zero
+_LEAST = 1e-24  # keeps an empty descriptor zero
 
 
 @inlined
@@ -42,7 +42,7 @@ def _sample(buffer, layout, x, y, cos, sin, patch):
 
 @inlined
 def _sample_upright(buffer, layout, x, y, spacing, line, patch):
-    """The same on a grid that is not rotated, whose columns and rows are found once each: half the time."""
+    """The same on an unrotated grid: columns and rows are computed once each, in half the time."""
     height, width, base, per_row = layout
     left, share = line
     side = len(patch)
@@ -149,7 +149,7 @@ def descriptors(buffer, table, keypoints, angle, step, tent, root):
         angle: (M,) float32 radians.
         step: spacing of the samples where the growth is 1, in pixels of the octave.
         tent: (cells, S) float32 weights of a row's samples in the cells.
-        root: whether RootSIFT is asked for.
+        root: whether to compute RootSIFT.
 
     Returns:
         (M, cells^2 * 8) float32, cells row by row.

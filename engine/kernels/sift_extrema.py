@@ -13,7 +13,7 @@ from engine.runtime.jit import compiled, inlined
 
 TAPS = 4
 """Taps of a filter that one pass over a strip applies; filters are padded with zeros to a multiple of it."""
-_STRIP = 8  # rows of the octave that are written at a time; a multiple of a word of flags and of both phases
+_STRIP = 8  # rows of the octave written at a time; a multiple of a word of flags and of both phases
 
 
 @compiled(
@@ -152,7 +152,7 @@ def _apply_gains(out, gains, gain):
 
 @inlined
 def _gain_of(gains, level, y, height):
-    """The gain of one output along an axis, of the first and the last of which they are kept."""
+    """The gain of one output along an axis; gains are stored for its first and last outputs."""
     edge = gains.shape[2]
     if y < edge:
         return gains[0, level, y]

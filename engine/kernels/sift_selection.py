@@ -1,4 +1,4 @@
-"""Which of SIFT's keypoints are kept: those within their cell's share first, compiled by numba."""
+"""Select SIFT's keypoints: those within their cell's share first. Compiled by numba."""
 
 from __future__ import annotations
 

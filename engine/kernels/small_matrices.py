@@ -12,7 +12,7 @@ from engine.runtime.jit import compiled, inlined
 
 @compiled()
 def mirror(matrix):
-    """Complete a symmetric matrix (N, N) of which the lower triangle is known, in place."""
+    """Complete a symmetric matrix (N, N) from its lower triangle, in place."""
     for i in range(matrix.shape[0]):
         for j in range(i):
             matrix[j, i] = matrix[i, j]
@@ -20,7 +20,7 @@ def mirror(matrix):
 
 @compiled()
 def solve(matrix, right, out):
-    """Solve by Cholesky's decomposition, which overwrites the matrix; False where it is not positive definite."""
+    """Solve by Cholesky's decomposition, which overwrites the matrix; False if it is not positive definite."""
     size = right.size
     for i in range(size):
         for j in range(i + 1):

@@ -1,4 +1,4 @@
-"""What is computed once of a picture on the CPU, by OpenCV: sums, and means of 2 x 2 pixels."""
+"""Sums and 2 x 2 means of a picture, computed once on the CPU by OpenCV."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What surrounds the transforms of a correlation on the CPU, compiled by numba: one pass, no temporaries.
+"""Loops around the transforms of a correlation on the CPU, compiled by numba: one pass, no temporaries.
 
 Sums are in float64 and about the window's mean, or of a picture about 0: a large offset would cost digits.
 """
@@ -25,7 +25,7 @@ def moments(picture, zero_mean):
         zero_mean: take the squares about the mean; else the mean is taken as 0.
 
     Returns:
-        Both in float64; not finite where a pixel is not.
+        Both in float64; not finite if a pixel is not.
     """
     # Counted from the first pixel: a picture of one level has sums of exactly 0.
     start, total, square = np.float64(picture[0, 0]) if zero_mean else 0.0, 0.0, 0.0
@@ -267,7 +267,7 @@ def normalise(out, products, inverse, factor):
     "(f4[:, ::1], b1[:, ::1], f8[:, :, ::1], Tuple((f8[:, :, ::1], i4[:, ::1])), UniTuple(i8, 2), UniTuple(f8, 2))"
 )
 def masked_scores(out, asked, sums, boxes, model, floors):
-    """Write the scores of a template that is whole at the places of a block that are asked for.
+    """Write the scores of a whole template at the requested places of a block.
 
     Args:
         out: (H', W') float32 or float64, written to.

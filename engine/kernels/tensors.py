@@ -66,7 +66,7 @@ def _one_surface(search: Tensor, templates: Tensor, zero_mean: bool) -> Tensor:
 
 
 def _suits_float32(search: Tensor, window_energy: Tensor, energy: Tensor) -> bool:
-    """Whether no patch is too weak for float32; on a GPU not asked, since the host would wait for the answer."""
+    """Whether no patch is too weak for float32; not checked on a GPU, since the host would wait for it."""
     if search.device.type != "cpu" or search.dtype == torch.float64:
         return False
     return float(window_energy) <= FLOAT32_NORM_RATIO**2 * float(energy.min())
@@ -90,7 +90,7 @@ def products(image: Tensor, templates: Tensor) -> Tensor:
     """Numerators of :func:`prepared_surface`.
 
     Args:
-        image: (H, W) float32, or (T, H, W) where every template has its own.
+        image: (H, W) float32, or (T, H, W) if every template has its own.
         templates: (T, h, w) float32 of zero mean, scaled to a norm of 1 here.
 
     Returns:
@@ -125,7 +125,7 @@ def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_square
         radius_squared: positions of at most this squared distance are inside, in squared pixels.
 
     Returns:
-        (T,) float32; -1 where nothing is outside.
+        (T,) float32; -1 if nothing is outside.
     """
     height, width = products.shape[1:]
     row, column = (winner // width)[:, None, None], (winner % width)[:, None, None]
@@ -159,7 +159,7 @@ def correlate(search: Tensor, templates: Tensor) -> Tensor:
     """Cross-correlation by the correlation theorem.
 
     Args:
-        search: (H, W) floating point, or (T, H, W) where every template has its own.
+        search: (H, W) floating point, or (T, H, W) if every template has its own.
         templates: (T, h, w) of the same dtype.
 
     Returns:

@@ -1,7 +1,7 @@
 """Learned matchers: networks with weights from the user's own files. Nothing is downloaded.
 
-LoFTR alone, or DISK, ALIKED or SuperPoint with LightGlue; :func:`load_matcher` recognises by the names of its
-tensors what a file holds. A weights file is opened as tensors only: a pickle that would run code is refused.
+LoFTR alone, or DISK, ALIKED or SuperPoint with LightGlue; :func:`load_matcher` recognises a file by the names of
+its tensors. A weights file is opened as tensors only: a pickle that would run code is refused.
 """
 
 from typing import TYPE_CHECKING
@@ -33,7 +33,7 @@ _NAMES = {
 }
 """The public names by module. A module is imported when one of its names is used: networks need torch."""
 
-if not TYPE_CHECKING:  # checkers of types know the names above, and refuse others
+if not TYPE_CHECKING:  # type checkers see the names above and reject others
     __getattr__ = imported_on_use(__name__, _NAMES)
 
 

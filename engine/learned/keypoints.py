@@ -25,7 +25,7 @@ class Keypoints:
 
     Attributes:
         xy_px: (N, 2).
-        strength: (N,) the larger, the likelier it is found again; comparable within one network.
+        strength: (N,) larger if the keypoint is likelier to be found again; comparable within one network.
         descriptors: (N, D).
     """
 
@@ -37,7 +37,7 @@ class Keypoints:
         return len(self.xy_px)
 
     def only(self, chosen: Tensor) -> Keypoints:
-        """Those of a mask (N,) or of indices."""
+        """The keypoints selected by a mask (N,) or by indices."""
         return Keypoints(self.xy_px[chosen], self.strength[chosen], self.descriptors[chosen])
 
 

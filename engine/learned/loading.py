@@ -26,7 +26,7 @@ def load_matcher(
     max_keypoints: int = 2048,
     min_confidence: float = 0.5,
 ) -> KeypointMatcher | Loftr:
-    """Build the matcher that some files hold, in any order.
+    """Build the matcher from its files, in any order.
 
     Args:
         paths: LoFTR alone, or LightGlue with DISK, ALIKED or SuperPoint; state dicts or checkpoints, under the
@@ -36,8 +36,8 @@ def load_matcher(
         min_confidence: of a match by LoFTR, in [0, 1]; LightGlue has a threshold of its own.
 
     Raises:
-        OptionError: a file is missing, is not one of tensors, holds no known network or does not fit it, or the
-            files do not make a matcher.
+        OptionError: a file is missing, holds no tensors or no known network, or does not fit it, or the files do
+            not form a matcher.
         DeviceError: the device is not there.
     """
     if max_keypoints < 2:
@@ -131,13 +131,13 @@ def _disk(weights: Weights, device: torch.device) -> nn.Module:
 
 
 def _aliked(weights: Weights, device: torch.device) -> nn.Module:
-    """ALIKED of the size that its tensors have."""
+    """ALIKED in the size of its tensors."""
     if len(weights.tensors["block1.conv1.weight"]) == 8:
         name = "aliked-t16"
     else:
         offsets = weights.tensors.get("desc_head.agg_weights")
         name = "aliked-n32" if offsets is not None and len(offsets) == 32 else "aliked-n16"
-    # Without a threshold every local maximum is a keypoint; how many are taken is said picture by picture.
+    # Without a threshold every local maximum is a keypoint; each call limits their number.
     return fill(_kornia().ALIKED(name, max_num_keypoints=1 << 16, detection_threshold=0.0), weights, device)
 
 
@@ -146,13 +146,13 @@ def _superpoint(weights: Weights, device: torch.device) -> nn.Module:
 
 
 def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Module:
-    """LightGlue for descriptors of so many numbers, as deep as its file.
+    """LightGlue for descriptors of this length, with its file's depth.
 
     Raises:
         OptionError: it is for descriptors of another length, or for keypoints with a scale and an angle.
     """
     light_glue = _kornia().LightGlue
-    tensors, unnamed = weights.tensors, None  # named features would make kornia fetch their weights
+    tensors, unnamed = weights.tensors, None  # for named features kornia would fetch weights
     projection, positions = tensors.get("input_proj.weight"), tensors.get("posenc.Wr.weight")
     taken = 256 if projection is None else int(projection.shape[-1])
     if weights.kind == "LightGlue":

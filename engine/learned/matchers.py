@@ -74,7 +74,7 @@ class KeypointMatcher:
     def match(
         self, first: Keypoints, first_size_px: tuple[int, int], second: Keypoints, second_size_px: tuple[int, int]
     ) -> Tensor:
-        """Which keypoints of two pictures belong together.
+        """Match the keypoints of two pictures.
 
         Args:
             first: of one picture.
@@ -121,7 +121,7 @@ def _device_of(network: nn.Module) -> torch.device:
 
 
 def _padded(image: Tensor, multiple: int) -> Tensor:
-    """The picture, its edge replicated at the right and at the bottom to whole cells."""
+    """The picture, padded at the right and bottom to whole cells by replicating its edge."""
     height, width = image.shape[2:]
     return functional.pad(image, (0, -width % multiple, 0, -height % multiple), mode="replicate")
 

@@ -1,4 +1,4 @@
-"""What a matcher of two pictures is, for options that name one: it needs no network and no torch."""
+"""The interface of image matchers, for options that name one; needs no network and no torch."""
 
 from __future__ import annotations
 
@@ -20,6 +20,6 @@ class PairMatcher(Protocol):
 
         Returns:
             The matched points, (M, 2) in the frame's pixels and (M, 2) in the crop's, both (x, y) with centres
-            at integers. Row by row they belong together; M may be 0.
+            at integers. Rows correspond; M may be 0.
         """
         ...

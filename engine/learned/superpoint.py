@@ -1,4 +1,4 @@
-"""SuperPoint: a network that detects keypoints and describes them, with the published names of its layers.
+"""SuperPoint: a network that detects and describes keypoints, with the published names of its layers.
 
 References:
     DeTone, Malisiewicz and Rabinovich, SuperPoint: Self-supervised interest point detection and description,
@@ -11,7 +11,7 @@ from engine.runtime.tensors import Tensor, functional, nn, torch
 
 CELL_PX = 8
 """Side of the cell of pixels that shares one descriptor, and in which the detector chooses at most one place."""
-_BORDER_PX = 4  # a keypoint nearer to the edge was seen only in part
+_BORDER_PX = 4  # a keypoint nearer to the edge is only partly visible
 _SEPARATION_PX = 4  # the strongest keypoint within this distance stays
 _MIN_SCORE = 0.0005
 

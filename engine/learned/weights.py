@@ -20,10 +20,10 @@ KINDS = {
     "LoFTR": ("backbone.conv1.weight", "loftr_coarse.layers.0.q_proj.weight"),
 }
 """Tensors by which each network's file is recognised."""
-_WRAPPERS = ("state_dict", "extractor", "model")  # under which checkpoints keep their tensors
-# Computed anew where a file lacks them.
+_WRAPPERS = ("state_dict", "extractor", "model")  # keys under which checkpoints keep their tensors
+# Recomputed if a file lacks them.
 _DERIVED = ("num_batches_tracked", "confidence_thresholds", "dkd.hw_grid")
-# What training left in published files, and inference does not read.
+# Training leftovers in published files, not used for inference.
 _UNUSED = re.compile(r"log_assignment\.\d+\.r|.*num_batches_tracked|confidence_thresholds")
 _LISTED = 3  # names in a message
 
@@ -34,7 +34,7 @@ class Weights:
 
     Attributes:
         path: of the file.
-        kind: of :data:`KINDS`, or None where the names are of no known network.
+        kind: of :data:`KINDS`, or None if the names are of no known network.
         tensors: by the names that the networks have now.
     """
 
@@ -50,7 +50,7 @@ def read_weights(path: str | Path) -> Weights:
         path: a state dict, or a checkpoint that holds one.
 
     Raises:
-        OptionError: the file is missing or not one of tensors alone.
+        OptionError: the file is missing or contains more than tensors.
     """
     tensors = {_present_name(name): value for name, value in _read(path).items()}
     kind = next((kind for kind, names in KINDS.items() if all(name in tensors for name in names)), None)
@@ -80,7 +80,7 @@ def fill(network: nn.Module, weights: Weights, device: torch.device) -> nn.Modul
 
 
 def _present_name(name: str) -> str:
-    """LightGlue's layers were once self_attn.3 and cross_attn.3, and are transformers.3.self_attn now."""
+    """Rename LightGlue's old layers, self_attn.3 and cross_attn.3, to transformers.3.self_attn and so on."""
     name = name.removeprefix("matcher.")
     part, _, rest = name.partition(".")
     if part not in ("self_attn", "cross_attn"):
@@ -90,7 +90,7 @@ def _present_name(name: str) -> str:
 
 
 def _read(path: str | Path) -> Mapping[str, Tensor]:
-    """The tensors of a file by the names that it has for them."""
+    """The tensors of a file by the file's names."""
     if not Path(path).is_file():
         raise OptionError(f"weights: no such file: {path}")
     try:

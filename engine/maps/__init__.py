@@ -1,1 +1,1 @@
-"""Raster files as maps: grids, tiles, pyramids, surface models, and what a method has prepared of a map, once."""
+"""Raster files as maps: grids, tiles, pyramids, surface models, and data that methods prepare once from a map."""

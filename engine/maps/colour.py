@@ -1,4 +1,4 @@
-"""Colours of a map for pictures of it: a window of its grid, read from the file in whatever grid that is in."""
+"""Colours of a map window for display, read from the file in any grid."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Rgb = NDArray[np.uint8]
 
 
 def read_colour(source: Source, grid: Grid, window: Window, shape: tuple[int, int]) -> Rgb | None:
-    """Colours of a window; None where the file has fewer than three bands and no colour table.
+    """Colours of a window; None if the file has fewer than three bands and no colour table.
 
     Args:
         source: the map's file.
-        grid: of the map in use, in which the window lies.
+        grid: of the map in use; the window is in its pixels.
         window: in full-resolution pixels of ``grid``.
         shape: rows and columns of the result.
 
@@ -38,7 +38,7 @@ def read_colour(source: Source, grid: Grid, window: Window, shape: tuple[int, in
     limit = np.array([source.grid.width_px, source.grid.height_px])
     low = np.clip(np.floor(xy.min(axis=(0, 1))) - 2, 0, limit - 1).astype(int)
     high = np.clip(np.ceil(xy.max(axis=(0, 1))) + 3, low + 1, limit).astype(int)
-    # Read at about the resolution of the result, from an overview of the file where it has one.
+    # Read at about the resolution of the result, from an overview if the file has one.
     shrink = max(1.0, float(np.sqrt(np.prod(high - low) / math.prod(shape))))
     size = np.maximum(1, np.round((high - low) / shrink)).astype(int)
     bands = _read(source, low, high - low, size, palette)

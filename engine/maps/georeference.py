@@ -28,7 +28,7 @@ class Georeference:
         width_px, height_px: columns and rows.
         crs: of the grid.
         frame: local east-north-up; its origin is the centre of the map.
-        gsd_m_per_px: true metres on the ground per pixel at the centre: the root of the area of a pixel.
+        gsd_m_per_px: true metres on the ground per pixel at the centre: the square root of a pixel's area.
         bounds_deg: west, south, east, north of the outer edges.
 
     Raises:

@@ -24,19 +24,19 @@ Array = NDArray[np.float64]
 Function = Callable[[Array], Array]
 
 WARP_MARGIN = 0.5
-"""Polynomial transforms cover this share of the map's longer side beyond its edges; beyond they are exact."""
+"""Polynomial transforms extend beyond the map by this share of its longer side; farther out they are exact."""
 
 
 class Warp:
     """A transform of the plane by polynomials that were checked against the exact function.
 
     PROJ, and the conversion from the tangent plane to the ellipsoid, take a fraction of a millisecond a call. Over
-    one map both are so smooth that polynomials of degree 5 follow them to micrometres. Where one point of a call
-    is outside ``box``, and everywhere if the fit misses ``tolerance``, all points take the exact function.
+    one map both are so smooth that polynomials of degree 5 follow them to micrometres. If any point of a call is
+    outside ``box``, or if the fit misses ``tolerance``, all points take the exact function.
 
     Args:
         exact: function of points (..., 2) to points (..., 2).
-        box: (2, 2) low and high corner of where the polynomials hold.
+        box: (2, 2) low and high corner of the polynomials' domain.
         tolerance: largest error of a coordinate, in the units of the result.
     """
 
@@ -134,7 +134,7 @@ def earth_crs(value: Any, argument: str) -> CRS:
         argument: its name in messages.
 
     Raises:
-        MapError: it is no such system.
+        MapError: it is not such a system.
     """
     from pyproj import CRS, Transformer
     from pyproj.exceptions import ProjError
@@ -195,7 +195,7 @@ class Grid:
 
         def back(points: Array) -> Array:
             x, y = backward.transform(points[..., 0], points[..., 1])
-            if self.crs.is_geographic:  # a map across the antimeridian counts on beyond 180 degrees
+            if self.crs.is_geographic:  # a map across the antimeridian continues beyond 180 degrees
                 x = centre_x + (np.asarray(x) - centre_x + 180.0) % 360.0 - 180.0
             return apply_affine(crs_to_pixel, np.stack([x, y], axis=-1))
 
@@ -205,7 +205,7 @@ class Grid:
         """Bounding box of the outer edges.
 
         Args:
-            margin: by which it is widened, as a share of the longer side.
+            margin: added to each side, as a share of the longer side.
 
         Returns:
             (2, 2) low and high corner in pixels.
@@ -214,7 +214,7 @@ class Grid:
         return np.array([[-grow, -grow], [self.width_px - 1 + grow, self.height_px - 1 + grow]])
 
     def lattice(self, count: int = 33) -> Array:
-        """Points spread evenly over the picture, its outer edges included.
+        """Points spread evenly over the picture, including its outer edges.
 
         Args:
             count: along each side.
@@ -228,7 +228,7 @@ class Grid:
 
     @property
     def is_metric(self) -> bool:
-        """Whether it can be matched against as it is: projected, north-up, square on the ground to 1 %."""
+        """Whether it can be matched without resampling: projected, north-up, square on the ground to 1 %."""
         linear = self.pixel_to_crs[:, :2]
         step = np.abs(linear).max()
         upright = linear[0, 0] > 0 and linear[1, 1] < 0 and abs(linear[[0, 1], [1, 0]]).max() < 1e-3 * step
@@ -253,11 +253,11 @@ def overlap(grid: Grid, other: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp]
     """The part of another grid that a grid covers, widened by two pixels.
 
     Args:
-        grid: that covers.
-        other: whose part is returned.
+        grid: the grid that covers.
+        other: the grid of which a part is returned.
 
     Returns:
-        (2,) first pixel (x, y) of ``other``, and (2,) the one past the last; equal where they do not overlap.
+        (2,) first pixel (x, y) of ``other``, and (2,) the one past the last; equal if they do not overlap.
     """
     points = warp_between(grid, other)(grid.lattice())
     points = points[np.isfinite(points).all(axis=1)]

@@ -1,4 +1,4 @@
-"""Heights of a surface model under a map: the part that overlaps, its pixels and its grid."""
+"""Heights of a surface model under a map: the overlapping part, its pixels and its grid."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HEIGHT_RANGE_M = (-1000.0, 20000.0)
 
 
 def read_surface(source: Source, grid: Grid, limit_px: int = SURFACE_LIMIT_PX) -> tuple[NDArray[np.float32], Grid]:
-    """The part of a surface model under a map, decimated by averages where it exceeds a limit.
+    """The part of a surface model under a map, averaged down if it exceeds a limit.
 
     Args:
         source: the model.
@@ -62,7 +62,7 @@ def surface_part(source: Source, grid: Grid) -> Window:
 
 
 def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Heights of a window of a surface model, averaged where the result is coarser.
+    """Heights of a window of a surface model, averaged if the result is coarser.
 
     Args:
         source: the model.

@@ -1,7 +1,7 @@
-"""The map's keypoints by a network, described once tile by tile as the flight reaches them, looked up by window.
+"""The map's keypoints by a network: each tile is described once, when the flight reaches it. Lookup by window.
 
-A tile is described with the neighbourhood beyond its edges. A network that normalises over the whole picture, as
-DISK does, still describes a tile a little differently than the level in one piece.
+A tile is described with the neighbourhood beyond its edges. A network that normalises over the whole picture, such
+as DISK, still describes a tile slightly differently from the whole level.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from engine.maps.recently_used import RecentlyUsed
 from engine.runtime.tensors import torch
 from engine.values import Window
 
-if TYPE_CHECKING:  # a map is built on what lies here
+if TYPE_CHECKING:  # avoids an import circle with the map
     from engine.orthomap import OrthoMap
 
 TILE_PX = 512
@@ -26,7 +26,7 @@ TILE_PX = 512
 HALO_PX = 64
 """Margin around a tile that is read for description."""
 PX_PER_KEYPOINT = 64
-"""A tile has at most one keypoint for so many pixels."""
+"""A tile has at most one keypoint per this many pixels."""
 MAX_KEYPOINTS = 1 << 18
 """Keypoints kept in memory, besides those of the last window; one takes up to 520 bytes."""
 _NODATA_PX = 5  # a keypoint this near to a pixel without data may be its edge
@@ -39,7 +39,7 @@ class KeypointMap:
 
     Args:
         site: the map.
-        matcher: whose extractor describes it.
+        matcher: its extractor describes the map.
     """
 
     def __init__(self, site: OrthoMap, matcher: KeypointMatcher) -> None:
@@ -57,7 +57,7 @@ class KeypointMap:
         Args:
             window: in pixels of the level, inside it.
             level: of the map's pyramid.
-            count: upper bound on the keypoints; where there are more, every tile keeps the same share of its own.
+            count: upper bound on the keypoints; if there are more, every tile keeps the same share of its own.
 
         Returns:
             Keypoints: in pixels of the window.

@@ -1,7 +1,7 @@
-"""Cache of named arrays on disk, one file per key; the key is a hash of what the arrays were computed from.
+"""Cache of named arrays on disk, one file per key; the key is a hash of the arrays' inputs.
 
 Files are validated: one that cannot be read, has another key, or holds other arrays than requested counts as
-missing. A folder that cannot be written is no error; the arrays are then computed again.
+missing. A folder that cannot be written is not an error; the arrays are then computed again.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ def load_arrays(key: str, kinds: Kinds) -> NamedArrays | None:
 
     Args:
         key: from :func:`cache_key`.
-        kinds: names, element types and shapes that are expected.
+        kinds: expected names, element types and shapes.
 
     Returns:
-        Arrays (N, ...) with a common N and finite values; None where the file is missing or not valid.
+        Arrays (N, ...) with a common N and finite values; None if the file is missing or not valid.
     """
     try:
         with cache_path(key).open("rb") as stream, np.load(stream, allow_pickle=False) as file:

@@ -27,9 +27,9 @@ if TYPE_CHECKING:  # a map is built on what lies here
 Array = NDArray[np.float64]
 
 DETECTOR_VERSION = 3
-"""Part of the key of cached landmarks; to be raised with every change of detector or descriptor."""
+"""Part of the key of cached landmarks; raise it with every change of detector or descriptor."""
 MIN_CONTRAST = 0.005
-"""Lowe's contrast threshold: bare ground has little, and where there is more the strongest are taken."""
+"""Lowe's contrast threshold: bare ground has little; elsewhere the strongest are taken."""
 TILE_PX = 256
 """Tiles begin on multiples of this in every level."""
 HALO_PX = 64
@@ -38,11 +38,11 @@ CELL_PX = 64
 """Landmarks are ranked by strength within square cells of the level."""
 MAX_PER_CELL = 96
 PREPARED_PX = 16 << 20
-"""Largest number of pixels of the levels that are prepared at once, and of a level that is searched as a whole."""
+"""Most pixels of levels prepared at once, and of a level that is searched as a whole."""
 MAX_LANDMARKS = 1 << 19
 """Landmarks cached in memory, besides those of the last window; one takes 300 bytes.
 
-Where more were prepared before the flight the limit is raised to their number, up to 236 MB.
+If more were prepared before the flight, the limit rises to their number, up to 236 MB.
 """
 _SLOTS = 8192  # more than the detector finds in a tile
 _STORED: Kinds = {
@@ -60,7 +60,7 @@ class Landmarks:
 
     Attributes:
         features: batch of one, N slots, in pixels of the level, on the device.
-        xy_px: (N, 2) their positions once more, where no device must be asked.
+        xy_px: (N, 2) a copy of their positions in host memory.
         points_m: (N, 3) east, north and height of the surface.
     """
 
@@ -77,7 +77,7 @@ class LandmarkMap:
 
     Args:
         site: the map.
-        device: of detection and of the returned features; the cache is in the CPU's memory.
+        device: of detection and of the returned features; the cache is in host memory.
         backend: of :func:`engine.features.sift`.
     """
 
@@ -111,7 +111,7 @@ class LandmarkMap:
         return self._to_landmarks(_gathered(tiles, [_inside(tile, window, max_rank) for tile in tiles]))
 
     def prepare(self, levels: Iterable[int] | None = None) -> None:
-        """Describe whole levels, upright and not, and cache them in a file where the map comes from one.
+        """Describe whole levels, upright and not, and cache them in a file if the map comes from one.
 
         Args:
             levels: in order of preference, up to :data:`PREPARED_PX` in all; None takes all, the coarsest first.
@@ -123,7 +123,7 @@ class LandmarkMap:
                 break
             for upright in (True, False):
                 self._prepare(level, upright)
-        # No more than what is prepared now: a large map, of which little is prepared, keeps the usual limit.
+        # No more than is prepared now: a large map with few prepared levels keeps the usual limit.
         self._max_landmarks = max(self._max_landmarks, sum(map(_count, self._tiles.values())))
 
     def _prepare(self, level: int, upright: bool) -> None:
@@ -149,12 +149,12 @@ class LandmarkMap:
             self._tiles[key] = self._with_points({field: values[own] for field, values in stored.items()}, level)
 
     def _tile(self, key: _Key) -> NamedArrays:
-        """A tile, which becomes the most recently used."""
+        """Get a tile, which becomes the most recently used."""
         level = key[0]
         return self._tiles.get(key, lambda: self._with_points(self._detect(*key), level))
 
     def _detect(self, level: int, upright: bool, row: int, column: int) -> NamedArrays:
-        """Every keypoint on a tile, as it would be detected in the whole level."""
+        """Every keypoint on a tile, as detected in the whole level."""
         rows, columns = self._site.level_shape(level)
         x0, y0 = column * TILE_PX, row * TILE_PX
         x1, y1 = min(columns, x0 + TILE_PX), min(rows, y0 + TILE_PX)
@@ -172,7 +172,7 @@ class LandmarkMap:
             upright=upright,
             mask=torch.from_numpy(mask)[None, None].to(self._device),
             contrast_threshold=MIN_CONTRAST,
-            spread=1,  # by strength alone; landmarks are spread by the cells of the level
+            spread=1,  # by strength alone; the level's cells spread landmarks
         )
         fields = (found.valid, found.xy_px, found.scale_px, found.angle_deg, found.descriptors)
         valid, *all_slots = download([values[0] for values in fields])

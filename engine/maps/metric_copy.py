@@ -1,8 +1,8 @@
-"""The metric copy of a map, which is matched against: north-up in UTM, created once and cached on disk.
+"""The metric copy of a map, used for matching: north-up in UTM, created once and cached on disk.
 
-A map in degrees, a rotated one or one of oblong pixels is resampled for it; a large one without overviews gets
-those. A large copy is a folder of tiles. Each is written and renamed in one step, with a line in a list that has
-the hash of its content, so that an interrupted copy is continued and a damaged tile is created again.
+A map in degrees, rotated or with oblong pixels is resampled; a large one without overviews gets them. A large copy
+is a folder of tiles. Each is written and renamed in one step, and a list records the hash of its content, so that
+an interrupted copy can continue and a damaged tile is created again.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from engine.values import Window
 
 MAX_SIDE_PX = 1_000_000
 GRID_VERSION = 1
-"""Part of the key of cached copies; to be raised with every change of how they are created."""
+"""Part of the key of cached copies; raise it with every change in how they are created."""
 TILE_PX = 8192
 """Side of the tiles of a large copy; each has overviews down to a thirty-second."""
 COARSEST_PX = 16384
 """A large file whose smallest overview has a longer side than this is copied."""
 LIST = "tiles.txt"
-"""In the folder of a large copy: a line per tile, its name and its SHA-256, or "-" where it has no valid pixel."""
+"""In the folder of a large copy: a line per tile, its name and its SHA-256, or "-" if it has no valid pixel."""
 ProgressCallback = Callable[[int, int], None]
 """Called while a copy is created, with the number of pixels done and in all."""
 _CACHED_HASH_BYTES = 1 << 22  # the hashes of larger files are cached by size and time
@@ -65,12 +65,12 @@ def _metric_grid(source: Grid) -> Grid:
 
 
 def is_large(grid: Grid) -> bool:
-    """Whether a map of this grid is read window by window, instead of being held in memory."""
+    """Whether a map on this grid is read window by window instead of held in memory."""
     return grid.width_px * grid.height_px > MEMORY_LIMIT_PX
 
 
 def needs_copy(source: Source) -> bool:
-    """Whether a map cannot be used as it is: its grid is not metric, or it is large without overviews."""
+    """Whether a map needs a copy: its grid is not metric, or it is large without overviews."""
     grid = source.grid
     if not grid.is_metric:
         return True
@@ -123,7 +123,7 @@ def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> It
 
 
 class _Progress:
-    """Counts the pixels of a copy that are done, and reports them."""
+    """Counts and reports the finished pixels of a copy."""
 
     def __init__(self, grid: Grid, on_progress: ProgressCallback | None) -> None:
         self._done_px, self._all_px, self._on_progress = 0, grid.width_px * grid.height_px, on_progress
@@ -140,17 +140,17 @@ def open_metric_copy(
     cache_dir: str | os.PathLike[str] | None,
     on_progress: ProgressCallback | None = None,
 ) -> Source:
-    """The source on its metric grid, from the cache where there is a copy.
+    """The source on its metric grid, from the cache if it has a copy.
 
     The key is the SHA-256 of the content of the file and of the files beside it that GDAL uses, of the
     georeference, and of the version of this format. A cached file that does not fit or cannot be read is created
-    again; where the cache cannot be written, the copy stays in the temporary directory as long as the map is open.
+    again; if the cache cannot be written, the copy stays in the temporary directory while the map is open.
 
     Args:
         source: the map.
         reader: of its pixels, None to create one if it is needed.
         cache_dir: folder of the copies; None for the user's cache.
-        on_progress: called while a copy is created, and not where there is one already.
+        on_progress: called while a copy is created, not if there is one already.
     """
     grid = source.grid if source.grid.is_metric else _metric_grid(source.grid)
     cache = cache_folder() if cache_dir is None else Path(cache_dir)
@@ -180,7 +180,7 @@ def _key(source: Source, cache: Path) -> str:
 
 
 def _file_hash(path: Path, cache: Path) -> str:
-    """SHA-256 of a file's content; that of a large one is cached while its size and time stay the same."""
+    """SHA-256 of a file's content; for a large file cached while its size and time stay the same."""
     found = path.stat()
     identity = hashlib.sha256(f"{path.absolute()} {found.st_size} {found.st_mtime_ns} {found.st_ino}".encode())
     note = cache / "hashes" / identity.hexdigest()
@@ -218,7 +218,7 @@ def _single(
 def _tiled(
     folder: Path, source: Source, reader: GrayReader | None, grid: Grid, on_progress: ProgressCallback | None
 ) -> Source:
-    """A large copy: tiles that are missing or differ from the list are created, the others stay.
+    """Create a large copy: write tiles that are missing or differ from the list, keep the others.
 
     Raises:
         OSError: a tile cannot be written.
@@ -232,7 +232,7 @@ def _tiled(
         if recorded == ("-" if not target.exists() else _file_hash(target, folder.parent)):
             progress.add(tile.area_px, quietly=True)
             continue
-        progress.add(0)  # reports that work goes on before the first block is done
+        progress.add(0)  # reports progress before the first block is done
         reader = reader or GrayReader(source)
         corner = tile in (tiles[0], tiles[-1])  # they define the extent of the grid
         holds_map = _write(target, reader, source.grid, grid, tile, progress, even_empty=corner)
@@ -243,7 +243,7 @@ def _tiled(
 
 
 def _read_list(path: Path) -> dict[str, str]:
-    """The recorded hash of each tile; of several lines the last counts, and a truncated one does not."""
+    """The recorded hash of each tile; the last of several lines counts, a truncated line does not."""
     if not path.is_file():
         return {}
     lines = (line.split() for line in path.read_text(encoding="ascii", errors="replace").splitlines())
@@ -251,14 +251,14 @@ def _read_list(path: Path) -> dict[str, str]:
 
 
 def _cached(path: Path, grid: Grid) -> Source | None:
-    """The cached file, or None where it is missing, broken or of another grid."""
+    """The cached file, or None if it is missing, broken or of another grid."""
     try:
         source = open_source(path)
         same = np.allclose(source.grid.pixel_to_crs, grid.pixel_to_crs, rtol=0, atol=1e-6)
         size = (source.grid.width_px, source.grid.height_px)
         if not same or size != (grid.width_px, grid.height_px) or source.dataset.count != 2:
             return None
-        with map_errors("map", path):  # a file cut short shows in its last rows
+        with map_errors("map", path):  # the last rows reveal a truncated file
             whole = size[0] * size[1] <= MEMORY_LIMIT_PX
             source.dataset.read(window=((0 if whole else size[1] - 1, size[1]), (0, size[0])))
     except (MapError, OSError):

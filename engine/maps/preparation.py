@@ -1,4 +1,4 @@
-"""What a map is created from: a file, copied to a metric grid where it needs it, or checked arrays."""
+"""Sources of a map: a file, copied to a metric grid if necessary, or checked arrays."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def open_readable(
 
 
 def _facts(source: Source, nodata_share: float) -> dict[str, Any]:
-    """What :meth:`engine.OrthoMap.info` reports about the file."""
+    """Facts about the file for :meth:`engine.OrthoMap.info`."""
     return {
         "path": str(source.path),
         "driver": source.dataset.driver,
@@ -45,7 +45,7 @@ def _facts(source: Source, nodata_share: float) -> dict[str, Any]:
 
 
 def check_arrays(gray: Gray, valid: Mask, heights: NDArray[np.float32] | None) -> None:
-    """Refuse arrays that do not make a map.
+    """Refuse arrays that do not form a map.
 
     Args:
         gray: (H, W) uint8.
@@ -77,7 +77,7 @@ def metric_grid(shape: tuple[int, ...], matrix: Array, crs: Any) -> Grid:
         Grid: metric and north-up.
 
     Raises:
-        MapError: it is not.
+        MapError: the grid is not metric and north-up.
     """
     if matrix.shape != (2, 3) or not np.isfinite(matrix).all() or np.linalg.det(matrix[:, :2]) == 0.0:
         raise MapError(f"pixel_to_crs: expected a finite, invertible (2, 3), got {matrix.tolist()}")

@@ -1,7 +1,7 @@
-"""The map as the NCC method searches it, prepared once: enhanced, with half-resolution levels.
+"""The map prepared once for the NCC method: enhanced, with half-resolution levels.
 
-A small level of the map is prepared as a whole; of a large one, regions on a fixed grid as the flight reaches
-them, of which the least recently used are evicted.
+A small level of the map is prepared as a whole, a large one in regions on a fixed grid as the flight reaches them.
+The least recently used regions are evicted.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Region:
     Attributes:
         window: its extent, in pixels of the level.
         search: prepared pixels that templates are matched against.
-        valid: (H, W) bool, False on nodata; None where all pixels are valid.
-        mask: the same on the host, which is asked without waiting for a device.
+        valid: (H, W) bool, False on nodata; None if all pixels are valid.
+        mask: the same on the host, to read without waiting for a device.
     """
 
     window: Window
@@ -65,7 +65,7 @@ class PreparedMap:
     def __init__(self, site: OrthoMap, device: Device, radius_px: int, score: str = "local") -> None:
         self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
         self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()  # the most recently used is last
-        # Guards the regions, not their preparation: a thread that hangs there must not block the next one.
+        # Guards the regions, not their preparation: a thread that hangs there must not block others.
         self._lock = threading.Lock()
         self.created = 0
         """Regions prepared so far."""
@@ -91,14 +91,14 @@ class PreparedMap:
         return Region(aligned, search, region.valid[part], region.mask[part])
 
     def enhanced(self, window: Window, level: int) -> tuple[FloatImage, NDArray[np.bool_] | None]:
-        """The enhanced picture of a window, of what is prepared; the same as by :func:`enhanced_part`.
+        """The enhanced picture of a window, from prepared regions; equals :func:`enhanced_part`.
 
         Args:
             window: in pixels of the level, inside it.
             level: of the map's pyramid.
 
         Returns:
-            (H, W) float32, and (H, W) bool, False on nodata; None where all pixels are valid.
+            (H, W) float32, and (H, W) bool, False on nodata; None if all pixels are valid.
         """
         region = self.cut(window, level)
         inner = np.s_[window.y0 - region.window.y0 :, window.x0 - region.window.x0 :]
@@ -122,7 +122,7 @@ class PreparedMap:
         return region
 
     def _cached(self, window: Window, level: int) -> Region | None:
-        """The most recently used region that contains a window, which becomes the most recent; or None."""
+        """The most recently used region that contains a window, now the most recent; or None."""
         for key in reversed(self._regions):
             if key[0] == level and _contains(key[1], window):
                 self._regions.move_to_end(key)
@@ -162,7 +162,7 @@ def enhanced_part(
         level: of the map's pyramid.
 
     Returns:
-        (H, W) float32, and (H, W) bool, False on nodata; None where all pixels are valid.
+        (H, W) float32, and (H, W) bool, False on nodata; None if all pixels are valid.
     """
     rows, columns = site.level_shape(level)
     margin = radius_px + 2  # reach of the box, plus one for the gradient and one for the smoothing

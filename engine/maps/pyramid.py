@@ -21,7 +21,7 @@ class Reader(Protocol):
     """Source of pixels: a file, or arrays.
 
     Attributes:
-        levels: that can be read, ascending, 0 among them.
+        levels: the levels that can be read, ascending, including 0.
         all_valid: whether no pixel can be nodata.
     """
 
@@ -50,7 +50,7 @@ class ArrayReader:
     Attributes:
         gray: (H, W) uint8.
         valid: (H, W) bool.
-        levels: 0 alone.
+        levels: only 0.
         all_valid: False, since nodata is looked up in ``valid``.
     """
 
@@ -79,7 +79,7 @@ class Pyramid:
     Args:
         width_px: of level 0.
         height_px: of level 0.
-        reader: of the pixels. Levels that it lacks are averaged from the next finer one.
+        reader: reads the pixels. Missing levels are averaged from the next finer one.
     """
 
     def __init__(self, width_px: int, height_px: int, reader: Reader) -> None:
@@ -103,7 +103,7 @@ class Pyramid:
         return self._size[0] >> level, self._size[1] >> level
 
     def _streamed(self, level: int) -> tuple[Gray, Mask]:
-        """A whole level, read in strips so that colour and masks of the file are never in memory at once."""
+        """A whole level, read in strips to keep the file's colour and masks out of memory."""
         height, width = self.shape(level)
         gray, valid = np.empty((height, width), np.uint8), np.empty((height, width), np.bool_)
         rows = max(1, 1024 >> (level - self._stored(level)))
@@ -113,7 +113,7 @@ class Pyramid:
         return gray, valid
 
     def _stored(self, level: int) -> int:
-        """The level that is read to compute another."""
+        """The level to read in order to compute another."""
         return max(stored for stored in self._reader.levels if stored <= level)
 
     def _from_file(self, window: Window, level: int) -> tuple[Gray, Mask]:
@@ -137,7 +137,7 @@ class Pyramid:
             level: of the pyramid.
 
         Returns:
-            (h, w) uint8 grey and (h, w) bool validity; views where the level is in memory.
+            (h, w) uint8 grey and (h, w) bool validity; views if the level is in memory.
 
         Raises:
             OptionError: the window is empty or not inside, or there is no such level.
@@ -156,7 +156,7 @@ class Pyramid:
 
     @property
     def fully_valid(self) -> bool:
-        """Whether no pixel is nodata; of a large map only where its file format cannot mark nodata."""
+        """Whether no pixel is nodata; true for a large map only if its file format cannot mark nodata."""
         return self._reader.all_valid if self.is_large else self.nodata_share == 0.0
 
     @cached_property
@@ -192,7 +192,7 @@ class Pyramid:
 
 
 def _halved(gray: Gray, valid: Mask) -> tuple[Gray, Mask]:
-    """2 x 2 area averages; valid where all four are. An odd last row or column is left out."""
+    """2 x 2 area averages, valid if all four are. An odd last row or column is left out."""
     import cv2
 
     height, width = gray.shape[0] // 2, gray.shape[1] // 2

@@ -1,7 +1,7 @@
 """Raster files that may be opened: a local file by its first bytes, a folder of tiles or a VRT as one picture.
 
 A folder of tiles becomes the text of a VRT, GDAL's mosaic format. A user's VRT is read too, after a check that it
-names nothing but local raster files.
+refers only to local raster files.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ SIGNATURES = (
     ("WEBP", (b"RIFF",)),
     ("MBTiles", (b"SQLite format 3\0",)),
 )
-"""GDAL drivers and the signatures of their files; the ending of a file's name does not count."""
+"""GDAL drivers and the signatures of their files; file name extensions are ignored."""
 _GEOPACKAGE = slice(68, 72), (b"GPKG", b"GP10", b"GP11")
-"""Where an SQLite file says that it is a GeoPackage, and how."""
+"""Offset and value of the mark of a GeoPackage in an SQLite file."""
 NO_TILES = (".ovr", ".msk", ".aux", ".part")
-"""Endings of side files and partial files, which are not tiles of a folder."""
+"""Extensions of side files and partial files, which are not tiles of a folder."""
 OWN_TAGS = "SCENEMATCH_"
-"""Prefix of this project's metadata items; a folder of tiles has those that all its tiles share."""
+"""Prefix of this project's metadata items; a folder of tiles has the items that all its tiles share."""
 OFF_GRID_PX = 0.05
-"""Largest offset of a tile from whole pixels of the first tile's grid; beyond it would have to be resampled."""
+"""Largest offset of a tile from whole pixels of the first tile's grid; a larger one would need resampling."""
 _VRT_HEAD = b"<VRTDataset"
 _VRT_TAGS = frozenset(
     (
@@ -55,7 +55,7 @@ class _Tile:
     size: tuple[int, int]
     transform: Any
     crs: Any
-    kind: tuple[int, str, str, float, float]  # bands that are used, element type, nodata, scale and offset
+    kind: tuple[int, str, str, float, float]  # bands in use, element type, nodata, scale and offset
     block: tuple[int, int]
     overviews: tuple[int, ...]
     own_tags: frozenset[tuple[str, str]]  # metadata items of this project
@@ -81,7 +81,7 @@ def driver_of(file: Path, argument: str) -> str:
     """GDAL's driver for a file, or "VRT".
 
     Raises:
-        MapError: it is of no supported format.
+        MapError: its format is not supported.
     """
     with file.open("rb") as stream:
         head = stream.read(1024)
@@ -95,10 +95,10 @@ def driver_of(file: Path, argument: str) -> str:
 
 
 def openable(path: Path, argument: str) -> tuple[str | Path, str]:
-    """What GDAL opens for a file or folder, the file itself or the text of a VRT, and its driver.
+    """What to give GDAL for a file or folder, the file itself or the text of a VRT; and the driver.
 
     Raises:
-        MapError: it is no raster, or its tiles do not fit together.
+        MapError: it is not a raster, or its tiles do not fit together.
     """
     if path.is_dir():
         return vrt_of_folder(path, argument), "VRT"
@@ -109,7 +109,7 @@ def openable(path: Path, argument: str) -> tuple[str | Path, str]:
 
 
 def _check_geopackage(file: Path, argument: str) -> None:
-    """Refuse a GeoPackage without a raster, or with several, of which GDAL would open none."""
+    """Refuse a GeoPackage without a raster or with several: GDAL would open none of them."""
     import sqlite3
     from contextlib import closing
 
@@ -128,11 +128,10 @@ def _check_geopackage(file: Path, argument: str) -> None:
 
 
 def vrt_of_folder(folder: Path, argument: str) -> str:
-    """The text of a VRT that joins the tiles of a folder; what no tile covers is nodata.
+    """The text of a VRT that joins the tiles of a folder; pixels without a tile are nodata.
 
     Raises:
-        MapError: there are none, or they differ in CRS, size of a pixel, bands or element type, or are no tiles
-            of one grid.
+        MapError: there are none, or they differ in CRS, pixel size, bands or element type, or are not on one grid.
     """
     tiles = [_read_tile(file, driver, argument) for file, driver in _rasters_in(folder)]
     if not tiles:
@@ -153,7 +152,7 @@ def vrt_of_folder(folder: Path, argument: str) -> str:
 
 
 def _moved(transform: Any, x: int, y: int) -> list[float]:
-    """GDAL's six numbers of a transform whose origin is moved by (x, y) pixels."""
+    """GDAL's six numbers of a transform with its origin moved by (x, y) pixels."""
     a, b, c, d, e, f = list(transform)[:6]
     return [c + a * x + b * y, a, b, f + d * x + e * y, d, e]
 
@@ -215,7 +214,7 @@ def _check_beside(first: _Tile, tile: _Tile, argument: str) -> None:
 
 
 def _position(first: _Tile, tile: _Tile, argument: str) -> tuple[int, int]:
-    """Column and row of the first tile's grid at which another begins."""
+    """Column and row in the first tile's grid at which another tile begins."""
     a, b, c, d, e, f = list(first.transform)[:6]
     x, y = np.linalg.solve([[a, b], [d, e]], [tile.transform.c - c, tile.transform.f - f])
     if max(abs(x - round(x)), abs(y - round(y))) > OFF_GRID_PX:
@@ -231,8 +230,8 @@ def _vrt_text(
 ) -> str:
     """The VRT of tiles by their top-left corners.
 
-    Pixels without a tile have the tiles' nodata value. Where there is none, a mask band joins the tiles' masks;
-    those of tiles with a nodata value GDAL would read into it in pieces of the wrong width.
+    Pixels without a tile have the tiles' nodata value. Without one, a mask band joins the tiles' masks; for tiles
+    with a nodata value GDAL would read the masks in pieces of the wrong width.
     """
     bands, dtype, nodata, scale, offset = tiles[0].kind
     root = Xml.Element("VRTDataset", rasterXSize=str(size[0]), rasterYSize=str(size[1]))
@@ -257,7 +256,7 @@ def _vrt_text(
 
 
 def _add_overviews(root: Xml.Element, factors: Sequence[int]) -> None:
-    """Declare the overviews of the largest tile; those that a smaller one lacks, GDAL computes as it reads."""
+    """Declare the overviews of the largest tile; GDAL computes those that a smaller one lacks while reading."""
     if factors:
         Xml.SubElement(root, "OverviewList", resampling="average").text = " ".join(map(str, factors))
 
@@ -271,13 +270,13 @@ def _add_sources(
         source = Xml.SubElement(element, "SimpleSource" if nodata is None else "ComplexSource")
         Xml.SubElement(source, "SourceFilename", relativeToVRT="0").text = str(tile.path)
         Xml.SubElement(source, "SourceBand").text = band
-        if "mask" not in band:  # so that a tile is opened when it is read, not with the folder
+        if "mask" not in band:  # so that a tile is opened only when it is read
             rows, columns = (str(n) for n in tile.block)
             of = {"RasterXSize": width, "RasterYSize": height, "BlockXSize": columns, "BlockYSize": rows}
             Xml.SubElement(source, "SourceProperties", of | {"DataType": _TYPES[tile.kind[1]]})
         Xml.SubElement(source, "SrcRect", xOff="0", yOff="0", xSize=width, ySize=height)
         Xml.SubElement(source, "DstRect", xOff=str(x), yOff=str(y), xSize=width, ySize=height)
-        if nodata is not None:  # so that the nodata of one tile does not hide what another has there
+        if nodata is not None:  # so that one tile's nodata does not hide another's pixels
             Xml.SubElement(source, "NODATA").text = nodata
 
 
@@ -285,10 +284,10 @@ def _add_sources(
 
 
 def _vrt_of_file(file: Path, argument: str) -> str:
-    """The text of a VRT that names nothing but local raster files, with their absolute paths.
+    """The text of a VRT that refers only to local raster files, with their absolute paths.
 
     Raises:
-        MapError: it does more than join rasters, or names what may not be opened.
+        MapError: it does more than join rasters, or refers to files that may not be opened.
     """
     import rasterio
 

@@ -4,9 +4,9 @@ Convention:
     GDAL's origin, the outer corner of the first pixel, is converted in :func:`_centred`; a :class:`Source` has the
     pixels of :mod:`engine.maps.grids`, centres at integers.
 
-Nodata is what the file marks (tag, mask, alpha, NaN). A file without such marks may still have a collar: pixels
-whose bands are all exactly 0, or all exactly the largest value, that are connected to the border of the picture
-and together cover more than :data:`COLLAR_SHARE` of it, count as nodata. Dark pixels inside do not.
+Nodata is what the file marks (tag, mask, alpha, NaN). A file without marks may still have a collar, which counts
+as nodata: pixels whose bands are all exactly 0, or all the largest value, connected to the picture's border and
+covering more than :data:`COLLAR_SHARE` of it in total. Dark pixels inside do not count.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ class Source:
 
 
 def stated_sigma(given: float | None, source: Source | None, tag: str, argument: str) -> float | None:
-    """The accuracy that was given, else the one in a file's metadata, else None.
+    """The given accuracy, else the one in a file's metadata, else None.
 
     Args:
-        given: by the user.
-        source: file whose metadata is read.
+        given: the user's value.
+        source: the file with the metadata.
         tag: metadata item.
         argument: name of ``given`` in messages.
 
@@ -127,10 +127,10 @@ def open_source(
         bounds_deg: west, south, east, north of the outer edges of a picture without georeference, whose rows
             and columns run evenly in ``crs`` (EPSG:4326 unless given; EPSG:3857 for a screenshot of a web map).
         bounds_crs: the same in the units of ``crs``.
-        crs: coordinate reference system of a file that names none; else that of a ``.prj`` beside it.
+        crs: coordinate reference system, if the file names none; None takes that of a ``.prj`` beside it.
 
     Raises:
-        MapError: the file is missing, is no raster that may be opened, or cannot be placed on the Earth.
+        MapError: the file is missing, is not a supported raster, or cannot be placed on the Earth.
     """
     file = local_path(path, argument)
     with map_errors(argument, file):
@@ -157,7 +157,7 @@ def open_source(
 
 
 def vertical_datum(dataset: Any) -> str | None:
-    """Name of the system in which a dataset's heights are metres above the sea; None where it names no such one.
+    """Name of the system in which a dataset's heights are metres above the sea; None if it names no such one.
 
     Only a compound CRS does, such as EPSG:32636+5773; heights above the ellipsoid are the third axis of another.
     """
@@ -165,7 +165,7 @@ def vertical_datum(dataset: Any) -> str | None:
 
     crs = CRS.from_wkt(dataset.crs.to_wkt()) if dataset.crs else None
     vertical = next((part for part in crs.sub_crs_list if part.is_vertical), None) if crs is not None else None
-    if vertical is None or "ellips" in vertical.name.lower():  # which older files name a datum of the sea
+    if vertical is None or "ellips" in vertical.name.lower():  # although older files state it as a datum
         return None
     axis = vertical.axis_info[0]
     return str(vertical.name) if axis.direction == "up" and axis.unit_conversion_factor == 1.0 else None
@@ -215,7 +215,7 @@ def _crs_of(file: Path, argument: str, own: Any, given: Any) -> CRS:
 
 
 def _from_degrees(bounds_deg: Bounds, crs: CRS, width: int, height: int) -> Bounds:
-    """The outer edges in the units of the CRS, where the picture has upright ones there."""
+    """The outer edges in the units of the CRS, if the picture is upright there."""
     from pyproj import Transformer
 
     west, south, east, north = bounds_deg
@@ -227,7 +227,7 @@ def _from_degrees(bounds_deg: Bounds, crs: CRS, width: int, height: int) -> Boun
     slant_x, slant_y = np.abs([x[2] - x[0], x[3] - x[1]]).max(), np.abs([y[3] - y[0], y[2] - y[1]]).max()
     if not (slant_x <= step_x / 2 and slant_y <= -step_y / 2):
         raise MapError(
-            f"bounds_deg: the corners are no rectangle in crs {crs.name!r}; expected bounds in its own units"
+            f"bounds_deg: expected a rectangle in crs {crs.name!r}, in its own units; the corners form none"
         )
     return float(x[0]), float(y[1]), float(x[1]), float(y[0])
 
@@ -287,7 +287,7 @@ class GrayReader:
         from rasterio.windows import Window as RasterWindow
 
         crop = RasterWindow(window.x0, window.y0, window.width_px, window.height_px)
-        # GDAL reads the overview that fits; its pixels are offset from the level's where the size is no multiple.
+        # GDAL reads the best overview; its pixels are offset from the level's if the size is not a multiple.
         how = Resampling.average if smooth and self._palette is None else Resampling.nearest
         shape = (len(self._bands), *size)
         with self._lock, map_errors("map", self._source.path):  # a GDAL dataset serves one thread at a time
@@ -366,7 +366,7 @@ def _luma(data: NDArray[Any]) -> NDArray[Any]:
 
 
 def _collars(data: NDArray[Any]) -> dict[float, Mask]:
-    """For pure black and pure white: the area that is connected to the border, by value.
+    """For pure black and pure white: the area connected to the border, by value.
 
     It is dilated by a pixel, because the border of a collar falls between the pixels of a decimated copy.
     """
@@ -377,7 +377,7 @@ def _collars(data: NDArray[Any]) -> dict[float, Mask]:
         count, labels = cv2.connectedComponents((data == value).all(axis=0).astype(np.uint8), connectivity=4)
         touches = np.zeros(count, np.bool_)
         touches[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
-        touches[0] = False  # label 0 is everything of another colour
+        touches[0] = False  # label 0 is every other colour
         area = touches[labels]
         if area.mean() > COLLAR_SHARE:
             found[float(value)] = cv2.dilate(area.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

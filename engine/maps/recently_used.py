@@ -1,4 +1,4 @@
-"""What an index made of parts of a map; the least recently used is given up. For any number of threads."""
+"""A cache that evicts the least recently used entries; safe for any number of threads."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class RecentlyUsed(Generic[K, V]):
         return len(self._entries)
 
     def __setitem__(self, key: K, entry: V) -> None:
-        """Add an entry that was made before, or replace one."""
+        """Add an existing entry, or replace one."""
         with self._lock:
             self._entries[key] = entry
             self._entries.move_to_end(key)
@@ -40,7 +40,7 @@ class RecentlyUsed(Generic[K, V]):
         return list(self._entries.values())
 
     def get(self, key: K, make: Callable[[], V]) -> V:
-        """An entry, which becomes the most recently used; made where there is none."""
+        """Get an entry, which becomes the most recently used; create it if missing."""
         with self._lock:
             found = self._entries.get(key)
             if found is not None:
@@ -54,7 +54,7 @@ class RecentlyUsed(Generic[K, V]):
         return made
 
     def evict(self, size: Callable[[V], int], limit: int, keep: int) -> None:
-        """Give up the least recently used entries until their sizes fit a limit, but not the last ``keep``."""
+        """Evict the least recently used entries until their sizes fit a limit, but not the last ``keep``."""
         with self._lock:
             used = sum(map(size, self._entries.values()))
             while used > limit and len(self._entries) > keep:

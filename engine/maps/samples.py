@@ -22,9 +22,9 @@ if TYPE_CHECKING:  # a map is built on what lies here
 Enhanced = Callable[[Window, int], tuple[FloatImage, NDArray[np.bool_] | None]]
 
 BLOCK_PX = 4
-"""One sample is taken of every block of this side: the pixel with the steepest gradient."""
+"""Every block with this side gives one sample: the pixel with the steepest gradient."""
 CELL_PX = 256
-"""Of a large level samples are taken cell by cell, on the cells of the prepared map."""
+"""A large level is sampled cell by cell, on the cells of the prepared map."""
 MAX_CELLS = 256
 MAX_SAMPLES = 2000
 _ROUGH_REACH_PX = 1.5  # pixels of the level from a sample at which roughness is measured
@@ -54,7 +54,7 @@ class SampleMap:
         Args:
             window: in pixels of the level, inside it, at least :data:`BLOCK_PX` wide and high.
             level: of the map's pyramid.
-            max_samples: about as many at most.
+            max_samples: approximate upper bound.
 
         Returns:
             Samples: in metres east, north and up.
@@ -68,7 +68,7 @@ class SampleMap:
             last = (
                 min(rows, -(-(y + window.height_px) // BLOCK_PX)),
                 min(columns, -(-(x + window.width_px) // BLOCK_PX)),
-            )  # blocks; the remainder beyond a cell's last one has none
+            )  # blocks; the remainder beyond a cell's last block has none
             first = (min(max(0, y // BLOCK_PX), last[0]), min(max(0, x // BLOCK_PX), last[1]))
             arrays = (samples.points_m, samples.values, samples.gradients, samples.weights)
             parts.append(every_nth(arrays, first, last, columns, step))
@@ -85,7 +85,7 @@ class SampleMap:
             for y in range(window.y0 // CELL_PX * CELL_PX, window.y0 + window.height_px, CELL_PX)
             for x in range(window.x0 // CELL_PX * CELL_PX, window.x0 + window.width_px, CELL_PX)
         ]
-        # The remainder beyond a level's last whole cell may be narrower than a block: no sample is taken there.
+        # The remainder beyond a level's last whole cell may be narrower than a block: it gives no sample.
         return [cell for cell in cells if min(cell.width_px, cell.height_px) >= BLOCK_PX]
 
     def _cell(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:

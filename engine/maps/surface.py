@@ -16,7 +16,7 @@ from engine.values import Window
 Heights = NDArray[np.float32]
 
 GROUND_PERCENT = 20.0
-"""Percentile of the surface that is used as the level of the ground."""
+"""Percentile of the surface used as the ground level."""
 TILE_PX = 256
 """Patches of a large surface begin and end on multiples of this."""
 MAX_SPAN = 6
@@ -76,12 +76,12 @@ class HeightTiles:
 
 
 class SurfaceModel:
-    """Heights on a grid of their own.
+    """Heights on their own grid.
 
     Args:
         heights_m: (H, W), NaN where unknown.
         from_map: from pixels of the map to those of the heights.
-        decimated: the same surface with fewer pixels, where it is too large to be sampled as a whole.
+        decimated: the same surface with fewer pixels, if it is too large to be sampled as a whole.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class SurfaceModel:
         return isinstance(self._heights_m, HeightTiles)
 
     def overview(self, map_xy: Array) -> Array:
-        """Heights for samples spread over the whole map: of the decimated surface where there is one.
+        """Heights for samples spread over the whole map, from the decimated surface if there is one.
 
         Args:
             map_xy: (..., 2) pixels of the map.
@@ -139,7 +139,7 @@ class SurfaceModel:
             reach_px: half its side.
 
         Returns:
-            The plane's level at the middle and its slope (2,) in metres up per map pixel x and y; None where less
+            The plane's level at the middle and its slope (2,) in metres up per map pixel x and y; None if less
             than half of the square is known.
         """
         from engine.kernels.lower_plane import lower_plane  # numba takes a while to import
@@ -152,9 +152,9 @@ class SurfaceModel:
 
     @property
     def range_m(self) -> tuple[float, float]:
-        """Lowest and highest known height; of a large surface those of its averages."""
+        """Lowest and highest known height; for a large surface those of its averages."""
         if not isinstance(self._heights_m, np.ndarray):
-            assert self._decimated is not None  # what is read in tiles comes with it
+            assert self._decimated is not None  # a surface read in tiles has one
             return self._decimated.range_m
         return float(np.nanmin(self._heights_m)), float(np.nanmax(self._heights_m))
 
@@ -168,7 +168,7 @@ def _neighbours(at: Array, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp
 
 
 def open_surface(source: Source, grid: Grid) -> tuple[SurfaceModel, Grid]:
-    """The surface under a map and its grid: in memory, or read tile by tile where it is large.
+    """The surface under a map and its grid: in memory, or read tile by tile if it is large.
 
     Args:
         source: the model.

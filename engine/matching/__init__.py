@@ -1,6 +1,6 @@
-"""How a frame is matched: one file a method, and the steps that the methods share.
+"""How a frame is matched: one file per method, and the steps that the methods share.
 
-A method is a class derived from :class:`engine.matching.method.Method`. A new one is a file and a line in
+A method is a class derived from :class:`engine.matching.method.Method`. A new method is one file and one line in
 :data:`BY_PROFILE`.
 """
 
@@ -19,17 +19,17 @@ BY_PROFILE: Mapping[str, Mapping[str, str]] = {
     "engine": {"ncc": "ncc.Ncc", "sift": "sift.Sift", "auto": "auto.Auto", "learned": "learned.Learned"},
     "paper": {"ncc": "paper.PaperNcc", "sift": "paper.PaperSift"},
 }
-"""The class of each method, in its module. It is imported when a matcher is made: options need no torch."""
+"""The module and class of each method, imported when a matcher is made: options need no torch."""
 METHODS = tuple(BY_PROFILE["engine"])
 CLASSICAL = tuple(name for name in METHODS if name != "learned")
-"""Those that need no file of weights."""
+"""Methods that need no file of weights."""
 
 
 def method_type(name: str, profile: str) -> type[Method]:
     """The class of a method.
 
     Raises:
-        OptionError: there is none of this name, or not in this profile.
+        OptionError: no method has this name, or not in this profile.
     """
     if name not in METHODS:
         raise OptionError(f"method: expected one of {', '.join(METHODS)}, got {name!r}")

@@ -1,6 +1,6 @@
-"""Acceptance: when a match by either method is accepted, and why it is refused.
+"""Acceptance: decides whether to accept a match by either method, or why to refuse it.
 
-By the evidence for it and the risk that is allowed, see :mod:`engine.matching.evidence`.
+The evidence for the match and the allowed risk decide, see :mod:`engine.matching.evidence`.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ Refusal = tuple[Reason, str]
 
 
 def judge_peak(peak: Peak, evidence: PeakEvidence, risk: float, *, is_tested: bool = True) -> Refusal | None:
-    """The reason to refuse a correlation peak, or None where it is accepted.
+    """The reason to refuse a correlation peak, or None if it is accepted.
 
     Args:
         peak: the peak.
         evidence: for it.
-        risk: probability of a wrong fix that is allowed.
-        is_tested: whether the evidence was tested by the null hypothesis.
+        risk: allowed probability of a wrong fix.
+        is_tested: whether the evidence was tested by the null
+        hypothesis.
     """
     if not peak.curvature.any():
         return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"
@@ -47,7 +48,7 @@ def judge_peak(peak: Peak, evidence: PeakEvidence, risk: float, *, is_tested: bo
 
 
 def judge_pose(evidence: PoseEvidence, risk: float) -> Refusal | None:
-    """The reason to refuse a pose by matched features, or None where it is accepted.
+    """The reason to refuse a pose by matched features, or None if it is accepted.
 
     Args:
         evidence: of the pose.
@@ -63,7 +64,7 @@ def judge_pose(evidence: PoseEvidence, risk: float) -> Refusal | None:
 
 
 def _wrong(nats: float, risk: float) -> str:
-    return f"wrong with a probability of {1.0 - probability(nats):.1g}, {risk:g} is allowed"
+    return f"wrong with probability {1.0 - probability(nats):.1g}, at most {risk:g} is allowed"
 
 
 def _known(evidence: PeakEvidence | PoseEvidence) -> str:
@@ -79,7 +80,7 @@ def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:
         covariance_m2: (2, 2) sum of their covariances.
 
     Returns:
-        bool: False where chance alone would set them so far apart less than once in a thousand.
+        bool: False if chance alone would set them this far apart less than once in a thousand.
     """
     return chi_square(apart_m, covariance_m2) <= CONSISTENT_CHI_SQUARE
 
@@ -88,8 +89,8 @@ def offset_between_m(first: Fix, second: Fix) -> Array:
     """How far one fix lies from another.
 
     Args:
-        first: The fix at which the offset ends.
-        second: The fix at which it begins.
+        first: The fix at the offset's end.
+        second: The fix at its start.
 
     Returns:
         (2,) metres east and north from the second fix to the first.
@@ -98,20 +99,20 @@ def offset_between_m(first: Fix, second: Fix) -> Array:
 
 
 def agree_in_place(first: Fix, second: Fix) -> bool:
-    """Whether two fixes by one map are of one place (:func:`are_consistent`); the map's error is that of both."""
+    """Whether two fixes on one map are of one place (:func:`are_consistent`); they share the map's error."""
     covariance_m2 = first.relative_covariance_m2 + second.relative_covariance_m2
     return are_consistent(offset_between_m(first, second), covariance_m2)
 
 
 def agree_in_height(first: Fix, second: Fix) -> bool:
-    """Whether two poses are equally high; refinement may stay at a wrong height that the telemetry holds it to.
+    """Whether two poses are equally high; the telemetry may hold refinement at a wrong height.
 
     Args:
-        first: one; where it did not measure its height, it agrees with any.
-        second: the other.
+        first: one pose; if it did not measure its height, it agrees with any.
+        second: the other pose.
     """
     if first.up_m is None or second.up_m is None:
         return True
     variance_m2 = float(first.covariance_m2[2, 2] + second.covariance_m2[2, 2])
-    variance_m2 -= first.map_sigma_m**2 + second.map_sigma_m**2  # one error, of both
+    variance_m2 -= first.map_sigma_m**2 + second.map_sigma_m**2  # they share this error
     return (first.up_m - second.up_m) ** 2 <= _HEIGHT_CHI_SQUARE * variance_m2

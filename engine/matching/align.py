@@ -1,7 +1,7 @@
-"""From a camera frame to a picture aligned with the map: grey, rectify (equations 2 and 3).
+"""Align a camera frame with the map: grey, rectify (equations 2 and 3).
 
-A part of the frame is rectified on a plane for correlation (:func:`rectify`), the whole frame over the
-ground's relief for features (:func:`orthorectify`).
+For correlation :func:`rectify` rectifies a part of the frame on a plane; for features :func:`orthorectify`
+rectifies the whole frame over the ground's relief.
 
 Convention:
     A rectified patch has the map's pixels and axes. Its ``offset_px`` is the position of its top-left pixel
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 # Beyond this angle off the vertical a footprint is stretched more than 4 times and relief occludes the ground.
 MAX_RAY_DEG = 75.0
 _MIN_DOWN = math.cos(math.radians(MAX_RAY_DEG))
-# A frame that is finer than the map by more than this factor is averaged down first, to prevent aliasing.
+# A frame finer than the map by more than this factor is averaged down first, to prevent aliasing.
 _MAX_SHRINK = 0.75
 _ASPECTS = np.array([1.0, 4 / 3, 3 / 4, 16 / 9, 9 / 16])
 # Least size of a patch as a share of the requested fraction.
@@ -63,7 +63,7 @@ class GroundView:
 
     Attributes:
         image_from_map: (3, 3) homography; map pixels relative to the nadir to frame pixels.
-        center_px: (2,) ground point in the frame's middle.
+        center_px: (2,) ground point at the frame's middle.
         footprint_px: extent (width, height) of the whole frame on the map, the s T of equations 4 and 5.
         area_px: area of the whole frame on the map.
     """
@@ -90,7 +90,7 @@ def view_of(
         slope_m_per_px: (2,) rise of the plane per map pixel x and y; None is level.
 
     Returns:
-        GroundView | None: None where a ray of a corner exceeds :data:`MAX_RAY_DEG` or does not meet the plane.
+        GroundView | None: None if a ray of a corner exceeds :data:`MAX_RAY_DEG` or does not meet the plane.
     """
     enu_from_camera = camera.enu_from_camera(attitude)
     rays = camera.frame_rays @ enu_from_camera.T
@@ -139,7 +139,7 @@ def rectify(gray: NDArray[np.uint8], camera: Camera, view: GroundView, *, fracti
             heading, so that the cost of matching does not depend on the heading.
 
     Returns:
-        Patch | None: None where it is smaller than 8 x 8 map pixels.
+        Patch | None: None if it would be smaller than 8 x 8 map pixels.
     """
     size = _inscribed_size(view, gray.shape, fraction)
     if size is None:
@@ -160,14 +160,14 @@ def rectify(gray: NDArray[np.uint8], camera: Camera, view: GroundView, *, fracti
 
 
 def shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], Array]:
-    """Average a picture down where it is much finer than the map.
+    """Average a picture down if it is much finer than the map.
 
     Args:
         gray: (H, W).
-        scale: pixel of the picture over pixel of the map, on the ground.
+        scale: size on the ground of the picture's pixel over the map's.
 
     Returns:
-        The picture (h, w), ``gray`` itself where it is not much finer; and the homography (3, 3) from pixels of
+        The picture (h, w), ``gray`` itself if it is not much finer; and the homography (3, 3) from pixels of
         ``gray`` to its pixels.
     """
     if scale >= _MAX_SHRINK:
@@ -176,7 +176,7 @@ def shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], Ar
     sx, sy = width / gray.shape[1], height / gray.shape[0]
     homography = np.array([[sx, 0, sx / 2 - 0.5], [0, sy, sy / 2 - 0.5], [0, 0, 1.0]])
     picture, left = gray, scale
-    while left <= _MAX_SHRINK / 2.0:  # as much as halves do, which are fast by OpenCV, edges on edges
+    while left <= _MAX_SHRINK / 2.0:  # as far as halving goes, which OpenCV does fast, edges on edges
         half = (max(8, picture.shape[1] // 2), max(8, picture.shape[0] // 2))
         picture, left = np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.uint8), 2.0 * left
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8), homography
@@ -186,7 +186,7 @@ def _inscribed_size(view: GroundView, shape: tuple[int, ...], fraction: float) -
     """Width and height of the largest upright rectangle about the view's centre inside the frame."""
     side = fraction * math.sqrt(view.area_px)
     limit = np.array([shape[1] - 1, shape[0] - 1])
-    for shapes in (_RECTANGLES[:1], _RECTANGLES):  # for most headings and tilts the largest fits
+    for shapes in (_RECTANGLES[:1], _RECTANGLES):  # at most headings and tilts the largest fits
         corners = view.center_px + side * shapes  # (S, A, 4, 2)
         image = corners @ view.image_from_map[:, :2].T + view.image_from_map[:, 2]
         depth = image[..., 2:]
@@ -204,16 +204,16 @@ def _inscribed_size(view: GroundView, shape: tuple[int, ...], fraction: float) -
 # ----------------------------------------------------------------------------------------- the whole frame
 
 MAX_FIELD_DEG = 70.0
-"""Of an oblique frame the ground is used up to this angle off the vertical; beyond it is far and foreshortened."""
+"""Ground farther off the vertical than this angle is ignored: it is far away and foreshortened."""
 MIN_PICTURE_PX = 32
 """Least extent of an orthorectified frame."""
 SIDE_STEP_PX = 16
-"""Its sides are multiples of this, so that a flight meets few lengths and lays out none in the air."""
+"""Its sides are multiples of this, so that a flight uses few sizes and plans none in the air."""
 MAX_PICTURE_PX = 8 << 20
-"""Most pixels of one: where it would cover more, its height is out of proportion to the map."""
-_NODES = 17  # along each side of the lattice on which the projection is computed; bilinear between
+"""Most pixels of one; if it would need more, the height is out of proportion to the map."""
+_NODES = 17  # per side of the grid on which the projection is computed; bilinear in between
 RIM_PX = 5
-"""What an orthorectified frame shows ends so far within its edge, whose gradients are none of the ground."""
+"""Margin left out inside an orthorectified frame's edge, whose gradients are not the ground's."""
 _RIM = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
 
 Relief = Callable[[Array], Array]
@@ -226,9 +226,9 @@ class Orthophoto:
 
     Attributes:
         gray: (h, w) uint8; the edge is repeated where the frame shows nothing.
-        valid: (h, w) bool, where the frame shows the ground, its rim left out.
+        valid: (h, w) bool, True where the frame shows the ground, without its rim.
         offset_px: (2,) of its top-left pixel from the assumed nadir, in map pixels.
-        frame_px: x and y, (h, w) float32 each, of the place in the frame that each pixel was taken from.
+        frame_px: x and y, (h, w) float32 each, of each pixel's source in the frame.
     """
 
     gray: NDArray[np.uint8]
@@ -253,7 +253,7 @@ class Orthophoto:
 
 
 def ground_bounds_px(camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: Array) -> Array | None:
-    """The box about the ground that a frame shows, on a level plane, up to :data:`MAX_FIELD_DEG`.
+    """Bounding box of the ground that a frame shows, on a level plane, up to :data:`MAX_FIELD_DEG`.
 
     Args:
         camera: pinhole (the frame is undistorted).
@@ -262,8 +262,8 @@ def ground_bounds_px(camera: Camera, attitude: Attitude, height_m: float, enu_ja
         enu_jacobian: (2, 2) metres east and north per map pixel x and y.
 
     Returns:
-        (2, 2) lower and upper corner in map pixels from the nadir; None where the middle of the frame looks beyond
-        that angle.
+        (2, 2) lower and upper corner in map pixels from the nadir; None if the frame's middle is beyond that
+        angle.
     """
     rays = camera.border_rays @ camera.enu_from_camera(attitude).T
     reach = np.hypot(rays[:, 0], rays[:, 1])
@@ -289,13 +289,13 @@ def orthorectify(
     Args:
         gray: (H, W) undistorted.
         camera: its pinhole.
-        attitude: assumed of the body.
-        height_m: assumed above the ground below the camera.
+        attitude: assumed attitude of the body.
+        height_m: assumed height above the ground below the camera.
         enu_jacobian: (2, 2) metres east and north per map pixel x and y.
-        relief: of the ground; None is level.
+        relief: of the ground; None means level.
 
     Returns:
-        Orthophoto | None: None where it would be too small or too large, or the middle of the frame looks beyond
+        Orthophoto | None: None if it would be too small or too large, or the frame's middle is beyond
         :data:`MAX_FIELD_DEG`.
     """
     bounds = ground_bounds_px(camera, attitude, height_m, enu_jacobian)
@@ -330,7 +330,7 @@ def _projected(ground_m: Array, camera: Camera, enu_from_camera: Array) -> NDArr
 def _drawn(
     gray: NDArray[np.uint8], scale: float, x_px: NDArray[np.float32], y_px: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
-    """The frame at places (h, w) of it, averaged down first where it is much finer than the map."""
+    """The frame sampled at (h, w) places, averaged down first if it is much finer than the map."""
     picture, picture_from_image = shrink(gray, scale)
     if picture is not gray:
         (sx, _, left), (_, sy, top) = picture_from_image[:2].astype(np.float32)
@@ -341,7 +341,7 @@ def _drawn(
 def _between_nodes(
     nodes: NDArray[np.float32], shape: tuple[int, ...], size: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Places x and y (h, w) in a frame of some shape, by those (n, n, 3) of a lattice; 1 where it shows them."""
+    """Places x and y (h, w) in a frame, interpolated from a grid (n, n, 3); and 1 where the frame shows them."""
     from engine.kernels.lattice import places_between_nodes  # numba takes a while to import
 
     x_px, y_px, inside = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.uint8)

@@ -1,4 +1,4 @@
-"""The auto method: NCC and SIFT, each a second opinion of the other."""
+"""The auto method: NCC and SIFT, each checking the other."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from engine.values import Fix, NoFix, Reason, Result, Window
 
 
 class Auto(Method):
-    """NCC where height and heading are known, then SIFT where there is time; two fixes must agree.
+    """NCC if height and heading are known, then SIFT if time remains; two fixes must agree.
 
     Args:
         site: the map.
@@ -58,16 +58,16 @@ class Auto(Method):
         self.sift.warmup(query)
 
     def warmup_search(self, query: Query) -> None:
-        """Search the whole map by both, or headings and heights about the prior by NCC."""
+        """Search the whole map by both methods, or headings and heights around the prior by NCC."""
         if query.prior is None:
             self.locate(query)
         else:
             self.ncc.warmup_search(query)
 
     def locate(self, query: Query) -> Result:
-        """The more accurate of two fixes that agree, or the only one.
+        """The more accurate of two agreeing fixes, or the only fix.
 
-        The second method makes a fix more certain. It comes last, so that for lack of time nothing is lost to it.
+        The second method makes a fix more certain. It runs last, so that it never takes time from the first.
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
@@ -93,7 +93,7 @@ class Auto(Method):
         if not agree_in_height(first, second):
             return _vaguer(second, offset_m)
         fixes = [fix for fix in (refined, second) if isinstance(fix, Fix)]
-        # Both compare one picture with one map under one prior, so their odds are not multiplied.
+        # Both compare the same picture and map with the same prior, so their odds are not multiplied.
         stated = [fix.confidence for fix in fixes if fix.confidence is not None]
         best = min(fixes, key=lambda fix: fix.sigma_m)
         return replace(best, stage="verified", confidence=max(stated, default=None))
@@ -103,7 +103,7 @@ class Auto(Method):
             if not isinstance(first, Fix):
                 return self.sift.locate(query)
             with query.scheduler.with_fix():
-                if first.stage == "coarse":  # no pose that is refined yet: SIFT's will be
+                if first.stage == "coarse":  # its pose is not refined yet: SIFT's will be
                     return self.sift.locate(query)
                 return self.sift.confirm(query, partial(_agree, first))
         except OutOfTime:
@@ -119,10 +119,10 @@ def _agree(first: Fix, second: Fix) -> bool:
 
 
 def _vaguer(second: Fix, offset_m: NDArray[np.float64]) -> Fix:
-    """The fix of SIFT where NCC found the same place, but not as nearly as both state.
+    """SIFT's fix if NCC found the same place, but further away than both state.
 
-    No other place lies so near. Telemetry in error moves the patch that NCC looks for; the pose rests less on it.
-    Which one is off is unknown: the covariance covers both.
+    No other place is so near. A telemetry error shifts the patch that NCC searches for, and the pose less so.
+    Which of the two is off is unknown: the covariance covers both.
     """
     covariance_m2 = second.covariance_m2.copy()
     covariance_m2[:2, :2] += offset_m[:, None] * offset_m

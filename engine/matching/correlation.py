@@ -1,4 +1,4 @@
-"""Correlation of one hypothesis: the frame aligned with the map by a height and a heading, and its peak."""
+"""Correlation of one hypothesis: align the frame with the map by a height and a heading, find the peak."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from engine.window import SPREAD_SIGMAS, level_crop
 Array = NDArray[np.float64]
 
 METHOD = "ncc"
-_COARSER = (0, 1, 2)  # levels above the frame's own that may be matched where time is short
-_MIN_SIDE_PX = 24  # of what is correlated there
+_COARSER = (0, 1, 2)  # levels above the frame's own that may be matched if time is short
+_MIN_SIDE_PX = 24  # of the template there
 _EVERY_PLACE = "every place of a wide window"  # a step
-_GROUND_SHARE = 0.3  # of the height: within this distance of a frame's middle its ground is taken for a plane
-_SPREAD_SIGMAS = 2.0  # and within so many sigmas of the prior, where the position is less certain
+_GROUND_SHARE = 0.3  # of the height: the ground this close to a frame's middle is fitted by a plane
+_SPREAD_SIGMAS = 2.0  # or within so many sigmas of the prior, if that is farther
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Aligned:
     """A frame in the pixels of one level of the map's pyramid.
 
     Attributes:
-        pose: the height and heading by which it was aligned.
+        pose: the height and heading that aligned it.
         level: of the pyramid.
         jacobian: (2, 2) metres per pixel of the level.
         view: how the ground is seen.
@@ -60,7 +60,7 @@ class Aligned:
 
 @dataclass(frozen=True, slots=True)
 class Correlator:
-    """One frame with the map that it is correlated with.
+    """One frame and the map to correlate it with.
 
     Attributes:
         query: the frame.
@@ -78,7 +78,7 @@ class Correlator:
         Args:
             pose: the height and heading to align it by.
             level: of the pyramid.
-            nadir_px: (2,) where its ground is looked up; None takes the prior's place, or level ground.
+            nadir_px: (2,) where to look up its ground; None takes the prior's place, or level ground.
         """
         query, options = self.query, self.options
         attitude, height = pose.grid_attitude, pose.height_agl_m
@@ -105,10 +105,9 @@ class Correlator:
         return Aligned(pose, level, jacobian, view, patch, enhanced)
 
     def nowhere(self, aligned: Aligned) -> list[NDArray[np.uint8]]:
-        """The patches of the null hypothesis, as large as the frame's: upside down, and mirrored.
+        """Patches for the null hypothesis, as large as the frame's: upside down, and mirrored.
 
-        They show no place on Earth. Where the compass is wrong by half a turn, or the camera's picture comes
-        mirrored, one of them shows the true one.
+        They show no place on Earth, unless the compass is wrong by half a turn or the camera mirrors its picture.
         """
         query, own, attitude = self.query, aligned.patch.gray, aligned.pose.grid_attitude
         turned, patch = np.ascontiguousarray(own[::-1, ::-1]), None
@@ -118,7 +117,7 @@ class Correlator:
         return [turned, np.ascontiguousarray(own[:, ::-1]) if patch is None else patch.gray]
 
     def _align_oblique(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
-        """An oblique frame drawn over the ground's relief; its view is that of the part which is correlated."""
+        """An oblique frame drawn over the ground's relief; its view is that of the correlated part."""
         query, options = self.query, self.options
         attitude, height = pose.grid_attitude, pose.height_agl_m
         assert attitude is not None
@@ -134,7 +133,7 @@ class Correlator:
         return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, enhanced)
 
     def _slope(self, view: GroundView, height_m: float, level: int, nadir_px: Array | None) -> Array:
-        """Rise (2,) of the ground per pixel of the level, about a wider area the vaguer the prior is."""
+        """Rise (2,) of the ground per pixel of the level, over a wider area if the prior is vaguer."""
         query = self.query
         reach_m, place = _GROUND_SHARE * height_m, nadir_px
         if place is None and query.prior is not None:
@@ -144,7 +143,7 @@ class Correlator:
         return query.site.ground_plane(place + view.center_px * 2.0**level, reach_m)[1] * 2.0**level
 
     def window(self, aligned: Aligned) -> Window | None:
-        """The adaptive window in full-resolution map pixels; the whole map where there is no prior."""
+        """The adaptive window in full-resolution map pixels; the whole map without a prior."""
         query = self.query
         nadir = query.prior_px
         if nadir is None:
@@ -157,7 +156,7 @@ class Correlator:
         return query.window(center, footprint, min_px, margin=self.options.margin)
 
     def near(self, aligned: Aligned, nadir_px: Array, slack_px: int) -> Window:
-        """The window that holds the template about a nadir, and so many full-resolution pixels to each side."""
+        """The window that holds the template around a nadir, with a margin in full-resolution pixels."""
         site, scale = self.query.site, 2**aligned.level
         height, width = aligned.template.shape
         x0, y0 = (int(v) - slack_px for v in np.round(nadir_px + aligned.patch.offset_px * scale))
@@ -171,12 +170,12 @@ class Correlator:
         return self.prepared.cut(level_crop(self.query.site, window, level), level)
 
     def search(self, aligned: Aligned, window: Window, quick: QuickLook | None = None) -> Peak | None:
-        """The peak in a window, in pixels of the aligned level; None where the template is nowhere on the map.
+        """The peak in a window, in pixels of the aligned level; None if the template is nowhere on the map.
 
         Args:
             aligned: the hypothesis.
             window: in full-resolution map pixels.
-            quick: what is kept in a wide window although not every place was scored.
+            quick: which peaks of a wide window to keep although not every place was scored.
         """
         query, options = self.query, self.options
         height, width = aligned.template.shape
@@ -192,7 +191,7 @@ class Correlator:
     def _peak(
         self, region: Region, template: NDArray[np.float32], exclusion_px: float, quick: QuickLook | None
     ) -> Peak:
-        """The peak coarse to fine where that suffices, else of every place, if there is time for it."""
+        """The peak coarse to fine if that suffices, else over every place if there is time."""
         scheduler, search = self.query.scheduler, region.search
         with scheduler.stage("match"):
             found = self._coarse_to_fine(region, template, exclusion_px, quick)
@@ -216,7 +215,7 @@ class Correlator:
         return coarse_to_fine.peak(region.search, template, exclusion_px, min_overlap=least, quick=quick)
 
     def _has_coarse_levels(self, region: Region) -> bool:
-        """Whether places are scored at half resolution: on the CPU, and where pixels are about 0, as nodata is."""
+        """Whether to score places at half resolution: on the CPU, if pixels are centred on 0 like nodata."""
         on_cpu = isinstance(region.search.image, np.ndarray)
         return on_cpu and not self.options.exhaustive and (region.valid is None or self.is_centred)
 
@@ -228,17 +227,17 @@ class Correlator:
 
     @property
     def is_centred(self) -> bool:
-        """Whether enhanced pixels lie about 0, which nodata is on a coarse level."""
+        """Whether enhanced pixels are centred on 0, the value of nodata on a coarse level."""
         return self.options.score != "grey" and self.options.enhance_radius_px > 0
 
     def best_places(
         self, aligned: Aligned, window: Window, separation_px: int, count: int
     ) -> tuple[list[tuple[int, int, float]], Array] | None:
-        """The highest places of a window that are apart from each other.
+        """The highest places of a window, separated from each other.
 
         Args:
             aligned: the hypothesis.
-            window: in full-resolution map pixels; of a wide one on the CPU coarse to fine.
+            window: in full-resolution map pixels; searched coarse to fine if wide and on the CPU.
             separation_px: places are more than this apart in x or in y.
             count: upper bound on their number.
 
@@ -259,11 +258,11 @@ class Correlator:
         return None if surface is None else (best_positions(surface[0], separation_px, count), surface[1])
 
     def surface(self, aligned: Aligned, window: Window) -> tuple[Picture, Array] | None:
-        """The whole surface that :meth:`search` finds its peak on, for reports.
+        """The whole surface on which :meth:`search` finds its peak, for reports.
 
         Returns:
             Scores (H', W') of the template's top-left pixel, and that place (2,) of the first in pixels of the
-            level; None where the template does not fit the window.
+            level; None if the template does not fit the window.
         """
         height, width = aligned.template.shape
         region = self.cut(window, aligned.level)
@@ -294,7 +293,7 @@ class Correlator:
 
 
 def _moved(peak: Peak, window: Window) -> Peak:
-    """A peak of a window's surface, in pixels of the level."""
+    """The peak of a window's surface, in pixels of the level."""
     return replace(peak, x=peak.x + window.x0, y=peak.y + window.y0)
 
 
@@ -307,9 +306,9 @@ def _about(quick: QuickLook, window: Window) -> QuickLook:
 
 
 def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:
-    """Expected pixels of the window, by levels above the frame's own; the cost is proportional to them."""
+    """Expected pixels of the window per level above the frame's own; the cost is proportional to them."""
     site, camera, height_m = query.site, query.camera, query.telemetry.height_agl_m
-    assert height_m is not None  # asked for before
+    assert height_m is not None  # checked before
     assert query.prior is not None
     own = query.level_of(height_m)
     out = {}
@@ -320,6 +319,6 @@ def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:
         if coarser == 0 or (own + coarser < site.levels and side_px >= _MIN_SIDE_PX):
             slack_px = 2.0 * SPREAD_SIGMAS * query.prior.sigma_m / gsd_m
             width, height = (options.margin * n * per_px + slack_px for n in (camera.width_px, camera.height_px))
-            rows, columns = site.level_shape(own + coarser)  # beyond which no window reaches
+            rows, columns = site.level_shape(own + coarser)  # no window is larger
             out[coarser] = min(width, columns) * min(height, rows)
     return out

@@ -1,4 +1,4 @@
-"""Covariance of a fix by correlation: of its peak, and of what is assumed of telemetry, map and ground."""
+"""Covariance of a fix by correlation, from its peak and the assumed errors of telemetry, map and ground."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def tilt_covariance(cam_from_map: Array, sigma_rad: float) -> Array:
 
 
 def with_map_accuracy(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
-    """The errors with the accuracy that the map states in place of the one assumed of any map."""
+    """The errors, with the map's stated accuracy in place of the assumed one."""
     return replace(
         errors,
         map_m=errors.map_m if site.georeference_sigma_m is None else site.georeference_sigma_m,
@@ -43,7 +43,7 @@ def with_map_accuracy(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
 
 
 def options_on_map(options: MatcherOptions, site: OrthoMap) -> MatcherOptions:
-    """The settings with the accuracy that a map states in place of the one assumed of any map."""
+    """The settings, with the map's stated accuracy in place of the assumed one."""
     ncc, sift = options.ncc, options.sift
     return replace(
         options,
@@ -53,12 +53,12 @@ def options_on_map(options: MatcherOptions, site: OrthoMap) -> MatcherOptions:
 
 
 def map_sigma_of(site: OrthoMap) -> float:
-    """Georeferencing accuracy of a map per axis: its own, or that of any map."""
+    """Georeferencing accuracy of a map per axis: as stated, or as assumed."""
     return AssumedErrors().map_m if site.georeference_sigma_m is None else site.georeference_sigma_m
 
 
 def with_frame_accuracy(frame: Frame, errors: AssumedErrors) -> AssumedErrors:
-    """The errors with what the frame states in place of what is assumed of any telemetry, and with its lag."""
+    """The errors, with the frame's stated accuracies in place of assumed ones, and with its lag."""
     sigmas = (frame.heading_sigma_deg, frame.tilt_sigma_deg, frame.height_sigma_m)
     return _with_accuracy(errors, *sigmas, frame.tilt_lag_deg or 0.0, frame.heading_lag_deg or 0.0)
 
@@ -82,13 +82,13 @@ def _with_accuracy(
     return replace(errors, **known) if known else errors
 
 
-_NO_SHARE = 1e-6  # of a height whose standard deviation is stated as a whole
-# Neighbouring pixels share their noise: so many of them, squared, count as one.
+_NO_SHARE = 1e-6  # for a height whose standard deviation is stated as a whole
+# Neighbouring pixels share their noise: a square with this side counts as one.
 _CORRELATION_PX = 5.0
 
 
 def score_sigma(pixels: int) -> float:
-    """One standard deviation of the NCC of a patch with ground that it does not show.
+    """Standard deviation of the NCC between a patch and ground that it does not show.
 
     The correlation coefficient of N independent samples about zero has the variance 1/N.
     """
@@ -112,7 +112,7 @@ def peak_covariance_px(peak: Peak, pixels: int) -> Array:
     independent = 1.0 / score_sigma(pixels) ** 2
     rho = min(max(peak.score, 0.05), 0.999)
     information = -peak.curvature * independent * rho / (1.0 - rho * rho)
-    # A ridge has no curvature along it: the peak is then known to a few pixels there, not infinitely badly.
+    # A ridge has no curvature along it: the peak is still known there to a few pixels.
     values, vectors = np.linalg.eigh(information)
     variances = np.clip(1.0 / np.maximum(values, 1e-9), 0.05**2, 5.0**2)
     return np.asarray((vectors * variances) @ vectors.T, dtype=np.float64)
@@ -121,23 +121,23 @@ def peak_covariance_px(peak: Peak, pixels: int) -> Array:
 def misalignment_covariance_px2(
     peak: Peak, shape: tuple[int, int], height_m: float, errors: AssumedErrors
 ) -> Array:
-    """Covariance of a peak whose template is turned or scaled against the map.
+    """Covariance of a peak whose template is rotated or scaled relative to the map.
 
-    An error of heading or height moves every part of the patch by an amount of its own. Where the parts stay
-    within the width of the peak, it lies at their mean, and nothing is lost; where they do not, it follows the
-    part with the strongest texture, which may be anywhere. The share between the two is u^2 / (u^2 + width^2).
+    An error of heading or height moves every part of the patch by a different amount. If the parts stay within the
+    width of the peak, the peak lies at their mean, and nothing is lost; if not, it follows the part with the
+    strongest texture, which may be anywhere. The share between the two is u^2 / (u^2 + width^2).
 
     Args:
         peak: of the patch.
         shape: (rows, columns) of the patch.
         height_m: above the ground.
-        errors: what is assumed of height and heading.
+        errors: assumed errors of height and heading.
 
     Returns:
         (2, 2) in square pixels.
     """
     share = math.hypot(errors.height_share, errors.height_m / height_m, math.radians(errors.heading_deg))
-    apart = share**2 * (shape[0] ** 2 + shape[1] ** 2) / 24.0  # mean over the patch of one axis
+    apart = share**2 * (shape[0] ** 2 + shape[1] ** 2) / 24.0  # mean over the patch along one axis
     bend = -float(np.trace(peak.curvature)) / 2.0
     width = max(peak.score, 0.05) / max(bend, 1e-9)
     return np.asarray(apart * apart / (apart + width) * np.eye(2), dtype=np.float64)
@@ -148,12 +148,12 @@ def ncc_covariance_m2(
 ) -> Array:
     """Covariance of a fix by correlation.
 
-    The nadir is the position of the template less an offset by height and attitude, so their errors move the fix:
+    The nadir is the template's position minus an offset from height and attitude, so their errors move the fix:
     half a degree of tilt is 1.3 m at 150 m.
 
     Args:
         peak_px2: (2, 2) covariance of the peak in square pixels.
-        pose: height and attitude by which the frame was aligned.
+        pose: height and attitude that aligned the frame.
         camera: its mount gives the direction of the optical axis.
         enu_jacobian: (2, 2) metres east and north per pixel.
         errors: of the telemetry and the map.

@@ -1,10 +1,9 @@
-"""Evidence: the currency in which it is decided whether a place is right.
+"""Evidence: log-likelihood ratios that decide whether a place is right.
 
-Log-evidence, in nats, is log p(what was seen | it was taken there) - log p(the same | it was taken somewhere else,
-that looks like chance). Independent evidence adds up, and a fix is handed out if the odds that the sum gives leave
-no more than the risk that is allowed. What chance does is measured on the frame itself: by the pairs of its own
-matches that are known to be wrong, by the best rival elsewhere, and, in doubt, by the same frame mirrored, which
-shows no place on Earth.
+Evidence, in nats, is log p(match | the frame was taken there) - log p(match | it was taken elsewhere, by chance).
+Independent evidence adds up, and a fix is accepted if its probability of being wrong is at most the allowed risk.
+Chance is measured on the frame itself: by pairs of its own matches that are known to be wrong, by the best rival
+elsewhere and, in doubt, by the mirrored frame, which shows no place on Earth.
 """
 
 from __future__ import annotations
@@ -20,29 +19,29 @@ from engine.values import Fix
 from engine.window import SPREAD_SIGMAS
 
 INDEPENDENT = 0.7
-"""Which share of what matches say is independent: keypoints overlap, and several lie on one thing. Fitted on towns
-and on the places for fitting, so that evidence e for a wrong place is met no more often than exp(-e)."""
+"""Independent share of the evidence from matches: keypoints overlap, and several lie on one object. Fitted on
+towns and the places for fitting, so that evidence e for a wrong place occurs at most with probability exp(-e)."""
 RELIABILITY = 0.99
-"""Probability that a position, or a height, holds within its standard deviation; else it may be anything."""
+"""Probability that a position or a height is right to within its standard deviation; else it may be anything."""
 _SEARCHED = (2.0 * SPREAD_SIGMAS) ** 2 / (2.0 * math.pi)
-"""Area of a window over that of the prior's Gaussian: by so much its middle is more probable than other places."""
-_MAX_NATS = 30.0  # beyond which a probability is 1 to the last digit
-_PLACE_PX = 4.0  # side of the area whose scores are one place's: an enhanced picture changes over so many pixels
+"""Area of a window over that of the prior's Gaussian: how much more probable its middle is than other places."""
+_MAX_NATS = 30.0  # above it a probability is 1 to the last digit
+_PLACE_PX = 4.0  # side of the area that counts as one place: enhanced pictures vary on this scale
 
 
 @dataclass(frozen=True, slots=True)
 class PeakEvidence:
-    """What speaks for the highest peak of a correlation surface: extreme values of chance.
+    """Evidence for the highest peak of a correlation surface, from extreme values of chance.
 
-    Scores of chance are normal: the best of n places is expected at sqrt(2 ln n) sigmas, and reaches s sigmas with
-    a probability of n exp(-s^2 / 2). The rival, the best score elsewhere or of the null hypothesis, is what chance
-    reached. If it is higher than so many places explain, places here look alike, and a sigma is as much more.
+    Chance scores are normal: the best of n places is expected at sqrt(2 ln n) sigmas, and reaches s sigmas with
+    probability n exp(-s^2 / 2). The rival, the best score elsewhere or of the null hypothesis, shows what chance
+    reached. If it is higher than that many places explain, places here look alike, and sigma grows in proportion.
 
     Attributes:
         sigmas: Fisher's z of the score, in standard deviations of chance.
         rival_sigmas: the same of the rival.
         measured: places among which the rival is the best.
-        tried: places, times headings and heights, among which the peak is the best; no fewer.
+        tried: places, times headings and heights, among which the peak is the best; at least ``measured``.
         prior_chi_square: of the position against the prior, with two degrees of freedom; None without a prior.
     """
 
@@ -65,20 +64,20 @@ def _expected_sigmas(places: float) -> float:
 
 
 def independent_places(positions: float) -> float:
-    """How many places so many positions, in pixels, are: scores of neighbours are of one place."""
+    """Number of independent places among this many pixel positions: neighbours belong to one place."""
     return max(positions / _PLACE_PX**2, math.e)
 
 
 def sigmas_of(score: float, sigma: float) -> float:
-    """Fisher's z of a score in [-1, 1], 0 of a negative one, in standard deviations of a score of chance."""
+    """Fisher's z of a score in [-1, 1] (0 if negative), in standard deviations of a chance score."""
     return math.atanh(min(max(score, 0.0), 0.999)) / sigma
 
 
 def prior_chi_square(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> float:
-    """Chi-square, of two degrees of freedom, of a position against the prior by the errors of both.
+    """Chi-square, with two degrees of freedom, of a position against the prior, by the errors of both.
 
     Args:
-        fix: not accepted yet; an error of the map is the prior's as well, which is a place on it.
+        fix: not accepted yet; the prior is a place on the map and shares the map's error.
         prior_m: (2,) east and north in metres.
         sigma_m: standard deviation of the prior, per axis.
 
@@ -91,16 +90,16 @@ def prior_chi_square(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> 
 
 @dataclass(frozen=True, slots=True)
 class PoseEvidence:
-    """What speaks for a pose by matched keypoints.
+    """Evidence for a pose from matched keypoints.
 
     Attributes:
-        log10_nfa: log10 of the number of false alarms, the poses that chance would support as well.
+        log10_nfa: log10 of the number of false alarms, the poses that chance would support equally well.
         prior_chi_square: of the position against the prior, with two degrees of freedom; None without a prior.
-        height_chi_square: of the height against the telemetry's, with one degree of freedom; None where the
+        height_chi_square: of the height against the telemetry's, with one degree of freedom; None if the
             height is unknown or doubted.
-        rival_share: votes of the best translation elsewhere over those of this one; 0 where matches did not vote,
-            and ``log10_nfa`` is of the pose.
-        null_log10_nfa: log10 of the false alarms that the mirrored frame reaches; 0 where it was not asked.
+        rival_share: votes of the best translation elsewhere over those of this one; 0 if matches did not vote and
+            ``log10_nfa`` refers to the pose.
+        null_log10_nfa: log10 of the false alarms that the mirrored frame reaches; 0 if it was not matched.
     """
 
     log10_nfa: float
@@ -119,12 +118,12 @@ class PoseEvidence:
 
 
 def _of_position(chi_square: float | None) -> float:
-    """Of a place that lies so far from the prior's, against one anywhere in the window."""
+    """Evidence for a place at this distance from the prior's, against one anywhere in the window."""
     return 0.0 if chi_square is None else math.log(_gaussian(chi_square) * _SEARCHED + 1.0 - RELIABILITY)
 
 
 def _of_height(chi_square: float | None) -> float:
-    """Of a height that lies so far from the telemetry's. Agreement says nothing: wrong poses agree as well."""
+    """Evidence of a height this far from the telemetry's. Agreement adds none: wrong poses agree as well."""
     return 0.0 if chi_square is None else math.log(_gaussian(chi_square) + 1.0 - RELIABILITY)
 
 
@@ -133,17 +132,17 @@ def _gaussian(chi_square: float) -> float:
 
 
 def probability(nats: float) -> float:
-    """The probability, in (0, 1), that a place is right, where every second frame shows a place in its window."""
+    """The probability, in (0, 1), that a place is right, if every second frame shows a place in its window."""
     return 1.0 / (1.0 + math.exp(-min(max(nats, -_MAX_NATS), _MAX_NATS)))
 
 
 def nats_of(probability: float) -> float:
-    """The evidence that gives a probability; that of 1 is as much as counts."""
+    """The evidence that gives a probability; capped for a probability of 1."""
     return min(math.log(probability / max(1.0 - probability, math.exp(-_MAX_NATS))), _MAX_NATS)
 
 
 def is_beyond_doubt(nats: float, risk: float) -> bool:
-    """Whether a place has evidence for the cube of the risk: no null hypothesis is asked.
+    """Whether the evidence suffices for the cube of the risk: no null hypothesis is needed.
 
     Mirrored frames over symmetric ground, which are no chance, reached the square.
     """
@@ -151,12 +150,12 @@ def is_beyond_doubt(nats: float, risk: float) -> bool:
 
 
 def is_hopeless(nats: float, risk: float) -> bool:
-    """Whether a place has less than half of the evidence that is needed, so that no closer look will bring it."""
+    """Whether there is less than half of the evidence needed, too little for a closer look to help."""
     return nats < 0.5 * needed_nats(risk)
 
 
 def needed_nats(risk: float) -> float:
-    """The evidence at which a fix is wrong with no more than this probability.
+    """The evidence at which a fix is wrong with at most this probability.
 
     Args:
         risk: in (0, 1).

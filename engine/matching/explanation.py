@@ -1,4 +1,4 @@
-"""What one frame's match looks like: its correlation surface or its matches, recomputed for reports."""
+"""One frame's correlation surface or matches, recomputed for reports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-_MAX_WINDOW_PX = 1 << 21  # correlated as a whole; a larger window on a coarser level
+_MAX_WINDOW_PX = 1 << 21  # of a window correlated as a whole; a larger one uses a coarser level
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class ScoreSurface:
     Attributes:
         scores: (H, W) in [-1, 1].
         peak_px: (2,) its highest place (x, y).
-        corner_px: (2,) where in the map the patch's middle lies for the first score.
+        corner_px: (2,) map position of the patch's middle at the first score.
         step_px: map pixels from one score to the next.
     """
 
@@ -48,12 +48,12 @@ class ScoreSurface:
 
 @dataclass(frozen=True, slots=True)
 class PointMatches:
-    """Points of the frame that were found on the map.
+    """Points of the frame found on the map.
 
     Attributes:
         frame_px: (M, 2) in the undistorted frame.
         map_px: (M, 2) in the map.
-        agree: (M,) whether each agrees with the pose; none does where there is no pose.
+        agree: (M,) whether each agrees with the pose; all False without a pose.
     """
 
     frame_px: Array
@@ -63,13 +63,13 @@ class PointMatches:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """A frame's match in pictures; what could not be made is None.
+    """A frame's match in pictures; None for what could not be made.
 
     Attributes:
         gray: (H, W) the undistorted frame.
         rectified: (h, w) the frame in the map's pixels and axes.
-        outline_px: (4, 2) corners, in map pixels, of where the frame was found: of the rectified part by NCC, of
-            the whole frame by SIFT.
+        outline_px: (4, 2) corners in map pixels of the found frame: of the rectified part for NCC, of the whole
+            frame for SIFT.
         surface: of NCC.
         matches: of SIFT.
     """
@@ -129,7 +129,7 @@ def outline_of(corner_px: Array, patch: Gray) -> Array:
 
 
 def rectified_frame(query: Query) -> Patch | None:
-    """The frame in the map's pixels by its telemetry, on the level that suits it."""
+    """The frame in the map's pixels by its telemetry, on the level with the closest resolution."""
     pose = query.telemetry
     if pose.grid_attitude is None or pose.height_agl_m is None:
         return None
@@ -139,7 +139,7 @@ def rectified_frame(query: Query) -> Patch | None:
 
 
 def _footprint(query: Query, stats: PoseStats, ground_m: float) -> Array | None:
-    """(4, 2) where the frame's corners see a level ground, in map pixels; None where one sees the horizon."""
+    """(4, 2) where the frame's corners meet level ground, in map pixels; None if one sees the horizon."""
     rays = query.camera.frame_rays[:4] @ stats.rotation
     if (rays[:, 2] >= 0.0).any():
         return None

@@ -1,9 +1,8 @@
-"""Points of the frame found again on the map: by features of the orthophoto, or of the reduced frame.
+"""Find points of the frame on the map, by features of the orthophoto or of the reduced frame.
 
-Where height and heading are known the whole frame is drawn in the map's pixels by them
-(:func:`engine.matching.align.orthorectify`): its features are upright and of the map's scale, and what they match
-votes for one translation. Where they are not, the features of the frame itself are matched at any angle or scale,
-and RANSAC finds what agrees.
+If height and heading are known, the whole frame is orthorectified (:func:`engine.matching.align.orthorectify`):
+its features are upright and at the map's scale, and their matches vote for one translation. Otherwise features of
+the frame itself are matched at any angle and scale, and RANSAC finds those that agree.
 """
 
 from __future__ import annotations
@@ -32,27 +31,27 @@ from engine.values import Attitude
 Array = NDArray[np.float64]
 
 NOMINAL_SCALE = 0.5
-"""To which the pose's tolerance refers; features of a coarser picture are less accurate."""
-_ROUGHNESS_REACH_PX = 1.5  # pixels of the map about a landmark within which its surface's roughness counts
-_BLUNT_PX = 1.6  # scale at which a keypoint's position has twice the variance of a small one's
+"""The pose's tolerance refers to this; features of a coarser picture are less accurate."""
+_ROUGHNESS_REACH_PX = 1.5  # map pixels around a landmark over which the surface's roughness counts
+_BLUNT_PX = 1.6  # scale at which a keypoint's position variance is twice a small one's
 MAX_KEYPOINTS = 1000
 """Of the largest orthophoto."""
 _MAP_DENSITY = 1.5  # landmarks per pixel over the frame's keypoints per pixel
-_UPSAMPLED_PX = 100_000  # an orthophoto that shows more has keypoints enough without its smallest ones
+_UPSAMPLED_PX = 100_000  # an orthophoto with more has enough keypoints without the smallest
 
 
 @dataclass(frozen=True, slots=True)
 class Matched:
-    """Points of the frame found again in a view.
+    """Points of the frame found in a view.
 
     Attributes:
-        view: where.
+        view: the part of the map.
         points_px: (M, 2) pixels of the frame.
         points_m: (M, 3) metres on the ground.
         weights: (M,) relative inverse variances of the pixels.
-        tolerance_px: reprojection distance in the frame up to which a match agrees with a pose.
-        start: the pose that most voted for; None where there was no vote.
-        vote: what was voted for; None where there was no vote.
+        tolerance_px: largest reprojection distance in the frame at which a match agrees with a pose.
+        start: the pose with the most votes; None if there was no vote.
+        vote: the winning translation; None if there was no vote.
     """
 
     view: MapView
@@ -72,20 +71,20 @@ def match_views(
     hypothesis: TelemetryHypothesis,
     finder: PointFinder | None = None,
 ) -> list[Matched]:
-    """What of the frame is found again in each view.
+    """Find the frame's points in each view.
 
     Args:
         query: the frame.
-        landmarks: of the map; None where a finder takes their place.
+        landmarks: of the map; None if a finder takes their place.
         options: settings.
-        views: where to look.
-        hypothesis: what is assumed of the telemetry.
-        finder: finds the points in place of features; None takes ``options.matcher`` where there is one.
+        views: the parts of the map to search.
+        hypothesis: what is assumed about the telemetry.
+        finder: finds the points instead of features; None takes ``options.matcher`` if there is one.
     """
     if finder is None and options.matcher is not None:
         finder = PointFinder(options.matcher)
     source = finder or landmarks
-    assert source is not None  # only a finder does without landmarks
+    assert source is not None  # only a finder needs no landmarks
     height_m, attitude = hypothesis.height_m, query.telemetry.grid_attitude
     if height_m is not None and hypothesis.x_axis_deg is not None and attitude is not None and options.upright:
         found = [_by_orthophoto(query, source, options, view, attitude, height_m) for view in views]
@@ -107,7 +106,7 @@ def _by_orthophoto(
     attitude: Attitude,
     height_m: float,
 ) -> Matched | None:
-    """The whole frame drawn on a view's level, its features matched, and what they vote for."""
+    """Draw the whole frame on a view's level, match its features, and let the matches vote."""
     with query.scheduler.stage("rectify"):
         jacobian = query.jacobian * 2.0**view.level
         relief = ground_relief(query.site, query.prior_px, view.level)
@@ -121,7 +120,7 @@ def _by_orthophoto(
         photo_px, map_px, scale_px = _feature_pairs(query, source, photo, view, options)
     ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
     weights = _weights(query.site, ground_m, scale_px)
-    per_px = 2.0**view.level / map_px_per_pixel(query, height_m)  # pixels of the frame that are one of the level
+    per_px = 2.0**view.level / map_px_per_pixel(query, height_m)  # frame pixels per pixel of the level
     matched = Matched(view, photo.to_frame(photo_px), ground_m, weights, options.tolerance_px * max(per_px, 1.0))
     with query.scheduler.stage("vote"):
         return _voted(query, options, matched, photo, photo_px, map_px, attitude, height_m)
@@ -156,7 +155,7 @@ def _feature_pairs(
 
 
 def _matched(features: Features, found: Matches) -> tuple[NDArray[np.float32], Array, NDArray[np.int64]]:
-    """Accepted pairs: (M, 2) pixels of the features, (M,) their scales, (M,) indices on the map; in one copy."""
+    """Accepted pairs, in one copy: (M, 2) feature pixels, (M,) their scales, (M,) indices on the map."""
     columns = (features.xy_px[0], features.scale_px[0], found.valid[0], found.train_index[0])
     xy_px, scale_px, valid, index = download(columns)
     return xy_px[valid], scale_px[valid].astype(np.float64), index[valid]
@@ -197,13 +196,13 @@ def _voted(
 
 @dataclass(frozen=True, slots=True)
 class _Reduced:
-    """The frame reduced as the paper does, (1, 1, H, W) in [0, 1], and the scale (x, y) that reduced it."""
+    """The frame reduced as in the paper, (1, 1, H, W) in [0, 1], and the scale (x, y) of the reduction."""
 
     picture: torch.Tensor
     scale: Array
 
     def full(self, xy_px: Array | NDArray[np.float32]) -> Array:
-        """Places in the frame: edges lie on edges, centres on centres."""
+        """Places in the full frame: edges map to edges, centres to centres."""
         return np.asarray((xy_px + 0.5) / self.scale - 0.5, dtype=np.float64)
 
 
@@ -214,7 +213,7 @@ def _by_frame(
     views: list[MapView],
     hypothesis: TelemetryHypothesis,
 ) -> list[Matched]:
-    """Features of the reduced frame among those of the map, view by view."""
+    """Match features of the reduced frame with those of the map, view by view."""
     turn = hypothesis.x_axis_deg
     upright = options.upright and turn is not None
     with query.scheduler.stage("frame features"):
@@ -248,7 +247,7 @@ def _by_frame(
 
 
 def _by_reduced(query: Query, finder: PointFinder, options: SiftOptions, views: list[MapView]) -> list[Matched]:
-    """What a matcher of pictures finds with the reduced frame, view by view."""
+    """Points that an image matcher finds with the reduced frame, view by view."""
     reduced, matched = _reduce(query, options.scale), []
     valid = np.ones(reduced.picture.shape[2:], np.bool_)
     for view in views:
@@ -298,6 +297,6 @@ def lifted(site: OrthoMap, map_px: Array) -> Array:
 
 
 def _weights(site: OrthoMap, points_m: Array, scale_px: Array) -> Array:
-    """Weights (N,) of matches: blunt keypoints are less accurate, and on a rough surface they may stand higher."""
+    """Weights (N,) of matches: large keypoints are less accurate, and on a rough surface heights vary."""
     roughness = site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), _ROUGHNESS_REACH_PX)
     return roughness / (1.0 + (scale_px / _BLUNT_PX) ** 2)

@@ -1,4 +1,4 @@
-"""One frame matched with the map by features: matches lifted to 3D, and the pose that they agree on by PnP."""
+"""Match one frame with the map by features: lift the matches to 3D, solve for the pose by PnP."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ Array = NDArray[np.float64]
 
 METHOD = "sift"
 MIN_VOTES = 4
-"""Fewest matches of a pose where they voted for it."""
-_MATCHED_HEADING_SIGMA_DEG = 30.0  # of a heading that only the matches gave: next to no information
+"""Fewest matches of a pose that they voted for."""
+_MATCHED_HEADING_SIGMA_DEG = 30.0  # of a heading given by the matches alone: nearly no information
 
 
 @dataclass(frozen=True, slots=True)
 class PoseCandidate:
-    """A pose that is not accepted yet.
+    """A pose that has not been accepted yet.
 
     Attributes:
-        fix: what it means, with its confidence.
+        fix: the fix that it would give, with its confidence.
         evidence: for it.
     """
 
@@ -48,14 +48,14 @@ class PoseCandidate:
 
 @dataclass(frozen=True, slots=True)
 class FeatureMatcher:
-    """One frame with the landmarks that it is matched with.
+    """One frame and the landmarks to match it with.
 
     Attributes:
         query: the frame.
-        landmarks: of the map; None where a finder takes their place.
+        landmarks: of the map; None if a finder takes their place.
         options: settings.
-        finder: finds the matched points in place of features.
-        method: what fixes and refusals name.
+        finder: finds the matched points instead of features.
+        method: name of the method in fixes and refusals.
     """
 
     query: Query
@@ -65,7 +65,7 @@ class FeatureMatcher:
     method: str = METHOD
 
     def find(self) -> PoseCandidate | NoFix:
-        """The pose of the frame, or a refusal where there is none."""
+        """The pose of the frame, or a refusal if there is none."""
         query, options = self.query, self.options
         flat = query.refuse_flat(self.method, options.min_deviation)
         if flat is not None:
@@ -90,14 +90,14 @@ class FeatureMatcher:
         return refusal or self._find_with(next(self._attempts())[1])
 
     def judge(self, found: PoseCandidate) -> Fix | NoFix:
-        """The fix where its pose is accepted, else a refusal."""
+        """The fix if its pose is accepted, else a refusal."""
         fix, refusal = found.fix, judge_pose(found.evidence, self.query.risk)
         if refusal is None:
             return fix
         return self.query.refuse(*refusal, self.method, score=fix.score, window=fix.window)
 
     def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
-        """The candidate, unless beyond doubt with what its frame reaches mirrored, by the same telemetry."""
+        """The candidate; unless beyond doubt, compared with the mirrored frame under the same telemetry."""
         if is_beyond_doubt(found.evidence.nats, self.query.risk):
             return found
         mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
@@ -108,7 +108,7 @@ class FeatureMatcher:
         return PoseCandidate(replace(found.fix, confidence=probability(evidence.nats)), evidence)
 
     def _attempts(self) -> Iterator[tuple[FeatureMatcher, TelemetryHypothesis]]:
-        """What is tried in turn: the telemetry, the same at the frame's full resolution, and doubts of it."""
+        """Hypotheses to try in turn: the telemetry, the same at the frame's full resolution, then wider ones."""
         query, options = self.query, self.options
         height_m, factor = query.telemetry.height_agl_m, options.height_factor
         unknown = (MIN_HEIGHT_M, options.max_height_m)
@@ -122,15 +122,15 @@ class FeatureMatcher:
             yield self, wide
 
     def is_doubtful(self, found: PoseCandidate) -> bool:
-        """Whether too little speaks for a pose."""
+        """Whether there is too little evidence for a pose."""
         return found.evidence.nats < self.query.needed_nats
 
     def matches_in(self, window: Window) -> tuple[Array, Array, PoseStats | None]:
-        """What is matched in a window at the frame's own height and heading, and the pose of it: for reports.
+        """The matches in a window at the frame's own height and heading, and their pose: for reports.
 
         Returns:
             Points (M, 2) in pixels of the undistorted frame, their places (M, 3) on the ground in metres, and the
-            pose with its inliers, or None where there are too few or they do not determine one.
+            pose with its inliers, or None if the matches are too few or determine none.
         """
         height_m = self.query.telemetry.height_agl_m
         assert height_m is not None  # without one there is no single view
@@ -140,7 +140,7 @@ class FeatureMatcher:
         return found.points_px, found.points_m, self._pose(found, hypothesis)
 
     def _find_with(self, hypothesis: TelemetryHypothesis) -> PoseCandidate | NoFix:
-        """Match, lift and solve, with what is assumed of the telemetry."""
+        """Match, lift and solve, under one hypothesis about the telemetry."""
         query, options, scheduler = self.query, self.options, self.query.scheduler
         with scheduler.stage("window"):
             views = views_of(query, hypothesis, self.method, margin=options.margin, scale=options.scale)
@@ -148,13 +148,13 @@ class FeatureMatcher:
             return views
         if self.finder is not None and any(map(self.finder.too_large, views)):
             pixels = max(view.crop.area_px for view in views)
-            detail = f"a window of {pixels} pixels is more than is searched; a nearer position is needed"
+            detail = f"a window of {pixels} pixels is too large to search; a more accurate position is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method, window=views[0].window)
         matched = match_views(query, self.landmarks, options, views, hypothesis, self.finder)
         matched.sort(key=lambda found: len(found.points_px), reverse=True)
         count, window = len(matched[0].points_px), matched[0].view.window
         if count < MIN_VOTES:
-            detail = f"{count} matches; {MIN_VOTES} are asked for"
+            detail = f"{count} matches; {MIN_VOTES} are required"
             return query.refuse(Reason.TOO_FEW_MATCHES, detail, self.method, window=window)
         if scheduler.deadline.remaining_ms < 0:
             return query.refuse(Reason.LATE, "the budget was spent before the pose", self.method, window=window)
@@ -172,12 +172,12 @@ class FeatureMatcher:
     def _pose(self, found: Matched, hypothesis: TelemetryHypothesis) -> PoseStats | None:
         """The pose that the matches agree on and the attitude allows.
 
-        Few matches hardly separate a tilt from a displacement. What is known of the tilt counts also where the
-        heading is not: that is then taken from the matches themselves.
+        Few matches hardly separate a tilt from a displacement. A known tilt counts even if the heading is unknown:
+        the matches themselves then give the heading.
         """
         query, options = self.query, self.options
         pose = replace(options.pose, reprojection_px=found.tolerance_px)
-        if found.vote is not None:  # by which the place is judged, not by the pose
+        if found.vote is not None:  # the vote is evidence for the place, not the pose
             pose = replace(pose, min_inliers=MIN_VOTES, max_log10_nfa=math.inf)
         matrix = query.camera.matrix
         solve = partial(
@@ -196,7 +196,7 @@ class FeatureMatcher:
         return solve(prior=query.attitude_prior(heading_deg, sigma_deg, errors))
 
     def _fix(self, stats: PoseStats, window: Window) -> Fix | NoFix:
-        """The camera's centre as a fix; refused where a drone over this map cannot be there."""
+        """The camera's centre as a fix; refused if a drone over this map cannot be there."""
         query, site, options = self.query, self.query.site, self.options
         up = float(stats.center_m[2])
         nadir = site.pixel_from_enu(stats.center_m[:2])
@@ -208,7 +208,7 @@ class FeatureMatcher:
             return query.refuse(Reason.BAD_POSE, detail, self.method, score=share, window=window)
         covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
         turns_rad2 = stats.covariance[3:, 3:] + tilt_covariance(stats.rotation, _slope_rad(site, options.errors))
-        if not query.telemetry.has_tilt:  # features of a coarse picture err together, as a tilt would
+        if not query.telemetry.has_tilt:  # features of a coarse picture share errors that look like a tilt
             wider = max(1.0, NOMINAL_SCALE / options.scale) ** 2
             covariance, turns_rad2 = covariance * wider, turns_rad2 * wider
         doubt_m = query.scale_doubt_m(nadir, up, stats.rotation[2], query.errors(options.errors))
@@ -229,7 +229,7 @@ class FeatureMatcher:
     def _with_confidence(
         self, fix: Fix, stats: PoseStats, vote: Vote | None, hypothesis: TelemetryHypothesis
     ) -> PoseCandidate:
-        """The candidate of a fix; a height that is doubted in this hypothesis does not count."""
+        """The candidate of a fix; the height does not count if this hypothesis doubts it."""
         query, height_m = self.query, self.query.telemetry.height_agl_m
         errors = query.errors(self.options.errors)
         height_chi_square = None
@@ -251,11 +251,11 @@ class FeatureMatcher:
 
 
 def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:
-    """(3, 3) of the map: its georeferencing accuracy, and a slope of the ground that PnP takes for a tilt."""
+    """(3, 3) of the map: its georeferencing accuracy, and a ground slope that PnP mistakes for a tilt."""
     horizontal = errors.map_m**2 + (height_m * _slope_rad(site, errors)) ** 2
     return np.diag([horizontal, horizontal, errors.map_m**2])
 
 
 def _slope_rad(site: OrthoMap, errors: AssumedErrors) -> float:
-    """Standard deviation of the ground's slope against that of the map's heights."""
+    """Standard deviation of the ground's slope relative to that in the map's heights."""
     return math.radians(errors.surface_slope_deg if site.has_surface else errors.unknown_slope_deg)

@@ -1,4 +1,4 @@
-"""Multi-hypothesis search: NCC over headings, heights and whole maps; coarse for all of them, fine for the best.
+"""Multi-hypothesis search: NCC over headings, heights and whole maps, coarse for all, fine for the best.
 
 A hypothesis is a height and a heading of the frame. All are aligned on a coarse level of the map and scored
 against one spectrum. The best places are then matched level by level, and the winner's heading and height are
@@ -30,15 +30,15 @@ Array = NDArray[np.float64]
 _MAX_COARSE_PLACES = 32_000_000  # hypotheses times places on the coarse level, unless the template gets too small
 _MAX_COARSE_PX = 4_000_000  # of the map, likewise
 _MIN_TEMPLATE_PX = 20
-_MIN_QUICK_TEMPLATE_PX = 12  # of a quick look, whose result is kept where it is beyond doubt only
+_MIN_QUICK_TEMPLATE_PX = 12  # of a quick look, whose result is kept only if beyond doubt
 _MIN_QUICK_SCORE, _MAX_QUICK_RIVAL = 0.5, 0.7  # at full resolution; the rival as a share of the score
 _CANDIDATES = 8
 _SEMIFINALISTS = 4
 _FINALISTS = 2
-_HOPEFUL = 0.5  # of the best score: a place below does not win by a better heading and height
-_MIN_GROUP, _MAX_GROUP_PX = 2, 4_000_000  # templates in one batch, or pixels of their surfaces: memory's bound
-_SLACK_PX = 3  # by which a place that was found on a level may be wrong, in pixels of that level
-_EDGE_PX = 1.5  # by which the nearest hypothesis may be off at the corner of the patch
+_HOPEFUL = 0.5  # of the best score: a lower place does not win by a better heading and height
+_MIN_GROUP, _MAX_GROUP_PX = 2, 4_000_000  # templates in one batch, or pixels of their surfaces, to bound memory
+_SLACK_PX = 3  # error of a place found on a level, in pixels of that level
+_EDGE_PX = 1.5  # error of the nearest hypothesis at the patch's corner
 _MIDDLE_ROUNDS = 2
 _FINE_ROUNDS = 2
 
@@ -57,7 +57,7 @@ def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak
 
 
 def _quick_level(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[GridPose]] | None:
-    """One level above, with its fewer hypotheses, which costs a sixteenth; None where too little is left there."""
+    """Search one level above, with fewer hypotheses, at a sixteenth of the cost; None if too little is left."""
     above = level + 1
     side_px, turns, shares = _grid_on(correlator, first, above)
     if above == correlator.query.site.levels or side_px < _MIN_QUICK_TEMPLATE_PX:
@@ -72,7 +72,7 @@ def _is_clear(peak: Peak) -> bool:
 def _from_level(
     correlator: Correlator, first: Aligned, window: Window, level: int, poses: list[GridPose]
 ) -> tuple[Peak, Aligned] | None:
-    """The best peak over some hypotheses, all of which are scored on one level."""
+    """The best peak over some hypotheses, all scored on one level."""
     found: list[tuple[Peak, Aligned]] = []
     middle = max(first.level, level - 1)
     for pose, nadir in _coarse(correlator, poses, window, level):
@@ -90,12 +90,12 @@ def _from_level(
 
 
 def coarse_px(correlator: Correlator, first: Aligned, window: Window) -> int:
-    """Pixels of the map that :func:`search` looks at first, all at once."""
+    """Map pixels that :func:`search` searches first, all at once."""
     return window.area_px >> 2 * _coarse_level(correlator, first, window)[0]
 
 
 def _coarse_level(correlator: Correlator, first: Aligned, window: Window) -> tuple[int, list[GridPose]]:
-    """The level on which all hypotheses are scored, and the hypotheses, whose number falls with the resolution."""
+    """The level on which to score all hypotheses, and the hypotheses: fewer at lower resolution."""
     level, levels = first.level, correlator.query.site.levels
     while True:
         side_px, turns, shares = _grid_on(correlator, first, level)
@@ -107,13 +107,13 @@ def _coarse_level(correlator: Correlator, first: Aligned, window: Window) -> tup
 
 
 def _grid_on(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[float], list[float]]:
-    """The template's shorter side on a level, in its pixels, with the turns and shares to be tried there."""
+    """The template's shorter side on a level, in its pixels, with the turns and shares to try there."""
     h, w = (n >> (level - first.level) for n in first.template.shape)
     return min(h, w), *_grid(correlator.options, math.hypot(h, w) / 2.0)
 
 
 def _grid(options: NccOptions, reach_px: float) -> tuple[list[float], list[float]]:
-    """Turns in degrees and shares of the height that leave no corner of a patch off by more than :data:`_EDGE_PX`.
+    """Turns in degrees and shares of the height that keep a patch's corners within :data:`_EDGE_PX`.
 
     Args:
         options: how far heading and height may be off.
@@ -127,7 +127,7 @@ def _grid(options: NccOptions, reach_px: float) -> tuple[list[float], list[float
 
 
 def _steps(reach: float, step: float) -> list[float]:
-    """Offsets from -reach to reach, no further apart than the step, 0 among them."""
+    """Offsets from -reach to reach, including 0, spaced by at most the step."""
     count = math.ceil(reach / step)
     return [reach * i / count for i in range(-count, count + 1)] if count else [0.0]
 
@@ -171,7 +171,7 @@ def _coarse(
 
 
 def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.float32]) -> Iterator[Picture]:
-    """One surface (H', W') after the other, of which only a few are in memory."""
+    """Yield one surface (H', W') at a time; only a few are in memory."""
     area_px = region.window.width_px * region.window.height_px
     group = max(_MIN_GROUP, _MAX_GROUP_PX // area_px)
     if region.valid is None:
@@ -187,7 +187,7 @@ def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.floa
 
 
 def _same_size(fitting: list[Aligned]) -> tuple[NDArray[np.float32], list[Array]]:
-    """Templates (T, h, w) cut about their middles to the smallest, and what was cut off (x, y) at their corner."""
+    """Templates (T, h, w) cropped centrally to the smallest, and the (x, y) cut off at their corner."""
     h = min(aligned.template.shape[0] for aligned in fitting)
     w = min(aligned.template.shape[1] for aligned in fitting)
     trims = [((a.template.shape[1] - w) // 2, (a.template.shape[0] - h) // 2) for a in fitting]
@@ -196,7 +196,7 @@ def _same_size(fitting: list[Aligned]) -> tuple[NDArray[np.float32], list[Array]
 
 
 def _separated(found: list[tuple[float, GridPose, Array]], distance_px: float) -> list[tuple[GridPose, Array]]:
-    """The best few of places in falling order that are no neighbours of a better one."""
+    """The best few of places in falling order, without neighbours of a better one."""
     kept: list[tuple[GridPose, Array]] = []
     for _, pose, nadir in found:
         if all(np.hypot(*(nadir - other)) > distance_px for _, other in kept):
@@ -207,7 +207,7 @@ def _separated(found: list[tuple[float, GridPose, Array]], distance_px: float) -
 
 
 def _near(correlator: Correlator, aligned: Aligned, nadir_px: Array, level: int) -> Peak | None:
-    """The peak near a nadir that was found on some level, within a few pixels of that level."""
+    """The peak within a few pixels of a nadir that was found on some level."""
     return correlator.search(aligned, correlator.near(aligned, nadir_px, _SLACK_PX * 2**level))
 
 
@@ -263,7 +263,7 @@ def _best_at_full_resolution(
         better = _near(correlator, fine, nadir, aligned.level + 1)
         if better is None:
             continue
-        # Rivals get as good a heading and height as the winner, or the lead would be that of the refinement.
+        # Rivals are refined in heading and height like the winner, or refinement alone would create the lead.
         final.append(_refined(correlator, better, fine, _FINE_ROUNDS) if refine else (better, fine))
     if not final:
         return None
@@ -273,7 +273,7 @@ def _best_at_full_resolution(
 
 
 def _best_elsewhere(correlator: Correlator, found: list[tuple[Peak, Aligned]]) -> float:
-    """The best score at another place than the winner's."""
+    """The best score at a place other than the winner's."""
     winner = correlator.nadir_px(*found[0])
     distance_px = correlator.options.exclusion_m / correlator.query.site.gsd_m_per_px
     scores = [

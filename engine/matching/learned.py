@@ -1,4 +1,4 @@
-"""The learned method: points matched by networks, then all that SIFT does with its matches."""
+"""The learned method: networks match points; the rest is as in SIFT."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from engine.runtime.device import Device
 from engine.values import Fix, NoFix, Result, Window
 
 METHOD = "learned"
-_REDUCED = (1.0, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
+_REDUCED = (1.0, 0.5)  # of the scale at which the frame is matched; the smaller if time is short
 
 
 class Learned(Method):
-    """A learned matcher in place of SIFT's features; window, pose, probability and covariance are SIFT's.
+    """A learned matcher instead of SIFT's features; window, pose, probability and covariance are SIFT's.
 
     Args:
         site: the map.
         device: where the networks live.
-        options: settings; ``options.learned`` and, for what follows the matches, ``options.sift`` count.
+        options: settings; uses ``options.learned`` and, after matching, ``options.sift``.
 
     Raises:
         OptionError: there are no weights, or they make no matcher.
@@ -45,7 +45,7 @@ class Learned(Method):
         self.options = replace(options.sift, second_look=False, tolerance_px=own.tolerance_px)
         self.max_picture_px = own.max_picture_px
 
-    warmup_rounds = 1  # of seconds each where there is no GPU
+    warmup_rounds = 1  # each takes seconds without a GPU
 
     @property
     def cache_counters(self) -> dict[str, int]:
@@ -53,7 +53,7 @@ class Learned(Method):
         return {} if self.keypoints is None else {"keypoint tiles": self.keypoints.created}
 
     def locate(self, query: Query) -> Result:
-        """A fix on the finest level of the map that there is time for."""
+        """A fix on the finest level of the map that time allows."""
         works = {share: query.gray.size * self._scale(query, share) ** 2 for share in _REDUCED}
         share = query.scheduler.first_affordable(METHOD, works)
         if share is None:
@@ -73,7 +73,7 @@ class Learned(Method):
         return FeatureMatcher(query, None, options, self.finder, METHOD)
 
     def _scale(self, query: Query, share: float) -> float:
-        """The scale of the frame at which its pixels are those of the level that it is matched on."""
+        """The scale at which the frame's pixels equal those of the level that it is matched on."""
         size, most = query.gray.size, self.max_picture_px * share**2
         height_m = query.telemetry.height_agl_m
         if height_m is None:

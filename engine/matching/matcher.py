@@ -1,4 +1,4 @@
-"""SceneMatcher: one frame, one prior, one budget in; a Fix or a NoFix out. Of a frame it keeps only its cost."""
+"""SceneMatcher: one frame, prior and budget in, a Fix or NoFix out. Keeps no state but step costs."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ if TYPE_CHECKING:
     from engine.runtime.tensors import torch
 
 _WARMUP_SHARES = (0.25, 0.12)  # of the map's shorter side that a synthetic frame sees
-_WARMUP_SIDE_PX = 4096  # of a larger map it is a part of this side
+_WARMUP_SIDE_PX = 4096  # of a larger map only a part with this side is used
 
 
 def _plans_created() -> int:
-    """Layouts of pictures that SIFT made so far; its module is not imported to say that there are none."""
+    """Number of filters that SIFT computed so far; 0, without importing its module, if it is unused."""
     features = sys.modules.get("engine.features")
     return 0 if features is None else int(features.plans_created())
 
 
 def _give_back_memory() -> None:
-    """Give the system what was allocated for the warm-up alone: glibc keeps it otherwise."""
+    """Return the warm-up's memory to the system: glibc keeps it otherwise."""
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
         libc.malloc_trim(0)
 
 
 def _bounded(prior: Prior) -> Prior:
-    """The prior no vaguer, and moved no farther, than any map is wide."""
+    """The prior, with uncertainty and movement limited to the width of any map."""
     moved = (prior.moved_east_m, prior.moved_north_m)
     if prior.sigma_m <= MAX_SIGMA_M and max(map(abs, moved)) <= MAX_SIGMA_M:
         return prior
@@ -64,15 +64,15 @@ class SceneMatcher:
     Args:
         site: the map.
         camera: as calibrated, with its distortion; frames are undistorted by a lookup computed once.
-        method: "ncc" (needs height and heading), "sift" (needs neither), "auto": NCC where height and heading are
-            known, then SIFT where there is time; where both have a fix they must agree; or "learned": networks
-            with the weights of ``options.learned``.
+        method: "ncc" (needs height and heading), "sift" (needs neither), "auto": NCC if height and heading are
+            known, then SIFT if time remains; if both have a fix they must agree; or "learned": networks with the
+            weights of ``options.learned``.
         device: "cpu", "cuda" or "auto".
-        options: settings; the defaults serve. The accuracy that the map states counts more than theirs.
+        options: settings. The accuracy that the map states overrides theirs.
 
     Raises:
         OptionError: the method is unknown.
-        DeviceError: the device was asked for by name and is missing.
+        DeviceError: the device was requested by name and is missing.
     """
 
     def __init__(
@@ -92,17 +92,17 @@ class SceneMatcher:
         threads.default_threads()
         self._method: Method = build(site, self.device, self.options)
         self._costs = Costs()
-        # What an undistorted picture obeys; the mount stays.
+        # The camera of undistorted pictures; the mount stays.
         self._pinhole = replace(camera, distortion_model="plumb_bob", distortion=np.zeros(5))
 
     def warmup(self, report: Callable[[int, int], None] = lambda done, total: None) -> None:
-        """Do before take-off what is done once: compile, find the map's features, plan, and learn what steps cost.
+        """Do all one-time work before take-off: compile, find the map's features, plan, and measure step costs.
 
-        Features are found on every level of at most :data:`engine.maps.landmarks.PREPARED_PX` pixels; those of
-        a map that comes from a file are kept for the next start. The frames that are matched are the map's own.
+        Features are found on every level of at most :data:`engine.maps.landmarks.PREPARED_PX` pixels; those of a
+        map from a file are kept for the next start. The warm-up matches frames drawn from the map.
 
         Args:
-            report: takes how many of how many loops are compiled, or loaded from the cache of an earlier start.
+            report: called with the number of loops compiled (or loaded from an earlier cache) and the total.
         """
         prepare_loops(self._method.loops, report)
         self._method.prepare()
@@ -113,13 +113,13 @@ class SceneMatcher:
                 self._method.warmup(self._query(frame, prior, Deadline(Budget())))
             self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
         if self.site.is_searchable:
-            for _ in range(2):  # a step that ran once would be begun whatever it took
+            for _ in range(2):  # a step that ran once has no cost yet and would always start
                 self._method.warmup_search(self._query(frame, None, Deadline(Budget())))
         _give_back_memory()
-        self.locate(*self._synthetic_frame(_WARMUP_SHARES[0]))  # takes again what a frame needs of it
+        self.locate(*self._synthetic_frame(_WARMUP_SHARES[0]))  # allocates again what a frame needs
 
     def _synthetic_frame(self, share: float) -> tuple[Frame, Prior]:
-        """The frame that a camera takes above the map's middle where it sees this share of its shorter side."""
+        """The frame of a camera above the map's middle that sees this share of the map's shorter side."""
         site, camera = self.site, self.camera
         side_px = share * min(site.width_px, site.height_px, _WARMUP_SIDE_PX)
         per_px = side_px / max(camera.width_px, camera.height_px)
@@ -142,13 +142,13 @@ class SceneMatcher:
         return self._method.cache_counters | shared
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
-        """Where the camera was when the frame was taken.
+        """The camera's position when the frame was taken.
 
         Args:
             frame: of the camera's resolution.
             prior: where the vehicle should be; None searches the whole map.
-            budget: how long the answer may take; None does not hurry. An answer that would come too late is
-                refused with ``Reason.LATE``.
+            budget: how long the answer may take; None sets no limit. A late answer is refused with
+                ``Reason.LATE``.
 
         Raises:
             CalibrationError: the frame is not of the camera's resolution.
@@ -165,7 +165,7 @@ class SceneMatcher:
         if query.prior_px is not None and not np.isfinite(query.prior_px).all():
             return query.refuse_outside(self.method)  # nowhere in the map's coordinate system
         if prior is None and not self.site.is_searchable:
-            detail = f"the map of {self.site.size_km} is not searched as a whole; a position to begin at is needed"
+            detail = f"the map of {self.site.size_km} is not searched as a whole; a start position is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method)
         try:
             result = self._method.locate(query)
@@ -184,26 +184,26 @@ class SceneMatcher:
         *,
         workers: int | None = None,
     ) -> list[Fix | NoFix]:
-        """Where the camera was at each of many frames, by all cores: what :meth:`locate` says of each, in order.
+        """The results of :meth:`locate` for many frames, in order, computed on all cores.
 
-        The work is divided among copies of this process (Linux), which share the prepared map. What they cache and
-        learn ends with them: call :meth:`warmup` before. Frames are matched one by one in this process on a GPU,
-        with a map that is too large for memory, and where all are done in a moment.
+        Forked copies of this process (Linux) share the work and the prepared map. Their caches end with them: call
+        :meth:`warmup` before. Frames are matched one by one in this process on a GPU, with a map that is too large
+        for memory, or if there is little work.
 
         Args:
             frames: of the camera's resolution.
-            priors: one a frame; None searches the whole map.
+            priors: one per frame; None searches the whole map.
             budget: of each frame.
-            workers: as many processes at most. None is one a core, and 1 where other threads of Python run; a
-                number forks all the same, and no other thread may hold a lock then that matching needs.
+            workers: most processes. None is one per core, or 1 if other Python threads run. A number always forks;
+                no other thread may then hold a lock that matching needs.
 
         Raises:
-            OptionError: frames and priors differ in number, or there can be no such number of workers.
+            OptionError: frames and priors differ in number, or this number of workers is impossible.
             CalibrationError: a frame, which is named by its index, is not of the camera's resolution.
             BackendError: a worker ended.
         """
         if len(frames) != len(priors):
-            raise OptionError(f"priors: expected one a frame, {len(frames)}, got {len(priors)}")
+            raise OptionError(f"priors: expected one per frame, {len(frames)}, got {len(priors)}")
 
         def located(index: int) -> Fix | NoFix:
             try:
@@ -220,7 +220,7 @@ class SceneMatcher:
         """The number of processes that frames are divided among.
 
         Raises:
-            OptionError: there can be no such number.
+            OptionError: the number is impossible.
         """
         if asked is not None and asked < 1:
             raise OptionError(f"workers: expected 1 or more, got {asked}")
@@ -238,11 +238,11 @@ class SceneMatcher:
         return processes.safe_count() if asked is None else asked
 
     def explain(self, frame: Frame, window: Window, method: str | None = None) -> Explanation:
-        """What the match of a frame in a window looks like: its surface or its matches, for reports.
+        """The correlation surface or the matches of a frame in a window, for reports.
 
         Args:
             frame: of the camera's resolution.
-            window: that was searched, in map pixels.
+            window: the searched window, in map pixels.
             method: "ncc", "sift" or "learned"; None takes the matcher's own, and NCC of "auto".
 
         Raises:

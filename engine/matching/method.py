@@ -1,4 +1,4 @@
-"""What every method is: one map that frames are matched with; of a frame it keeps nothing."""
+"""The interface of all methods: match frames with one map; keep no state between frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from engine.values import Result, Window
 
 
 class Method(ABC):
-    """A method. One without caches, costs or parts has only to locate and to explain.
+    """A method. One without caches, costs or parts only needs ``locate`` and ``explain``.
 
     Args:
         site: the map.
@@ -24,15 +24,15 @@ class Method(ABC):
     """
 
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:  # noqa: B027
-        """Keep nothing; a method that prepares something of the map has a constructor of its own."""
+        """Store nothing; a method that prepares the map overrides this."""
 
     @property
     def parts(self) -> Mapping[str, Method]:
-        """The methods that it is made of, by name."""
+        """The methods that it consists of, by name."""
         return {}
 
     warmup_rounds: ClassVar[int] = 3
-    """How often each frame of the warm-up is matched to learn what the steps cost."""
+    """How often each warm-up frame is matched to measure step costs."""
 
     loops: ClassVar[tuple[str, ...]] = ()
     """Modules of :mod:`engine.kernels` whose compiled loops it calls."""
@@ -43,16 +43,16 @@ class Method(ABC):
         return {}
 
     def prepare(self) -> None:  # noqa: B027
-        """Prepare what is looked up of the map, before take-off."""
+        """Prepare the map's look-up data, before take-off."""
 
     def warmup(self, query: Query) -> None:  # noqa: B027
         """Run every variant of every step of a frame with a prior, so that it is compiled and its cost known."""
 
     def warmup_search(self, query: Query) -> None:  # noqa: B027
-        """Run a search once; it takes long, and few frames need one.
+        """Run a search once; it is slow, and few frames need one.
 
         Args:
-            query: without a prior, of the whole map; with one, of headings and heights where the method has that.
+            query: without a prior, searches the whole map; with one, headings and heights if the method can.
         """
 
     @abstractmethod
@@ -61,4 +61,4 @@ class Method(ABC):
 
     @abstractmethod
     def explain(self, query: Query, window: Window) -> Explanation:
-        """What the match of a frame in a window looks like, for reports."""
+        """The surface or the matches of a frame in a window, for reports."""

@@ -38,8 +38,8 @@ MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
 _SECOND_LOOK, _AT_ONCE = "ncc second look", "refinement at once"  # steps
 _HOPEFUL_LOOK = "ncc second look by a coarser level"
-_SURROUNDINGS_SIGMA_M = 30.0  # of the window about a place that was searched for, in which it must stand out
-_TURNS_DEG = (-4.0, 4.0)  # by which a heading may be wrong where its frame was refused
+_SURROUNDINGS_SIGMA_M = 30.0  # of the window around a place found by a search, in which it must stand out
+_TURNS_DEG = (-4.0, 4.0)  # heading errors to try if a frame was refused
 _TURNED_SIGMA_DEG = 2.0  # of the heading then
 
 
@@ -92,14 +92,14 @@ class Ncc(Method):
         self.locate(query if query.prior is None else doubted)
 
     def locate(self, query: Query) -> Result:
-        """A fix on the finest level of the map that there is time for, refined where there is time for that."""
+        """A fix on the finest level of the map that time allows, refined if time remains."""
         return self.refine(query, self.begin(query))
 
     def begin(self, query: Query, *, try_turns: bool = True) -> Result:
-        """A refined fix that begins at the coarsest level, else one by correlation alone, see :meth:`correlate`.
+        """A refined fix that starts at the coarsest level, else one by correlation alone, see :meth:`correlate`.
 
-        The peak of the coarsest level is the fix where it was accepted and there is no time for a finer one, or
-        where the finer one is at the same place, but not accepted.
+        The peak of the coarsest level is the fix if it was accepted and there is no time for a finer one, or if
+        the finer one is at the same place but not accepted.
         """
         coarse = self._by_coarse_peak(query)
         if coarse is None:
@@ -127,9 +127,9 @@ class Ncc(Method):
         return coarse if is_same or fine.reason is Reason.LATE else fine
 
     def _by_coarse_peak(self, query: Query) -> Fix | None:
-        """The peak of the coarsest level, where it is accepted and a pose may be refined from it as from any.
+        """The peak of the coarsest level, if it is accepted and refinement may start from it.
 
-        Where roll, pitch or the slope of the ground is unknown, the pose rests on the peak, which must be fine.
+        If roll, pitch or the ground's slope is unknown, the pose depends on the peak, which must then be fine.
         """
         if query.prior is None or query.frame.is_doubted or not self._can_refine(query):
             return None
@@ -146,7 +146,7 @@ class Ncc(Method):
         return None if isinstance(result, NoFix) else replace(result, stage="coarse")
 
     def _is_same(self, coarse: Fix, fine: Fix) -> bool:
-        """Whether two peaks are of one place: where one would not be the other's rival."""
+        """Whether two peaks are of one place, so that neither is the other's rival."""
         distance_m = float(np.hypot(*offset_between_m(coarse, fine)))
         return distance_m < self.options.exclusion_m and agree_in_place(coarse, fine)
 
@@ -155,23 +155,23 @@ class Ncc(Method):
 
         Args:
             query: the frame.
-            coarser: levels above the one whose pixels are like the frame's; None takes the finest that there is
-                time for.
-            try_turns: whether a refused frame is tried with its heading a few degrees off.
+            coarser: levels above the one whose pixels are like the frame's; None takes the finest that time
+                allows.
+            try_turns: whether to retry a refused frame with its heading a few degrees off.
         """
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
         step, works = self._step(query)
         if coarser is None:
             coarser = query.scheduler.first_affordable(step, works)
-        if coarser is None and query.frame.is_doubted:  # rather by its own heading and height than not at all
+        if coarser is None and query.frame.is_doubted:  # better its own heading and height than no fix
             query.scheduler.costs.note_refusal((step, max(works)))
             return self.correlate(query.undoubted, try_turns=try_turns)
         if coarser is None:
             return query.refuse_late(METHOD, (step, max(works)))
         found, result = self._find_and_judge(query, step, works, coarser)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
-            with suppress(OutOfTime):  # the refusal that there is stands
+            with suppress(OutOfTime):  # the existing refusal stands
                 result = self._look_again(query, found, result)
                 if isinstance(result, NoFix) and try_turns and found.is_tested:
                     result = self._look_turned(query, coarser, works[coarser], result)
@@ -184,13 +184,13 @@ class Ncc(Method):
     def _find_and_judge(
         self, query: Query, step: str, works: dict[int, float], coarser: int
     ) -> tuple[PeakCandidate | NoFix, Result]:
-        """The highest peak on a level, and what becomes of it; a variant of a step, whose cost is learned."""
+        """Find and judge the highest peak on a level; a variant of a step, whose cost is learned."""
         with query.scheduler.costed((step, coarser), works[coarser]):
             found = self.find(query, coarser=coarser)
             return found, found if isinstance(found, NoFix) else self.judge(query, found)
 
     def _step(self, query: Query) -> tuple[str, dict[int, float]]:
-        """The name of the step that correlates, and the work of its variants."""
+        """The name of the correlation step, and the work of its variants."""
         doubted, map_px = query.frame.is_doubted, float(query.site.width_px * query.site.height_px)
         if query.prior is None:
             return "ncc doubted search" if doubted else "ncc search", {0: map_px}
@@ -200,10 +200,10 @@ class Ncc(Method):
         return ("ncc", windows) if self._trusts(query) else ("ncc hypotheses", {0: map_px})
 
     def refine(self, query: Query, result: Result) -> Result:
-        """The fix of a fine peak with its pose refined, where that is wanted, possible and affordable."""
+        """The fix of a fine peak, its pose refined if that is wanted, possible and affordable."""
         if not isinstance(result, Fix) or result.stage != "fine" or not self._can_refine(query):
             return result
-        if result.attitude is not None:  # found by another heading than the frame's own
+        if result.attitude is not None:  # found with another heading than the frame's own
             heading_deg = result.attitude.heading_deg
             frame = replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
             query = replace(query, frame=frame)
@@ -211,7 +211,7 @@ class Ncc(Method):
         return improved(query, result, "refinement", refinement.refine)
 
     def _can_refine(self, query: Query) -> bool:
-        """Whether poses are refined: a height that was searched for is not the frame's."""
+        """Whether poses are refined: not if the height was searched, as it is then not the frame's."""
         return self.options.refine and query.telemetry.height_agl_m is not None and self._trusts(query)
 
     def explain(self, query: Query, window: Window) -> Explanation:
@@ -219,12 +219,12 @@ class Ncc(Method):
         return explain_correlation(self._correlator(query), window)
 
     def find(self, query: Query, *, coarser: int = 0, headings: int = 1) -> PeakCandidate | NoFix:
-        """The highest peak of one frame, or a refusal where there is none.
+        """The highest peak of one frame, or a refusal if there is none.
 
         Args:
             query: the frame.
             coarser: see :meth:`correlate`.
-            headings: of how many tried it is one.
+            headings: how many headings are tried in all.
         """
         refusal = self._refuse_unusable(query)
         if refusal is not None:
@@ -239,7 +239,7 @@ class Ncc(Method):
         wide = query.site.is_large and window.area_px >> 2 * aligned.level > MAX_WINDOW_PX
         if wide and hypothesis_search.coarse_px(correlator, aligned, window) > MAX_WINDOW_PX:
             size = f"{window.width_px} x {window.height_px} px"
-            detail = f"a window of {size} is not searched; a better prior is needed"
+            detail = f"a window of {size} is too large to search; a better prior is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
         searched, hypotheses = not self._trusts(query), headings
         is_window = not (searched or wide or query.prior is None)
@@ -256,13 +256,13 @@ class Ncc(Method):
         tried = hypotheses * places_in(aligned, window)
         found = candidate_of(correlator, aligned, peak, window, searched=searched, tried=tried)
         if is_window and headings > 1 and found.evidence.nats < query.needed_nats:
-            return found  # the null hypothesis would only take away
+            return found  # the null hypothesis could only weaken it
         if is_window:
             return null_tested(correlator, found)
         return replace(found, is_tested=not searched and is_beyond_doubt(found.evidence.nats, query.risk))
 
     def _in_window(self, correlator: Correlator, aligned: Aligned, window: Window) -> tuple[Peak | None, Aligned]:
-        """The peak of one hypothesis; of an oblique frame over the ground where it was found, not at the prior."""
+        """The peak of one hypothesis; an oblique frame is redrawn over the ground where it was found."""
         query, pose = correlator.query, aligned.pose
         peak = correlator.search(aligned, window, quick_look(correlator, aligned, window))
         if peak is None or pose.grid_attitude is None or not is_oblique(query, pose.grid_attitude):
@@ -275,17 +275,16 @@ class Ncc(Method):
         return (peak, aligned) if second is None else (second, again)
 
     def judge(self, query: Query, found: PeakCandidate) -> Result:
-        """The fix where its peak is accepted, else a refusal."""
+        """The fix if its peak is accepted, else a refusal."""
         refusal = judge_peak(found.peak, found.evidence, query.risk, is_tested=found.is_tested)
         if refusal is not None:
             return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
         return found.fix
 
     def _look_turned(self, query: Query, coarser: int, work: float, refusal: NoFix) -> Result:
-        """The fix by a heading that is a few degrees off, where one is accepted, else the refusal.
+        """The fix with a heading a few degrees off, if one is accepted, else the refusal.
 
-        A compass beside motors is often off by more than is assumed of it, and a patch that is turned by 4 degrees
-        hardly correlates.
+        A compass near motors is often off by more than assumed, and a patch turned by 4 degrees hardly correlates.
         """
         best: Fix | None = None
         for turn_deg in _TURNS_DEG:
@@ -310,7 +309,7 @@ class Ncc(Method):
         return refusal if again is None else self.judge(query, again)
 
     def _looked_at(self, query: Query, found: PeakCandidate) -> Window:
-        """The window of a second look: the first one's, or of what was searched for the place's surroundings."""
+        """The window of a second look: the first one's; after a search, the surroundings of the place."""
         if found.is_tested:
             return found.fix.window
         place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
@@ -322,11 +321,11 @@ class Ncc(Method):
 
         Args:
             query: the frame.
-            found: at the first look.
-            window: that is looked at; None takes that of the first look, which the fix names in any case.
+            found: the candidate of the first look.
+            window: to look at; None takes that of the first look, which the fix names in any case.
 
         Returns:
-            PeakCandidate | None: None where the template is nowhere on the map, or there is no time.
+            PeakCandidate | None: None if the template is nowhere on the map, or there is no time.
         """
         window = window or found.fix.window
         correlator, scheduler, work_px = self._correlator(query), query.scheduler, found.aligned.work_px(window)
@@ -363,7 +362,7 @@ class Ncc(Method):
         return query.refuse_flat(METHOD, self.options.min_deviation)
 
     def _align(self, correlator: Correlator, coarser: int) -> Aligned | NoFix:
-        """The frame by its own height and heading, or by any heading where it came without one."""
+        """The frame with its own height and heading, or with any heading if it came without one."""
         query, pose = correlator.query, correlator.query.telemetry
         assert pose.height_agl_m is not None  # or it was refused
         level = min(query.level_of(pose.height_agl_m) + coarser, query.site.levels - 1)

@@ -1,4 +1,4 @@
-"""What correlation takes of an oblique frame: an upright part, drawn over the relief without the far field."""
+"""The part of an oblique frame to correlate: an upright rectangle over the relief, without the far field."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 OBLIQUE_DEG = 25.0
-"""Angle of the optical axis off the vertical beyond which the ground is no plane to a frame."""
+"""Angle of the optical axis off the vertical beyond which the ground no longer looks like a plane."""
 FIELD_DEG = 60.0
 """Ground farther off the vertical is left out: walls hide it, and an error of height or tilt moves it most."""
-_SAME_GROUND_SHARE = 0.02  # of the height; relief of places that are nearer looks alike
+_SAME_GROUND_SHARE = 0.02  # of the height; closer places have similar relief
 _MIN_SIDE_PX = 8
-_CELLS = 96  # along the longer side, by which the rectangle is found
+_CELLS = 96  # of the grid that finds the rectangle, along the longer side
 
 
 def is_oblique(query: Query, attitude: Attitude) -> bool:
@@ -31,7 +31,7 @@ def is_oblique(query: Query, attitude: Attitude) -> bool:
 
 
 def is_ground_below(query: Query, nadir_px: Array) -> bool:
-    """Whether the ground about a place (2,) is that about the prior, as far as it matters from this height."""
+    """Whether the ground at a place (2,) equals that at the prior, as far as it matters from this height."""
     height_m = query.telemetry.height_agl_m
     if query.prior_px is None or height_m is None:
         return False
@@ -52,7 +52,7 @@ def oblique_patch(
         nadir_px: (2,) full-resolution pixel about which the ground is looked up; None takes it for level.
 
     Returns:
-        Patch | None: None where no 8 x 8 pixels are seen.
+        Patch | None: None if no 8 x 8 pixels are seen.
     """
     site, jacobian = query.site, query.jacobian * 2.0**level
     relief = ground_relief(site, nadir_px, level)
@@ -77,7 +77,7 @@ def _near(shape: tuple[int, ...], offset_px: Array, jacobian: Array, height_m: f
 
 
 def _on_map(site: OrthoMap, shape: tuple[int, ...], corner_px: Array, level: int) -> Mask:
-    """(H, W) which pixels of an orthophoto lie on valid map, its corner at a pixel of the level."""
+    """(H, W) which pixels of an orthophoto lie on valid map, given its corner's pixel on the level."""
     valid, corner = np.zeros(shape, np.bool_), np.rint(corner_px).astype(int)
     rows, columns = site.level_shape(level)
     low = np.maximum(corner, 0)
@@ -96,7 +96,7 @@ def largest_rectangle(valid: Mask) -> Window:
         valid: (H, W).
 
     Returns:
-        Window: empty where there is none.
+        Window: empty if there is none.
     """
     step = max(1, max(valid.shape) // _CELLS)
     rows, columns = (n // step for n in valid.shape)
@@ -106,7 +106,7 @@ def largest_rectangle(valid: Mask) -> Window:
     for row in range(rows):
         runs[row] = np.where(cells[row], (runs[row - 1] if row else 0) + 1, 0)
     best, best_area, lowest = Window(0, 0, 0, 0), 0, runs
-    for width in range(1, columns + 1 if rows else 1):  # lowest: of the runs of so many columns from each on
+    for width in range(1, columns + 1 if rows else 1):  # lowest run of this many columns from each on
         if width > 1:
             lowest = np.minimum(lowest[:, :-1], runs[:, width - 1 :])
         row, column = divmod(int(lowest.argmax()), lowest.shape[1])

@@ -1,4 +1,4 @@
-"""The paper's own recipe, literally, with OpenCV: the baseline that the engine is compared with.
+"""The paper's recipe, reproduced literally with OpenCV: the baseline for comparison.
 
 NCC: grey, equalise, scale (eq. 2), rotate (eq. 3), ``TM_CCORR_NORMED`` (eq. 1) in the adaptive window (eq. 4, 5),
 whole-pixel peak; tilt is not compensated. SIFT: frame and window at 0.5, features of both computed for every
@@ -30,7 +30,7 @@ Scores = NDArray[np.float32]
 MARGIN = 1.3
 SCALE = 0.5
 RATIO = 0.8  # the paper gives none; Lowe's own
-FRACTION = 0.7  # of the rotated frame, so that no empty corner is matched
+FRACTION = 0.7  # of the rotated frame, to exclude empty corners
 REPROJECTION_PX = 4.0
 SIGMA_M = 2.4  # the paper states no covariance; this is the RMS error that it reports
 _MAX_DISTANCE_M = 1e6
@@ -111,7 +111,7 @@ class PaperSift(Method):
         rectified = None if patch is None else patch.gray
         if matched is None:
             return Explanation(query.gray, rectified)
-        agree = np.zeros(len(matched[0]), bool)  # the recipe gives the pose alone
+        agree = np.zeros(len(matched[0]), bool)  # the recipe gives only the pose
         found = PointMatches(matched[0], matched[1] + np.array([window.x0, window.y0], np.float64), agree)
         return Explanation(query.gray, rectified, matches=found)
 
@@ -130,7 +130,7 @@ def _scale(query: Query) -> float:
 
 
 def template_of(query: Query, window: Window) -> Gray | None:
-    """The frame equalised, scaled (eq. 2) and turned (eq. 3), square; None where it does not fit the window."""
+    """The frame equalised, scaled (eq. 2) and turned (eq. 3), square; None if it does not fit the window."""
     assert query.telemetry.grid_heading_deg is not None  # refused before
     height, width = query.gray.shape
     scale, jacobian = _scale(query), query.jacobian
@@ -145,7 +145,7 @@ def template_of(query: Query, window: Window) -> Gray | None:
 
 
 def surface(template: Gray, search: Gray) -> Scores:
-    """NCC as equation 1 has it, at each place of the template's top-left pixel."""
+    """NCC by equation 1, at each place of the template's top-left pixel."""
     return np.asarray(cv2.matchTemplate(cv2.equalizeHist(search), template, cv2.TM_CCORR_NORMED), np.float32)
 
 

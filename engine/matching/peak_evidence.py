@@ -1,4 +1,4 @@
-"""What a correlation peak means: the fix that it makes if it is accepted, and the evidence for it."""
+"""From a correlation peak to the fix that it gives if accepted, and the evidence for it."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ _MAX_CANDIDATES = 4  # of a refused frame
 
 @dataclass(frozen=True, slots=True)
 class PeakCandidate:
-    """A peak that is not accepted yet.
+    """A peak that has not been accepted yet.
 
     Attributes:
         peak: in pixels of the aligned level.
         aligned: the hypothesis that it belongs to.
-        fix: what the peak means, if it is accepted; with its probability.
+        fix: the fix that the peak gives if accepted, with its probability.
         evidence: for it.
-        tried: places, times headings and heights, among which it is the best.
+        tried: places, times headings and heights, among which the peak is the best.
         searched: whether heading and height were fitted to the picture.
-        is_tested: whether the null hypothesis is among its rivals, or would change nothing. A score that a fit
-            made as high as possible is no evidence until the structure about the place confirms it.
+        is_tested: whether the null hypothesis is among its rivals, or would change nothing. A score maximised by a
+            fit is no evidence until the structure around the place confirms it.
     """
 
     peak: Peak
@@ -54,11 +54,11 @@ class PeakCandidate:
 
 
 def quick_look(correlator: Correlator, aligned: Aligned, window: Window) -> QuickLook:
-    """Which peaks of a wide window are kept although not every place was scored.
+    """Which peaks of a wide window to keep although not every place was scored.
 
     Returns:
-        QuickLook: clear is a peak that is accepted without the null hypothesis; hopeless one of which a closer
-        look is not expected to make a fix.
+        QuickLook: a clear peak is accepted without the null hypothesis; for a hopeless one not even a closer look
+        is expected to give a fix.
     """
     risk = correlator.query.risk
 
@@ -79,7 +79,7 @@ def candidate_of(
     sigma: float | None = None,
     is_tested: bool = False,
 ) -> PeakCandidate:
-    """What a peak means.
+    """The candidate that a peak gives.
 
     Args:
         correlator: of the frame.
@@ -87,8 +87,8 @@ def candidate_of(
         peak: in pixels of its level.
         window: in which its rival is the best.
         searched: whether heading and height were fitted to the picture.
-        tried: places, times headings and heights, among which it is the best, if more than those of the window.
-        sigma: one standard deviation of a score of chance, if it was measured.
+        tried: places, times headings and heights, among which it is the best, if more than the window's.
+        sigma: standard deviation of a chance score, if measured.
         is_tested: whether the null hypothesis is among its rivals, or would change nothing.
     """
     query, (rows, columns) = correlator.query, aligned.template.shape
@@ -105,7 +105,7 @@ def candidate_of(
 
 
 def places_in(aligned: Aligned, window: Window) -> float:
-    """How many places of a window a hypothesis may lie at."""
+    """Number of places in a window at which a hypothesis fits."""
     (rows, columns), scale = aligned.template.shape, 2.0**aligned.level
     return independent_places(
         max(window.width_px / scale - columns, 1.0) * max(window.height_px / scale - rows, 1.0)
@@ -113,7 +113,7 @@ def places_in(aligned: Aligned, window: Window) -> float:
 
 
 def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
-    """The candidate, unless beyond doubt with what its frame reaches upside down and mirrored."""
+    """The candidate; unless beyond doubt, compared with its frame upside down and mirrored."""
     query, peak, aligned, window = correlator.query, found.peak, found.aligned, found.fix.window
     if is_beyond_doubt(found.evidence.nats, query.risk):
         return replace(found, is_tested=True)
@@ -126,14 +126,14 @@ def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
 def _null_score(
     correlator: Correlator, aligned: Aligned, window: Window, rival_score: float, *, matters: bool
 ) -> float:
-    """The best score of the null-hypothesis templates: what this window gives to chance.
+    """The best score of the null-hypothesis templates: what chance reaches in this window.
 
     Args:
         correlator: of the frame.
         aligned: the hypothesis.
         window: that was searched.
-        rival_score: of the peak's best rival: what is certainly below it does not count.
-        matters: whether the peak is accepted without it; else the best of a quick look is good enough.
+        rival_score: score of the peak's best rival; certainly lower scores are ignored.
+        matters: whether the peak is accepted without it; if not, a quick look's best score suffices.
     """
     options, best = correlator.options, -1.0
     quick = QuickLook(
@@ -148,11 +148,11 @@ def _null_score(
 
 
 def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window, *, searched: bool) -> Fix:
-    """The camera's nadir and its covariance; the heading too where it was searched for."""
+    """The camera's nadir and its covariance; also the heading if it was searched."""
     query, pose = correlator.query, aligned.pose
     errors = query.errors(correlator.options.errors)
     height_m = pose.height_agl_m
-    assert height_m is not None  # asked for before
+    assert height_m is not None  # checked before
     rows, columns = aligned.template.shape
     peak_px2 = peak_covariance_px(peak, rows * columns)
     peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), height_m, errors)
@@ -169,9 +169,9 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
 
 
 def candidates_of(correlator: Correlator, found: PeakCandidate) -> tuple[Fix, ...]:
-    """The peaks of a refused frame, each with its probability beside the others; none of a search.
+    """The peaks of a refused frame, each with its probability among them; none after a search.
 
-    Rivals belong to it: over repeated structure they follow the vehicle as faithfully as the right place does.
+    They include rivals: over repeated structure these follow the vehicle as closely as the right place does.
     """
     query, aligned, window = correlator.query, found.aligned, found.fix.window
     if not found.is_tested or query.prior is None or query.scheduler.deadline.remaining_ms < 0:

@@ -23,8 +23,8 @@ Mask = NDArray[np.bool_]
 Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
 
 _STEPS = 12  # Gauss-Newton steps at most; four or five are usual
-_STEP_SIGMAS = 2e-2  # a step this small, in standard deviations of the pose, is the last
-_PAIRS = 24  # pairs of matches that give candidate centres where the attitude is known
+_STEP_SIGMAS = 2e-2  # stop after a step this small, in standard deviations of the pose
+_PAIRS = 24  # pairs of matches that give candidate centres if the attitude is known
 _SLACK = 3.0  # factor on the tolerance at the start, for the error of a known attitude
 _REACH_SIGMAS = 4.0
 _MIN_EIGENVALUE = 1e-7  # of the correlation matrix; below it some direction is not determined
@@ -106,7 +106,7 @@ def ransac(problem: Problem, max_iterations: int, confidence: float, seed: int) 
         seed: Of the samples.
 
     Returns:
-        Rotation (3, 3) and centre (3,), or None where no sample gives a pose.
+        Rotation (3, 3) and centre (3,), or None if no sample gives a pose.
     """
     params = cv2.UsacParams()
     params.threshold = problem.tolerance_px
@@ -189,7 +189,7 @@ def gauss_newton(
         slack: Factor on the tolerance in the first step.
 
     Returns:
-        The pose, or None where there are too few inliers or they do not determine it.
+        The pose, or None if there are too few inliers or they do not determine it.
     """
     from engine.kernels.pose_fit import fit_pose  # numba takes a while to import
 
@@ -206,7 +206,7 @@ def gauss_newton(
 
 
 def _inverse(problem: Problem, information: Array) -> Array | None:
-    """Return the covariance (6, 6) by matches and known attitude, or None where they do not determine the pose."""
+    """Return the covariance (6, 6) by matches and known attitude, or None if they do not determine the pose."""
     total = information.copy()
     total[3:, 3:] += problem.precision
     found, covariance = cv2.invert(total, flags=cv2.DECOMP_CHOLESKY)
@@ -237,7 +237,7 @@ def match_covariance(problem: Problem, fit: Fit) -> Array | None:
         fit: The refined pose.
 
     Returns:
-        (6, 6) of the centre in the map's axes (m) and of the rotation about the camera's (rad), or None where some
+        (6, 6) of the centre in the map's axes (m) and of the rotation about the camera's (rad), or None if some
         direction is not determined.
     """
     covariance = _inverse(problem, fit.information)

@@ -1,4 +1,4 @@
-"""Points that a picture of the frame and a view of the map share, by a matcher of pictures."""
+"""Find points that an image of the frame and a view of the map share, with an image matcher."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class PointFinder:
     """Matches the frames of a flight with views of one map.
 
     Attributes:
-        matcher: of two pictures.
-        keypoints: of the map, where the matcher has any.
+        matcher: matches two pictures.
+        keypoints: of the map, if the matcher uses any.
         max_keypoints: of a frame.
         max_map_keypoints: of a window.
         max_window_px: upper bound on the pixels of a view.
@@ -38,18 +38,18 @@ class PointFinder:
     max_window_px: int | None = None
 
     def too_large(self, view: MapView) -> bool:
-        """Whether a view is more than is searched."""
+        """Whether a view is too large to search."""
         return self.max_window_px is not None and view.crop.area_px > self.max_window_px
 
     def find(
         self, query: Query, picture: torch.Tensor, valid: NDArray[np.bool_], view: MapView
     ) -> tuple[Array, Array]:
-        """What a picture and a view share.
+        """The points that a picture and a view share.
 
         Args:
-            query: the frame that the picture was made of.
-            picture: (1, 1, h, w) about in the level's pixels, upright where that is known.
-            valid: (h, w) bool, where the picture shows the frame.
+            query: the frame that the picture was made from.
+            picture: (1, 1, h, w), roughly in the level's pixels, upright if the heading is known.
+            valid: (h, w) bool, True where the picture shows the frame.
             view: of the map.
 
         Returns:
@@ -64,7 +64,7 @@ class PointFinder:
                 points, places = (_points(found) for found in self.matcher(picture, crop))
                 shown = _is_valid(points, valid)
                 points, places = points[shown], places[shown]
-        known = np.isfinite(places).all(axis=1)  # a matcher of others' may say NaN
+        known = np.isfinite(places).all(axis=1)  # a user's matcher may return NaN
         return points[known], places[known] + view.corner_px
 
     def _by_keypoints(
@@ -76,7 +76,7 @@ class PointFinder:
         known: KeypointMap,
         valid: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
-        """Matched pixels of picture and crop, the crop's keypoints looked up."""
+        """Matched pixels of picture and crop; the crop's keypoints are looked up."""
         with query.scheduler.stage("frame features"):
             mine = matcher.extract(picture, 4 * self.max_keypoints)
             shown = np.flatnonzero(_is_valid(_points(mine.xy_px), valid))[: self.max_keypoints]
@@ -91,7 +91,7 @@ class PointFinder:
 
 
 def _plain_outside(picture: torch.Tensor, valid: NDArray[np.bool_]) -> torch.Tensor:
-    """The picture with its mean where it shows nothing: a repeated edge is full of lines, which networks see."""
+    """The picture, filled with its mean where it shows nothing: networks see the lines of a repeated edge."""
     side = 2 * RIM_PX + 1
     shown = cv2.dilate(valid.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
     if shown.all() or not shown.any():
@@ -105,7 +105,7 @@ def _points(xy_px: torch.Tensor) -> Array:
 
 
 def _is_valid(xy_px: Array, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which points (M, 2) lie where a mask (h, w) holds; those that are not finite do not."""
+    """Which points (M, 2) lie where a mask (h, w) is True; non-finite points do not."""
     known = np.asarray(np.isfinite(xy_px).all(axis=1))
     x, y = (
         np.clip(np.rint(np.where(known[:, None], xy_px, 0.0)), 0, np.array(valid.shape)[::-1] - 1)

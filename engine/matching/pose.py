@@ -1,7 +1,7 @@
-"""Camera pose from matched points: options in, statistics out, or None where the matches do not support a pose.
+"""Camera pose from matched points: options in, statistics out, or None if the matches do not support a pose.
 
-:mod:`engine.matching.pnp` finds inliers and refines on them, and it finds some in any set of wrong matches. Here
-an a-contrario test bounds the expected number of poses with as many inliers by chance.
+:mod:`engine.matching.pnp` finds inliers, even among wrong matches alone, and refines the pose on them. Here an
+a-contrario test bounds the expected number of poses with as many inliers by chance.
 
 Convention:
     ``cam_from_map``: x_cam = R (X - C), camera axes x right, y down, z forward; map axes in metres, z up.
@@ -39,12 +39,12 @@ Mask = NDArray[np.bool_]
 
 _SAMPLE = 3  # matches that determine a pose, up to ...
 _POSES_PER_SAMPLE = 4
-_MIRRORED_STEPS = 4  # of the other pose of a plane: enough to estimate its cost
-_PAIRED = 300  # projections that are compared with all image points for the probability of a chance inlier
+_MIRRORED_STEPS = 4  # for the other pose of a plane: enough to estimate its cost
+_PAIRED = 300  # projections compared with all image points for the probability of a chance inlier
 _SAME_POSE_DEG = 1.5
 _CLOSER = (1.0, 2.0, 4.0)  # factors on the tolerance, tried in turn
-_CLOSE_SHARE, _CLOSE_INLIERS = 0.15, 12  # least inliers, as a share of those within the widest tolerance
-_START_SLACK = 2.0  # factor on the tolerance in the first step from a pose that fits within a wider one
+_CLOSE_SHARE, _CLOSE_INLIERS = 0.15, 12  # fewest inliers, as a share of those within the widest tolerance
+_START_SLACK = 2.0  # factor on the first step's tolerance from a pose that fits within a wider one
 _FREE_REACH = 4.0  # factor on the tolerance from which a pose without the prior starts
 # By how many times the inliers it must have more. Under right attitudes 134 frames of four flights had up to 1.07
 # times as many and one 1.16, under angles in radians, swapped or of the wrong sign each wrong pose but one 1.09.
@@ -89,7 +89,7 @@ class PoseStart:
     Attributes:
         rotation: (3, 3) of cam_from_map.
         center_m: (3,) the camera's centre in the map's axes.
-        tolerance_px: within which it may be expected to reproject right matches.
+        tolerance_px: the pose should reproject right matches to within this.
     """
 
     rotation: Array
@@ -140,11 +140,11 @@ def solve_pose(
         options: Thresholds; the defaults suit frames of a few hundred pixels.
         weights: (N,) relative inverse variances of the image points; None is 1 for all.
         prior: Attitude for the refinement, which separates tilt from displacement at a small field of view; it is
-            dropped where markedly more matches agree without it.
-        start: Where the refinement begins; None searches for an initial pose.
+            dropped if markedly more matches agree without it.
+        start: Start of the refinement; None searches for an initial pose.
 
     Returns:
-        None where the matches are few, collinear, behind the camera, ambiguous or not significant.
+        None if the matches are few, collinear, behind the camera, ambiguous or not significant.
 
     Raises:
         ShapeError: An array has another shape.
@@ -168,7 +168,7 @@ def solve_pose(
     log10_nfa, covariance = _log10_nfa(problem, fit, options), match_covariance(problem, fit)
     if log10_nfa > options.max_log10_nfa or covariance is None:
         return None
-    if other is not None:  # the place is known, the tilt is not: either pose may be right
+    if other is not None:  # the place is known but not the tilt: either pose may be right
         apart = np.append(other.center - fit.center, np.zeros(3))
         covariance = covariance + 0.5 * apart[:, None] * apart
     return _stats(fit, origin, covariance, known, len(points_m), log10_nfa)
@@ -194,7 +194,7 @@ def _problem(
 def _stats(
     fit: Fit, origin: Array, covariance: Array, known: NDArray[np.intp], count: int, log10_nfa: float
 ) -> PoseStats:
-    """The result of a fit of some of the matches, whose metres are about an origin (3,)."""
+    """The result of a fit to some of the matches, in metres about an origin (3,)."""
     center = fit.center + origin
     inliers = np.zeros(count, bool)
     inliers[known[fit.inliers]] = True
@@ -239,9 +239,9 @@ def _fit(problem: Problem, options: PoseOptions) -> Fit | None:
 
 
 def _fit_from(problem: Problem, start: PoseStart, origin: Array) -> Fit | None:
-    """The fit near an initial pose: to all matches within its tolerance, or the fewer that agree more closely.
+    """The fit near an initial pose, to all matches within its tolerance or to the fewer that agree more closely.
 
-    Where most agree only roughly, as over ground that has changed, the closer ones alone would be chance.
+    If most agree only roughly, as over changed ground, the closer ones alone would be chance.
     """
     wide = replace(problem, tolerance_px=max(start.tolerance_px, problem.tolerance_px))
     near = gauss_newton(wide, start.rotation, start.center_m - origin)
@@ -257,9 +257,9 @@ def _fit_from(problem: Problem, start: PoseStart, origin: Array) -> Fit | None:
 
 
 def _without_wrong_prior(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
-    """The fit, or the one without the prior where so many more matches agree with it that the prior is wrong.
+    """The fit, or the one without the prior if so many more matches agree with it that the prior is wrong.
 
-    About an attitude that is off by ten degrees a part of the frame agrees still, at a place as far off.
+    With an attitude ten degrees off, part of the frame still agrees, at a correspondingly wrong place.
     """
     free = replace(problem, attitude=None, precision=np.zeros((3, 3)))
     wide = replace(free, tolerance_px=_FREE_REACH * problem.tolerance_px)
@@ -317,7 +317,7 @@ def _log10_choose(n: int, k: int) -> float:
 
 
 def _other_pose(problem: Problem, fit: Fit, options: PoseOptions) -> Fit | None:
-    """The other of the two poses of a plane where it explains the matches nearly as well."""
+    """The other of the two poses of a plane, if it explains the matches nearly as well."""
     R, center = _mirrored(problem.points[:, fit.inliers], fit)
     if _same(R, fit.rotation):
         return None

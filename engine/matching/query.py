@@ -1,4 +1,4 @@
-"""What every method is given: one frame, what is known of its position, the map, and the frame's clock."""
+"""Input of every method: one frame, its prior, the map, and the frame's clock."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 
 Array = NDArray[np.float64]
 
-_AGREE_SIGMAS = 2.0  # of the telemetry's height, within which a measured one agrees with it
-_MOST_TURNED = math.radians(60.0)
+_AGREE_SIGMAS = 2.0  # difference at which a measured height still agrees with the telemetry's
+_MAX_TURNED = math.radians(60.0)
 _FOUND_HEIGHT_SHARE = 0.03  # standard deviation of a height that a search found
-_ASIDE = math.tan(math.radians(2.0))  # of an axis that is as good as vertical
+_ASIDE = math.tan(math.radians(2.0))  # of an axis that counts as vertical
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,14 @@ class Query:
     """One frame on its way to a fix.
 
     Attributes:
-        frame: as it came.
+        frame: as received.
         gray: (H, W) its undistorted grey picture.
-        camera: the pinhole that the undistorted picture obeys.
+        camera: pinhole camera of the undistorted picture.
         site: the map.
-        prior: where the vehicle should be, or None: anywhere on the map.
+        prior: where the vehicle should be, or None for anywhere on the map.
         device: where pictures are correlated.
-        scheduler: times its stages, and decides which steps there is time for.
-        risk: probability of a wrong fix that is allowed.
+        scheduler: times its stages and decides which steps time allows.
+        risk: allowed probability of a wrong fix.
     """
 
     frame: Frame
@@ -75,9 +75,9 @@ class Query:
 
     @cached_property
     def telemetry(self) -> GridPose:
-        """Height and attitude that the frame came with, the heading turned to grid north at the prior's position.
+        """The frame's height and attitude, with the heading from grid north at the prior's position.
 
-        Without a position that is the middle of the map, where grid north is true north.
+        Without a position it takes the middle of the map, where grid north is true north.
         """
         frame, heading_deg = self.frame, self.frame.heading_deg
         if heading_deg is not None and self.prior_px is not None and np.isfinite(self.prior_px).all():
@@ -94,7 +94,7 @@ class Query:
         return self.site.enu_jacobian(place)
 
     def level_of(self, height_m: float) -> int:
-        """The pyramid level whose pixels are like the frame's, taken from this high above the ground."""
+        """The pyramid level whose pixels are like the frame's at this height above the ground."""
         return level_for(self.site.gsd_m_per_px, height_m / self.camera.focal_px, self.site.levels)
 
     def window(
@@ -105,13 +105,13 @@ class Query:
         *,
         margin: float,
     ) -> Window | None:
-        """The adaptive window in map pixels (eq. 4, 5), or None where it lies outside the map.
+        """The adaptive window in map pixels (eq. 4, 5), or None if it lies outside the map.
 
         Args:
             center_px: (2,) where the middle of the footprint should lie.
             footprint_px: extent of the whole frame on the map.
             min_px: extent of what will be matched. The window holds it at every position within
-                :data:`engine.window.SPREAD_SIGMAS` of the prior, also where equations 4 and 5 would be smaller.
+                :data:`engine.window.SPREAD_SIGMAS` of the prior, even if equations 4 and 5 would give less.
             margin: the paper's 1.3.
         """
         prior = self.prior
@@ -126,7 +126,7 @@ class Query:
         return place_window((float(center_px[0]), float(center_px[1])), (width, height), shape)
 
     def errors(self, assumed: AssumedErrors) -> AssumedErrors:
-        """What is assumed of telemetry and map, less what the frame states of its own telemetry."""
+        """The assumed errors of telemetry and map, replaced by those that the frame states."""
         return with_frame_accuracy(self.frame, assumed)
 
     def attitude_prior(self, grid_heading_deg: float, sigma_deg: float, errors: AssumedErrors) -> AttitudePrior:
@@ -142,11 +142,11 @@ class Query:
         return AttitudePrior(enu_from_camera.T, (*errors.tilts_deg(known), sigma_deg), axes=mount)
 
     def scale_doubt_m(self, nadir_px: Array, up_m: float, camera_down: Array, errors: AssumedErrors) -> float:
-        """By how much a position may be off where the height that it was measured at is not the telemetry's.
+        """Position error to allow for if the measured height is not the telemetry's.
 
-        A focal length that is wrong by a share scales the height, and what the optical axis is off the vertical; a
-        distortion that the calibration lacks passes for a tilt, too. Or the height of the telemetry is wrong: the
-        picture does not tell.
+        A focal length that is wrong by some share scales the height and the optical axis's angle off the vertical;
+        distortion missing from the calibration also looks like a tilt. Or the telemetry's height is wrong: the
+        picture cannot tell.
 
         Args:
             nadir_px: (2,) of the camera.
@@ -155,7 +155,7 @@ class Query:
             errors: of the telemetry.
 
         Returns:
-            One standard deviation per axis, 0 where the two heights agree to two of theirs.
+            One standard deviation per axis, 0 if the heights agree to within two standard deviations.
         """
         known_m = self.telemetry.height_agl_m
         if known_m is None:
@@ -171,17 +171,17 @@ class Query:
         if told is not None and self.telemetry.has_tilt:
             told_down = self.camera.enu_from_camera(told)[:, 2]
             turned = math.acos(min(1.0, float(told_down @ camera_down)))
-        return math.hypot(off_m * (aside + _ASIDE), measured_m * math.tan(min(turned, _MOST_TURNED)))
+        return math.hypot(off_m * (aside + _ASIDE), measured_m * math.tan(min(turned, _MAX_TURNED)))
 
     # ------------------------------------------------------------------------------- heading and height searched
 
     @property
     def undoubted(self) -> Query:
-        """The same by the frame's own heading and height."""
+        """The same query with the frame's own heading and height."""
         return replace(self, frame=replace(self.frame, is_doubted=False))
 
     def with_height(self, pose: GridPose) -> Query:
-        """The same by the height that a search found, which is known as well as its steps are fine."""
+        """The same query with the height that a search found, as accurate as its steps."""
         frame, height_m = self.undoubted.frame, pose.height_agl_m
         assert frame.height_agl_m is not None
         assert height_m is not None
@@ -209,19 +209,19 @@ class Query:
         turn_covariance_rad2: Array | None = None,
         map_sigma_m: float = 0.0,
     ) -> Fix:
-        """A fix of this frame; its heading counts from true north there.
+        """A fix of this frame; its heading is from true north at the fix.
 
         Args:
             method: "ncc" or "sift".
             nadir_px: (2,) the camera's nadir in map pixels.
             covariance_m2: (3, 3) east, north, up.
             score: of the match.
-            window: that was searched.
-            east_north_m: (2,) of the nadir where it is known in metres; None computes it.
-            up_m: height of the camera, or None where it is not measured.
-            grid_attitude: the heading from grid north; None where it is not measured.
+            window: the searched window.
+            east_north_m: (2,) of the nadir if known in metres; None computes it.
+            up_m: height of the camera, or None if it is not measured.
+            grid_attitude: the heading from grid north; None if it is not measured.
             turn_covariance_rad2: (3, 3) of a small turn about the camera's axes, with a measured attitude.
-            map_sigma_m: the part of the covariance that is the map's georeference.
+            map_sigma_m: the georeference's part of the covariance.
         """
         east, north = self.site.enu_from_pixel(nadir_px) if east_north_m is None else east_north_m
         lat, lon = map(float, self.site.geodetic_from_pixel(nadir_px))
@@ -256,7 +256,7 @@ class Query:
 
     @property
     def timings(self) -> Timings:
-        """What was measured so far."""
+        """The timings so far."""
         return Timings(dict(self.scheduler.stages_ms))
 
     def refuse(
@@ -280,25 +280,25 @@ class Query:
         )
 
     def refuse_flat(self, method: str, min_deviation: float) -> NoFix | None:
-        """A refusal where the picture has no texture to match, else None."""
+        """A refusal if the picture has no texture to match, else None."""
         deviation = float(cv2.meanStdDev(self.gray)[1][0, 0])
         if deviation >= min_deviation:
             return None
         figure = f"the frame's grey levels deviate by {deviation:.1f}"
-        return self.refuse(Reason.NO_TEXTURE, f"{figure}; {min_deviation:g} is asked for", method)
+        return self.refuse(Reason.NO_TEXTURE, f"{figure}; {min_deviation:g} is required", method)
 
     def refuse_tilted(self, attitude: Attitude, method: str) -> NoFix:
-        """The refusal of a frame of which some part sees the horizon, or nearly so."""
+        """The refusal of a frame that sees the horizon, or nearly so."""
         tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
         return self.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", method)
 
     def refuse_outside(self, method: str) -> NoFix:
-        """The refusal of a frame whose window has nothing in common with the map."""
+        """The refusal of a frame whose window does not overlap the map."""
         return self.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)
 
     def refuse_late(self, method: str, step: Hashable) -> NoFix:
-        """The refusal of a frame for whose quickest variant of a step there is no time, see :class:`Scheduler`."""
+        """The refusal of a frame with no time for a step's quickest variant, see :class:`Scheduler`."""
         self.scheduler.costs.note_refusal(step)
         left_ms = self.scheduler.deadline.remaining_ms
-        detail = f"{left_ms:.1f} ms are left; the least that {method} can do takes longer"
+        detail = f"{left_ms:.1f} ms are left; {method}'s quickest variant takes longer"
         return self.refuse(Reason.LATE, detail, method)

@@ -1,4 +1,4 @@
-"""Dense refinement of a fix: all of the camera's pose, through the surface model or a plane."""
+"""Dense refinement of a fix: the whole camera pose, over the surface model or a plane."""
 
 from __future__ import annotations
 
@@ -37,32 +37,32 @@ from engine.values import Attitude, Fix, NoFix, Reason, Window
 Array = NDArray[np.float64]
 _T = TypeVar("_T")
 
-# Refinement that does not succeed at once on the frame's own level begins so many levels above it: one where the
-# tilt is known; two where it is not, or that failed as well.
+# If refinement fails on the frame's own level it restarts this many levels above: one if the tilt is known; two if
+# it is not, or if one failed as well.
 _COARSER, _MUCH_COARSER = 1, 2
-_TILTS_DEG = (-6.0, -3.0, 0.0, 3.0, 6.0)  # tried first about both axes where the tilt is unknown
+_TILTS_DEG = (-6.0, -3.0, 0.0, 3.0, 6.0)  # tried first about both axes if the tilt is unknown
 # Least correlation of an accepted pose. Without a known tilt true poses over simulated towns reached 0.53 and
 # wrong ones 0.32; with it true poses over a town in snow reached 0.29.
 _MIN_CORRELATION_WITHOUT_TILT = 0.45
 _MIN_CORRELATION = 0.2
 MIN_CORRELATION_AT_ONCE = 0.45
-"""Least correlation at once, where no coarser level leads to the pose; below it a known tilt is doubted as well.
+"""Least correlation to accept the first attempt; below it coarser levels are tried and a known tilt is doubted.
 
-By day the frames of three simulated flights reached 0.8 and more, in the evening on a map of noon half of them
-0.6, and wrong poses under a wrong tilt 0.30 to 0.35, where the right ones reached 0.87 as soon as it was doubted.
+By day the frames of three simulated flights reached 0.8 and more; in the evening, on a map from noon, half of them
+reached 0.6. Poses with a wrong tilt reached 0.30 to 0.35, and 0.87 as soon as the tilt was doubted.
 """
-# Tilt that may be wrong where the picture does not confirm the pose: under angles that are off by 1.5 degrees half
-# of the frames of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; under
-# right ones each was confirmed.
+# Possible tilt error if the picture does not confirm the pose: with angles off by 1.5 degrees, half of the frames
+# of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; with correct angles all
+# were confirmed.
 _UNCONFIRMED_TILT_DEG = 1.5
-# Standard deviations of an attitude that the picture does not confirm.
+# Standard deviations of an attitude that the image does not confirm.
 _DOUBTED_TILT_DEG, _DOUBTED_HEADING_DEG = 6.0, 6.0
-_HEIGHT_SHARE = 2e-4  # of the height, by which walls and the ground hidden behind them bias it: 3 cm at 150 m
-_COARSE_SAMPLES = 800  # of a coarser level
+_HEIGHT_SHARE = 2e-4  # bias of the height from walls and the ground hidden behind them: 3 cm at 150 m
+_COARSE_SAMPLES = 800  # on a coarser level
 
 
 def improved(query: Query, fix: Fix, step: str, improve: Callable[[Fix], _T]) -> Fix | _T:
-    """What a step makes of a fix; the fix itself if there is no time for the step."""
+    """The fix after a step, or unchanged if there is no time for the step."""
     scheduler, work_px = query.scheduler, float(query.gray.size)
     with scheduler.with_fix():
         if not scheduler.can_afford({step: work_px}):
@@ -81,7 +81,7 @@ class Refinement:
         query: the frame, with height and heading.
         samples: of the map.
         options: of the correlation.
-        knows_tilt: whether a roll and pitch that came with the frame count.
+        knows_tilt: whether to use the roll and pitch that came with the frame.
     """
 
     query: Query
@@ -90,12 +90,12 @@ class Refinement:
     knows_tilt: bool = True
 
     def refine(self, fix: Fix) -> Fix | NoFix:
-        """The fix with all of its pose refined, or a less certain one where refinement does not confirm it.
+        """The fix with its whole pose refined, or a less certain one if refinement does not confirm it.
 
-        Where the picture does not or hardly confirm the telemetry's attitude, that is doubted: the pose is refined
-        once more as if roll and pitch were hardly known, which counts where the picture confirms that. Without a
-        known roll and pitch the picture must determine them over a surface model, or the fix is refused: its error
-        is unknown then. Over ground that is taken for flat a fix that is not confirmed stays as it was.
+        If the picture hardly confirms the telemetry's attitude, the pose is refined once more as if roll and pitch
+        were hardly known; the result counts if the picture confirms it. If roll and pitch are unknown, the picture
+        must determine them over a surface model, or the fix is refused, because its error is unknown. If the
+        ground is assumed flat, an unconfirmed fix stays as it was.
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
         refined = self._through_all(fix)
@@ -116,17 +116,17 @@ class Refinement:
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
     def refine_at_once(self, fix: Fix) -> Fix | None:
-        """The fix of a known tilt refined on the frame's own level, None where that is not beyond doubt."""
+        """The fix of a known tilt refined on the frame's own level; None if the result is not beyond doubt."""
         prior = self._prior(fix)
         return self._refined(fix, prior, self._at_once(prior))
 
     def refine_from_coarser(self, fix: Fix) -> Fix | None:
-        """The same from a level above the frame's own, where a few pixels reach farther."""
+        """The same from a level above the frame's own, where a few pixels span more ground."""
         prior = self._prior(fix)
         return self._refined(fix, prior, self._through_levels(prior, _COARSER))
 
     def _doubting(self) -> Refinement:
-        """The same, of a frame whose attitude is hardly known."""
+        """The same for a frame whose attitude is hardly known."""
         frame = replace(
             self.query.frame,
             tilt_sigma_deg=_DOUBTED_TILT_DEG,
@@ -135,14 +135,14 @@ class Refinement:
         return replace(self, query=replace(self.query, frame=frame), knows_tilt=False)
 
     def _through_all(self, fix: Fix) -> Fix | None:
-        """The fix with its pose refined from as coarse a level as is necessary."""
+        """The fix with its pose refined, from a coarser level if necessary."""
         prior, fit = self._prior(fix), None
         if self._knows_tilt:
             fit = self._at_once(prior) or self._through_levels(prior, _COARSER)
         return self._refined(fix, prior, fit or self._through_levels(prior, _MUCH_COARSER))
 
     def _refined(self, fix: Fix, prior: GaussianPrior, fit: DenseFit | None) -> Fix | None:
-        """The fix with its pose refined, None where that failed or leads elsewhere."""
+        """The fix with its pose refined; None if refinement failed or led elsewhere."""
         query, errors = self.query, self.query.errors(self.options.errors)
         pose_covariance = None if fit is None else covariance_of(fit, prior)
         if fit is None or pose_covariance is None:
@@ -157,7 +157,7 @@ class Refinement:
         height_m = fit.pose.center_m[2] - query.site.ground_m
         covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
         slope_rad = 0.0
-        if not query.site.has_surface and not self._knows_tilt:  # a slope of the ground was taken for a tilt
+        if not query.site.has_surface and not self._knows_tilt:  # a slope of the ground was mistaken for a tilt
             slope_rad = math.radians(errors.unknown_slope_deg)
         covariance[:2, :2] += (height_m * slope_rad) ** 2 * np.eye(2)
         nadir_px = query.site.pixel_from_enu(fit.pose.center_m[:2])
@@ -167,7 +167,7 @@ class Refinement:
         turns_rad2 = pose_covariance[3:6, 3:6] + tilt_covariance(fit.pose.rotation, tilt_rad)
         moved = (fit.pose.center_m - prior.pose.center_m)[:2]
         allowed_m2 = fix.relative_covariance_m2 + covariance[:2, :2]
-        if not self.knows_tilt:  # by which the peak was displaced
+        if not self.knows_tilt:  # which displaced the peak
             allowed_m2 += (height_m * math.radians(errors.tilt_deg)) ** 2 * np.eye(2)
         if not are_consistent(moved, allowed_m2):
             return None
@@ -188,7 +188,7 @@ class Refinement:
     def _through_levels(
         self, prior: GaussianPrior, coarser: int, min_correlation: float | None = None
     ) -> DenseFit | None:
-        """Refine on levels coarser than the frame's, where a few pixels reach farther; then on its own.
+        """Refine on levels coarser than the frame's, where a few pixels span more ground; then on its own.
 
         The pose must fit better than the one to begin with.
         """
@@ -197,7 +197,7 @@ class Refinement:
         own, has_tilt = query.level_of(height_m), self._knows_tilt
         least = _MIN_CORRELATION if has_tilt else _MIN_CORRELATION_WITHOUT_TILT
         pose, fit = prior.pose, None
-        with query.scheduler.stage("dense"):  # one a pass, before each of which it may be abandoned
+        with query.scheduler.stage("dense"):  # one stage per pass; each may be skipped
             for level in range(min(own + coarser, site.levels - 1), own - 1, -1):
                 window = self._footprint(prior.pose, height_m, level)
                 if window is None:
@@ -215,7 +215,7 @@ class Refinement:
         return fit if fit.correlation >= max(at_prior, min_correlation or least) else None
 
     def _prior(self, fix: Fix) -> GaussianPrior:
-        """The telemetry's height and attitude; the position by correlation is a start without any weight."""
+        """The telemetry's height and attitude; the correlation's position is only a start, without weight."""
         query, known = self.query, self.query.telemetry
         errors = query.errors(self.options.errors)
         attitude, height_m = known.grid_attitude, known.height_agl_m
@@ -233,7 +233,7 @@ class Refinement:
         return GaussianPrior(Pose(attitude_prior.rotation, center, np.zeros(2)), precision)
 
     def _footprint(self, pose: Pose, height_m: float, level: int) -> Window | None:
-        """The part of a level that the frame shows, or None where that is less than a few blocks."""
+        """The part of a level that the frame shows, or None if that is less than a few blocks."""
         query = self.query
         rays = query.camera.frame_rays[:4] @ pose.rotation
         ground_m = pose.center_m[:2] + rays[:, :2] * (height_m / -rays[:, 2:])
@@ -246,7 +246,7 @@ class Refinement:
         return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
     def _enhanced_frame(self, height_m: float, level: int) -> EnhancedFrame:
-        """The frame at the resolution of a level, enhanced as the map is."""
+        """The frame at the resolution of a level, enhanced like the map."""
         query, options = self.query, self.options
         scale = height_m / query.camera.focal_px / (query.site.gsd_m_per_px * 2.0**level)
         gray, smaller = shrink(query.gray, scale)
@@ -273,15 +273,15 @@ class Refinement:
 
 
 def with_unconfirmed_tilt(query: Query, fix: Fix) -> Fix:
-    """The fix of a frame whose picture does not confirm its attitude: its covariance allows for a wrong tilt."""
+    """The fix of a frame whose picture does not confirm its attitude, with a covariance for a wrong tilt."""
     height_m = query.telemetry.height_agl_m
-    assert height_m is not None  # or there were no attitude to confirm
+    assert height_m is not None  # else there would be no attitude to confirm
     doubt_m = height_m * math.radians(_UNCONFIRMED_TILT_DEG)
     return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0]))
 
 
 def _tilted(pose: Pose, height_m: float) -> list[Pose]:
-    """The pose and others tilted against it that look at the same middle, where correlation found it."""
+    """The pose and tilted variants that look at the same point, where correlation found the frame's middle."""
 
     def reach_m(rotation: Array) -> Array:
         return np.asarray(rotation[2] * (height_m / -rotation[2, 2]))

@@ -1,4 +1,4 @@
-"""The relief of the ground under a frame: the surface model without what stands on the ground."""
+"""Relief under a frame: the surface model without objects on the ground."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from engine.orthomap import OrthoMap
 
 Array = NDArray[np.float64]
 
-_BUILDING_M = 30.0  # side of what stands on the ground
+_BUILDING_M = 30.0  # largest width of objects on the ground
 
 
 def ground_relief(site: OrthoMap, nadir_px: Array | None, level: int) -> Relief | None:
-    """The bare ground about a place: the surface without what is narrower than 30 m.
+    """The bare ground around a place: the surface without objects narrower than 30 m.
 
     Args:
         site: the map.
-        nadir_px: (2,) full-resolution pixel that heights count from; None where it is unknown.
-        level: of whose pixels the offsets are.
+        nadir_px: (2,) full-resolution pixel that heights count from; None if it is unknown.
+        level: the offsets are in its pixels.
 
     Returns:
-        Relief | None: None where the place or the surface is unknown.
+        Relief | None: None if the place or the surface is unknown.
     """
     if nadir_px is None or not site.has_surface:
         return None

@@ -1,9 +1,9 @@
-"""The second look of NCC at a window whose highest peak was refused: structure correlated besides grey levels.
+"""NCC's second look at a window whose highest peak was refused: correlate structure as well as grey levels.
 
-Another season, year or sun changes grey levels, and which side of an edge is the brighter one; where edges lie and
-which way they run stays. The surface is the mean of that of the grey levels and of both orientation channels
-(:func:`engine.kernels.scores.orientation`). What chance reaches is measured in the same window by null-hypothesis
-templates, the frame's own upside down and mirrored.
+Another season, year or sun changes grey levels and swaps the brighter side of an edge, but not the position and
+direction of edges. The surface is the mean over grey levels and both orientation channels
+(:func:`engine.kernels.scores.orientation`). Null-hypothesis templates, the frame's own upside down and mirrored,
+measure in the same window what chance reaches.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from engine.window import level_crop
 
 FloatImage = NDArray[np.float32]
 
-_PLACES, _APART_PX = 48, 2  # of a coarser level that are looked at closely, and how far they are apart there
-_NEAR_PX, _ABOUT_PX = 8, 32  # about such a place, and about the best of them, in pixels of the hypothesis' level
+_PLACES, _APART_PX = 48, 2  # places of a coarser level to examine closely, and their spacing there
+_NEAR_PX, _ABOUT_PX = 8, 32  # around such a place, and around the best one, in pixels of the hypothesis' level
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class SecondLook:
     """The peak of the second look.
 
     Attributes:
-        peak: in pixels of the aligned level; its rival is the better one of the surface's and of chance's best.
+        peak: in pixels of the aligned level; its rival is the better of the surface's and of chance's best.
         chance_sigma: one standard deviation of the scores of the null-hypothesis templates in the window.
     """
 
@@ -45,16 +45,16 @@ class SecondLook:
 
 
 def can_look_coarsely(correlator: Correlator, aligned: Aligned, window: Window) -> bool:
-    """Whether a window is wide, and its places are scored where coarser levels save work: on the CPU."""
+    """Whether a window is wide and scored on the CPU, so that coarser levels save work."""
     is_on_cpu = correlator.query.device.type == "cpu"
     return is_on_cpu and aligned.work_px(window) > WIDE_PX and not correlator.options.exhaustive
 
 
 def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> SecondLook | None:
-    """What a second look at a wide window can show at best, by the places that a coarser level shows.
+    """The best that a second look at a wide window can show, from the best places of a coarser level.
 
-    The best places of the coarser level are looked at on the hypothesis' own. Its rival is no more than the whole
-    window's, and chance is that about the best of them.
+    The coarser level's best places are examined on the hypothesis' own. The rival is at most the whole window's,
+    and chance is measured around the best place.
 
     Args:
         correlator: of the frame.
@@ -62,7 +62,7 @@ def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> Se
         window: in full-resolution map pixels.
 
     Returns:
-        SecondLook | None: None where its places have to be looked at one by one.
+        SecondLook | None: None if every place has to be scored.
     """
     coarse = _on_coarser_level(correlator, aligned, window)
     if coarse is None:
@@ -91,7 +91,7 @@ def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> Se
 
 
 def _on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) -> Aligned | None:
-    """The same hypothesis on the coarsest level that serves; None where there is none."""
+    """The same hypothesis on the coarsest usable level; None if there is none."""
     for above in (2, 1):
         level = aligned.level + above
         if level < correlator.query.site.levels and min(aligned.template.shape) >> above >= COARSE_TEMPLATE_PX:
@@ -101,7 +101,7 @@ def _on_coarser_level(correlator: Correlator, aligned: Aligned, window: Window) 
 
 
 def _peak_of(correlator: Correlator, aligned: Aligned, window: Window, own: FloatImage) -> Peak | None:
-    """The peak of the frame's own template, without what chance reaches; None where it is nowhere on the map."""
+    """The peak of the frame's own template, without what chance reaches; None if it is nowhere on the map."""
     scored = _scores(correlator, aligned, window, own)
     if scored is None or scored[0].max() <= -1.0:
         return None
@@ -115,11 +115,11 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
 
     Args:
         correlator: of the frame.
-        aligned: the hypothesis that is looked at.
+        aligned: the hypothesis to examine.
         window: in full-resolution map pixels.
 
     Returns:
-        SecondLook | None: None where the template is nowhere on the map.
+        SecondLook | None: None if the template is nowhere on the map.
     """
     scored = _scores(correlator, aligned, window, _templates(correlator, aligned, null=True))
     if scored is None:
@@ -140,7 +140,7 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
 
 
 def _templates(correlator: Correlator, aligned: Aligned, *, null: bool) -> FloatImage:
-    """Channels (3, T, h, w) of the frame, and of the null-hypothesis templates if asked for."""
+    """Channels (3, T, h, w) of the frame, and of the null-hypothesis templates if requested."""
     patches = [aligned.patch.gray, *(correlator.nowhere(aligned) if null else [])]
     radius_px = correlator.options.enhance_radius_px
     return np.stack([_channels(patch, radius_px, None) for patch in patches], axis=1)
@@ -149,7 +149,7 @@ def _templates(correlator: Correlator, aligned: Aligned, *, null: bool) -> Float
 def _scores(
     correlator: Correlator, aligned: Aligned, window: Window, templates: FloatImage
 ) -> tuple[FloatImage, Window] | None:
-    """Scores (T, H', W') of templates by all channels, and where they begin; None where these do not fit."""
+    """Scores (T, H', W') of templates by all channels, and where they begin; None if these do not fit."""
     query, options = correlator.query, correlator.options
     crop = level_crop(query.site, window, aligned.level)
     height, width = aligned.template.shape
@@ -162,7 +162,7 @@ def _scores(
     search = _channels(gray, options.enhance_radius_px, valid)
     scores = on_host(ncc(placed(search, query.device), placed(templates, query.device)).mean(0))
     if valid is not None:
-        # Nodata is 0 in all channels, about their mean, and costs places that are mostly on the map little.
+        # Nodata is 0 in all channels, near their mean, and so hardly lowers places that are mostly on the map.
         scores[:, _share_on_map(valid, height, width) < options.min_valid_share] = -1.0
     return scores, crop
 
@@ -178,16 +178,16 @@ def _channels(gray: NDArray[np.uint8], radius_px: int, valid: NDArray[np.bool_] 
 
 
 def confirmed(correlator: Correlator, found: PeakCandidate, looked: SecondLook, window: Window) -> PeakCandidate:
-    """What the peak of a second look means.
+    """The candidate that the peak of a second look gives.
 
     Args:
         correlator: of the frame.
-        found: at the first look.
-        looked: the second.
-        window: that it looked at.
+        found: the candidate of the first look.
+        looked: the second look.
+        window: the window of the second look.
     """
     peak = looked.peak
-    if not found.is_tested and found.peak.score > 0.0:  # what is elsewhere on the map only the search knows
+    if not found.is_tested and found.peak.score > 0.0:  # only the search knows the rest of the map
         elsewhere = found.peak.second_score / found.peak.score * peak.score
         peak = replace(peak, second_score=max(peak.second_score, elsewhere))
     own = candidate_of(

@@ -25,8 +25,8 @@ from engine.runtime.scheduler import OutOfTime
 from engine.runtime.tensors import torch
 from engine.values import Fix, NoFix, Reason, Result, Window
 
-_REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched, the smaller where time is short
-_FEW_SHARE = 0.5  # of the keypoints, where a pose is refined from few
+_REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched; the smaller if time is short
+_FEW_SHARE = 0.5  # of the keypoints, if a pose is refined from few
 _FEW, _REFINEMENT = "sift by few features", "refinement of sift"  # steps
 
 
@@ -36,8 +36,8 @@ class Sift(Method):
     Args:
         site: the map.
         device: where tensors live.
-        options: settings; ``options.sift`` counts, and for the refinement how NCC enhances the map.
-        samples: of the map for the refinement, where another method has them already.
+        options: settings; uses ``options.sift`` and, for refinement, NCC's enhancement of the map.
+        samples: of the map for the refinement, if another method already has them.
     """
 
     loops = (
@@ -84,7 +84,7 @@ class Sift(Method):
 
     def warmup(self, query: Query) -> None:
         """Run every variant of every step, so that it is compiled and its cost known."""
-        # A side of an orthophoto has at most twice the frame's pixels; turned by 45 degrees half as many more.
+        # An orthophoto's side has at most twice the frame's pixels; half as many more if turned by 45 degrees.
         longest_px = 3 * max(query.gray.shape)
         if chosen_backend(self.options.backend, torch.device(query.device)) == "compiled":
             prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX))
@@ -102,9 +102,9 @@ class Sift(Method):
             self.locate(query)
 
     def locate(self, query: Query) -> Result:
-        """A refined fix by few features, else one by all at the highest resolution that there is time for.
+        """A refined fix by few features, else one by all at the highest resolution that time allows.
 
-        Few features take a fifth of the time, and refinement makes up for what their pose lacks in accuracy.
+        Few features take a fifth of the time, and refinement restores the accuracy that their pose lacks.
         """
         few = self._by_few_features(query)
         if few is None:
@@ -118,12 +118,11 @@ class Sift(Method):
         return self._refined(query, result) if is_refined and isinstance(result, Fix) else result
 
     def confirm(self, query: Query, agrees: Callable[[Fix], bool]) -> Result:
-        """A fix to compare with that of another method: not refined by the grey levels that the other goes by.
+        """A fix to compare with another method's: not refined by the grey levels that the other uses.
 
         Args:
             query: the frame.
-            agrees: whether a fix agrees with the other method's. One by few features that does not is replaced by
-                one of all.
+            agrees: whether a fix agrees with the other method's. If one by few features does not, all are used.
         """
         few = self._by_few_features(query)
         if few is not None and _is_certain(query, few) and agrees(few):
@@ -131,7 +130,7 @@ class Sift(Method):
         return self._by_all_features(query)
 
     def _by_few_features(self, query: Query) -> Fix | None:
-        """A fix by half as many keypoints, a level coarser and not doubled; None where that is not accepted."""
+        """A fix by half as many keypoints, a level coarser and not upsampled; None if it is not accepted."""
         scale = self._few_scale(query)
         if scale is None or not self._has_time_for_few(query):
             return None
@@ -142,14 +141,14 @@ class Sift(Method):
         return found.fix
 
     def _few_scale(self, query: Query) -> float | None:
-        """The scale of the frame at which few features are sought; None where it is not asked or the map ends."""
+        """The frame's scale for few features; None if they are not wanted or the map has no such level."""
         height_m = query.telemetry.height_agl_m
         if query.prior is None or height_m is None or not self.options.upright or not self._can_refine(query):
             return None
         return coarser_scale(query, height_m, self.options.scale)
 
     def _has_time_for_few(self, query: Query) -> bool:
-        """Whether there is time for few features first and then for all of them, or only for few."""
+        """Whether time allows few features first and then all, or only few."""
         scheduler, works = query.scheduler, self._work_px(query)
         if scheduler.can_afford({_FEW: works[1.0], ("sift", _REDUCED[-1]): works[_REDUCED[-1]]}):
             return True
@@ -160,7 +159,7 @@ class Sift(Method):
         return False
 
     def _by_all_after(self, query: Query, few: Fix) -> Result:
-        """A fix by all features, or that of few where there is no time: its covariance for a tilt that is wrong.
+        """A fix by all features; without time the fix by few, with a covariance for a wrong tilt.
 
         Few features of a coarse picture follow the telemetry's attitude, which nothing has confirmed.
         """
@@ -174,7 +173,7 @@ class Sift(Method):
         return replace(with_unconfirmed_tilt(query, few), stage="coarse")
 
     def _by_all_features(self, query: Query) -> Result:
-        """A fix by all keypoints, not refined, at the highest resolution of the frame that there is time for."""
+        """An unrefined fix by all keypoints, at the highest frame resolution that time allows."""
         step = "sift"
         if query.prior is None or query.telemetry.height_agl_m is None:
             step = "sift search" if query.prior is None else "sift heights"
@@ -186,7 +185,7 @@ class Sift(Method):
             return self._at_scale(query, share)
 
     def _can_refine(self, query: Query) -> bool:
-        """Whether poses are refined: by a telemetry that is trusted, over a surface model."""
+        """Whether poses are refined: only with trusted telemetry over a surface model."""
         options, known = self.options, query.telemetry
         if not options.refine or not options.use_attitude or options.matcher is not None:
             return False
@@ -194,7 +193,7 @@ class Sift(Method):
         return is_known and query.site.has_surface and not query.frame.is_doubted
 
     def _refined(self, query: Query, fix: Fix) -> Fix:
-        """The fix with its pose refined, where that is possible and affordable."""
+        """The fix with its pose refined, if that is possible and affordable."""
         if not self._can_refine(query):
             return fix
         refinement = Refinement(query, self.samples, self._enhancement)
@@ -209,24 +208,24 @@ class Sift(Method):
         return explain_features(FeatureMatcher(query, self.landmarks, self.options), window)
 
     def find(self, query: Query, options: SiftOptions | None = None) -> PoseCandidate | NoFix:
-        """The pose of one frame, or a refusal where there is none.
+        """The pose of one frame, or a refusal if there is none.
 
         Args:
             query: the frame.
-            options: in place of the method's own.
+            options: replace the method's own.
         """
         return FeatureMatcher(query, self.landmarks, options or self.options).find()
 
     def judge(self, query: Query, found: PoseCandidate) -> Result:
-        """The fix where its pose is accepted, else a refusal; an improbable pose comes with it as evidence."""
+        """The fix if its pose is accepted, else a refusal that carries an improbable pose as evidence."""
         result = FeatureMatcher(query, self.landmarks, self.options).judge(found)
-        # What the null hypothesis reaches as well (ambiguous) is no evidence, however probable it looks.
+        # A pose that the null hypothesis matches (ambiguous) is no evidence, however probable it looks.
         if isinstance(result, NoFix) and result.reason is Reason.BAD_POSE:
             return replace(result, candidates=(found.fix,))
         return result
 
     def _work_px(self, query: Query) -> dict[float, float]:
-        """Pixels of the picture that is matched, by which the cost goes, by share of the usual scale."""
+        """Pixels of the matched picture, which determine the cost, per share of the usual scale."""
         known, scale = query.telemetry, self.options.scale
         if not self.options.upright or known.height_agl_m is None or known.grid_heading_deg is None:
             return {share: query.gray.size * (scale * share) ** 2 for share in _REDUCED}
@@ -240,6 +239,6 @@ class Sift(Method):
 
 
 def _is_certain(query: Query, fix: Fix) -> bool:
-    """Whether a pose is so probable that no null hypothesis is asked."""
+    """Whether a pose is so probable that no null hypothesis is needed."""
     assert fix.confidence is not None  # each pose has one
     return is_beyond_doubt(nats_of(fix.confidence), query.risk)

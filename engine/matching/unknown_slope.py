@@ -1,11 +1,11 @@
-"""Ground without a surface model: a refined pose over a plane whose slope nobody stated.
+"""Ground without a surface model: a refined pose over a plane of unknown slope.
 
-A slope of the ground and a tilt of the camera look alike, so that the picture tells only their sum. Most ground
-is nearly level, some is not: the slope's prior is a mixture of normal distributions of several widths, and a small
-sum is then mostly the attitude's error, a large one mostly a slope.
+A ground slope and a camera tilt look alike, so the picture shows only their sum. Most ground is nearly level, some
+is not: the slope's prior is a mixture of normal distributions of several widths. A small sum is then mostly an
+attitude error, a large one mostly a slope.
 
-The pose is refined with a wide prior of the slope. That prior is exchanged for each of the mixture's afterwards,
-as if the slope had been measured to be zero so well (a Kalman update), and the results are added up by evidence.
+The pose is refined with a wide prior of the slope. Afterwards that prior is replaced by each of the mixture's, as
+by a measurement of zero slope with that accuracy (a Kalman update). Evidence weights the results.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _WIDTHS = (0.175, 0.35, 0.7, 1.4)
 # The refinement without its prior of the slope and the peak rest on the same attitude: over level simulated towns
 # 98 % of poses agreed to this share of the height (the peak is as inexact), over hills of 8 to 30 m 19 to 33 %.
 _MAX_APART_SHARE = 0.0067
-_MAX_DEG = 20.0  # of the assumed slope: twice as much is a wall
-_REACH_SHARE = 1.0  # of the height: ground that slopes by so much rises or falls by that times its slope beside it
+_MAX_DEG = 20.0  # of the assumed slope: twice as steep is a wall
+_REACH_SHARE = 1.0  # of the height: sloping ground nearby rises or falls by this distance times its slope
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +46,14 @@ class SlopeFit:
 
 
 def wide_slope_deg(unknown_slope_deg: float) -> float:
-    """Standard deviation of the slope with which a pose is to be refined first, in degrees."""
+    """Standard deviation of the slope for the first refinement, in degrees."""
     return _WIDE * min(unknown_slope_deg, _MAX_DEG)
 
 
 def over_unknown_slope(
     pose: Pose, covariance: Array, peak_en_m: Array, height_m: float, unknown_slope_deg: float
 ) -> SlopeFit | None:
-    """A pose that was refined with a wide prior of the slope, with what is known of slopes in its place.
+    """Replace the wide slope prior of a refined pose by the mixture of likely slopes.
 
     Args:
         pose: refined, with the prior of :func:`wide_slope_deg` about level ground.
@@ -63,11 +63,11 @@ def over_unknown_slope(
         unknown_slope_deg: standard deviation of slopes of unknown ground, in degrees.
 
     Returns:
-        The pose, or None where the ground is no plane: without any knowledge of the slope the refined position is
-        then not the peak's.
+        The pose, or None if the ground is not a plane: the refined position without a slope prior then differs
+        from the peak's.
     """
     wide = math.tan(math.radians(wide_slope_deg(unknown_slope_deg)))
-    unbounded = covariance[6:, 6:] - wide**2 * np.eye(2)  # of a prior that is taken away
+    unbounded = covariance[6:, 6:] - wide**2 * np.eye(2)  # with the wide prior removed
     free = -covariance[:2, 6:] @ np.linalg.solve(unbounded, pose.slope)
     apart_m = pose.center_m[:2] + free - peak_en_m
     if math.hypot(*apart_m) > _MAX_APART_SHARE * height_m:
@@ -75,7 +75,7 @@ def over_unknown_slope(
     steps, covariances, log_weights = [], [], []
     for width in _WIDTHS:
         sigma = math.tan(math.radians(width * min(unknown_slope_deg, _MAX_DEG)))
-        variance = 1.0 / (sigma**-2 - wide**-2)  # of the measurement that makes the wide prior this one
+        variance = 1.0 / (sigma**-2 - wide**-2)  # of the measurement that turns the wide prior into this one
         total = covariance[6:, 6:] + variance * np.eye(2)
         gain = np.linalg.solve(total, covariance[6:]).T
         steps.append(-gain @ pose.slope)
@@ -85,17 +85,17 @@ def over_unknown_slope(
     weights = np.exp(np.array(log_weights) - max(log_weights))
     weights /= weights.sum()
     over = _mixed(pose, np.array(steps), np.array(covariances), weights, height_m)
-    over.covariance[:2, :2] += apart_m[:, None] * apart_m  # one of the two is off by it
+    over.covariance[:2, :2] += apart_m[:, None] * apart_m  # one of the two is off by this much
     return over
 
 
 def _mixed(pose: Pose, steps: Array, covariances: Array, weights: Array, height_m: float) -> SlopeFit:
-    """Mean and covariance of a mixture of steps (K, 8) from a pose with covariances (K, 8, 8)."""
+    """Mean and covariance of a mixture of steps (K, 8) from a pose, with covariances (K, 8, 8)."""
     step = weights @ steps
     between = steps - step
     covariance = np.einsum("k,kij->ij", weights, covariances) + (weights[:, None] * between).T @ between
     slope = pose.slope + step[6:]
-    # Ground that slopes is seldom a plane: it rises or falls by about as much beside it.
+    # Sloping ground is seldom a plane: nearby it rises or falls by about as much.
     relief_m2 = (_REACH_SHARE * height_m) ** 2 * 0.5 * float(slope @ slope + np.trace(covariance[6:, 6:]))
     covariance[2, 2] += relief_m2
     rotation = cv2.Rodrigues(step[3:6])[0] @ pose.rotation

@@ -1,4 +1,4 @@
-"""Where on the map features are searched: the adaptive window, on each pyramid level that the height allows."""
+"""Where to search for features: the adaptive window on each pyramid level that the height allows."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from engine.values import Attitude, NoFix, Window
 from engine.window import level_crop, level_for
 
 _CROP_STEP_PX = 32
-_NO_LARGER = 2.0**-0.25  # level_for allows pixels that are larger by this
+_NO_LARGER = 2.0**-0.25  # level_for allows pixels larger by this factor
 _MIN_DOWN = 0.2  # cosine of the optical axis off the vertical
 _LEVEL_ENDS = 0.75  # a level serves pictures up to this many octaves coarser than it, see level_for
 
 
 @dataclass(frozen=True, slots=True)
 class TelemetryHypothesis:
-    """What is assumed of the telemetry in one attempt at a frame.
+    """What one attempt at a frame assumes about the telemetry.
 
     Attributes:
-        heights_m: the lowest and the highest that is searched; equal where the height is known.
-        x_axis_deg: direction of the map's x axis in the frame, from +x towards +y; None where unknown.
+        heights_m: the lowest and the highest to search; equal if the height is known.
+        x_axis_deg: direction of the map's x axis in the frame, from +x towards +y; None if unknown.
     """
 
     heights_m: tuple[float, float]
@@ -34,7 +34,7 @@ class TelemetryHypothesis:
 
     @property
     def height_m(self) -> float | None:
-        """The height where it is known."""
+        """The height if it is known."""
         return self.heights_m[0] if self.heights_m[0] == self.heights_m[1] else None
 
 
@@ -72,12 +72,12 @@ def x_axis_deg(query: Query) -> float | None:
 def views_of(
     query: Query, hypothesis: TelemetryHypothesis, method: str, *, margin: float, scale: float
 ) -> list[MapView] | NoFix:
-    """The windows to search, one a level; a level that is too large to be searched gives way to a coarser one.
+    """The windows to search, one per level; a coarser level replaces one that is too large to search.
 
     Args:
         query: the frame and its prior; without a prior every window is the whole map.
-        hypothesis: its heights determine the levels, and the greatest that a level serves its window.
-        method: what a refusal names.
+        hypothesis: its heights determine the levels; the greatest height of a level determines its window.
+        method: named in a refusal.
         margin: the 1.3 of equations 4 and 5.
         scale: of the reduced frame.
     """
@@ -99,22 +99,22 @@ def views_of(
 
 
 def view_in(query: Query, window: Window, height_m: float, scale: float) -> MapView:
-    """The view of a window that is known, at one height; see :func:`views_of`."""
+    """The view of a given window at one height; see :func:`views_of`."""
     return _view(query, window, level_at(query, height_m, scale), map_px_per_pixel(query, height_m, scale))
 
 
 def level_at(query: Query, height_m: float, scale: float) -> int:
-    """The level whose pixels are like those of a frame that was reduced to a scale, and no larger."""
+    """The level whose pixels are like those of a frame reduced to a scale, and no larger."""
     return level_for(1.0, map_px_per_pixel(query, height_m, scale) * _NO_LARGER, query.site.levels)
 
 
 def drawn_px(query: Query, height_m: float, scale: float) -> float:
-    """How many pixels a frame has that is drawn on the level of a scale; :func:`_view` may draw it coarser."""
+    """Number of pixels of a frame drawn on the level of a scale; :func:`_view` may draw it coarser."""
     return query.gray.size * (map_px_per_pixel(query, height_m) / 2.0 ** level_at(query, height_m, scale)) ** 2
 
 
 def coarser_scale(query: Query, height_m: float, scale: float) -> float | None:
-    """The scale to reduce a frame to for one level above that of another scale; None where the map has none."""
+    """The scale whose level is one above another scale's; None if the map has no such level."""
     level = level_at(query, height_m, scale) + 1
     if level >= query.site.levels:
         return None
@@ -122,7 +122,7 @@ def coarser_scale(query: Query, height_m: float, scale: float) -> float | None:
 
 
 def _view(query: Query, window: Window, level: int, per_px: float) -> MapView:
-    """A window on a level, or where it is too large a coarser one; ``per_px`` map pixels are one of the frame."""
+    """A window on a level, or on a coarser one if too large; ``per_px`` is map pixels per frame pixel."""
     site = query.site
     while window.area_px >> 2 * level > PREPARED_PX and level < site.levels - 1:
         level += 1
@@ -130,7 +130,7 @@ def _view(query: Query, window: Window, level: int, per_px: float) -> MapView:
 
 
 def _window(query: Query, height_m: float, has_heading: bool, method: str, margin: float) -> Window | NoFix:
-    """The adaptive window (eq. 4, 5) at a height; the whole map where the position is unknown."""
+    """The adaptive window (eq. 4, 5) at a height; the whole map if the position is unknown."""
     nadir = query.prior_px
     if nadir is None:
         return Window(0, 0, query.site.width_px, query.site.height_px)

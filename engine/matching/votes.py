@@ -1,7 +1,7 @@
-"""The vote for a translation: of matches between an orthophoto and the map, most wrong, those that agree.
+"""Vote for a translation: find the matches between orthophoto and map that agree, among mostly wrong ones.
 
-Every match says where the orthophoto lies. Right ones say nearly the same, wrong ones anything: the densest place
-wins also where nine in ten are wrong. Small turns and changes of scale are tried as well.
+Every match votes for a position of the orthophoto. Right ones nearly agree, wrong ones scatter: the densest place
+wins even if nine in ten are wrong. Small turns and scale changes are tried as well.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 TURNS_DEG = (0.0, -6.0, 6.0)
-"""By which an orthophoto may be turned, since a heading may be wrong."""
+"""Turns of an orthophoto to try, since a heading may be wrong."""
 SCALES = (1.0, 0.93, 1.075)
-"""By which it may be scaled, since a height may be wrong."""
-_RIVAL_RADII = 3.0  # from the best translation: within, its own votes scatter where the tilt is not known
-_PAIRED = 300  # points that are compared with all others for the probability of a vote by chance
+"""Scales to try, since a height may be wrong."""
+_RIVAL_RADII = 3.0  # from the best translation; closer votes may be its own, scattered by an unknown tilt
+_PAIRED = 300  # points compared with all others for the probability of a chance vote
 
 
 @dataclass(frozen=True, slots=True)
 class Vote:
-    """What most matches agree on.
+    """The translation that most matches agree on, and its votes.
 
     Attributes:
         turn_deg: of the orthophoto about its middle, from +x towards +y.
@@ -33,7 +33,7 @@ class Vote:
         voters: (M,) bool, the matches that agree.
         shift_px: (2,) from the orthophoto, turned and scaled, to the map.
         rival: votes of the best translation elsewhere.
-        log10_nfa: log10 of the number of false alarms, the translations that as many wrong matches would agree on.
+        log10_nfa: log10 of the number of false alarms: translations on which as many wrong matches would agree.
     """
 
     turn_deg: float
@@ -55,10 +55,10 @@ def vote(photo_px: Array, map_px: Array, radius_px: float) -> Vote | None:
     Args:
         photo_px: (M, 2) in the orthophoto, about its middle.
         map_px: (M, 2) on the map.
-        radius_px: matches within it of a translation agree with it.
+        radius_px: a match this close to a translation agrees with it.
 
     Returns:
-        Vote | None: None without a match. Of equal ones the first, so that a turn needs more votes than none.
+        Vote | None: None without a match. The first of equals, so that a turn needs more votes than no turn.
     """
     from engine.kernels import clusters  # numba takes a while to import
 
@@ -85,7 +85,7 @@ def vote(photo_px: Array, map_px: Array, radius_px: float) -> Vote | None:
 def _log10_nfa(
     photo_px: Array, map_px: Array, shift_px: Array, voters: NDArray[np.bool_], radius_px: float
 ) -> float:
-    """log10 of the expected number of translations with as many votes, were all matches wrong.
+    """log10 of the expected number of translations with as many votes if all matches were wrong.
 
     A match of each orthophoto point with the map point of another match is wrong, but as crowded as right ones:
     the share of these that agree on the translation is the probability p of a vote by chance. Every match proposes

@@ -1,1 +1,1 @@
-"""One flight: how a position is carried from frame to frame, and what is made of each answer."""
+"""Navigation over a flight: carry the position from frame to frame and decide on each match."""

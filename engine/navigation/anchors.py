@@ -1,4 +1,4 @@
-"""Anchors: where dead reckoning starts, and the velocity by those of the last seconds."""
+"""Anchors: where dead reckoning starts, and the velocity from the last seconds' anchors."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from engine.navigation.motion import DriftModel, OdometrySample, PositionEstimate, VelocityEstimate
 from engine.values import Fix
 
-_VELOCITY_S = 1.0  # over which the last fixes give a velocity
-_MEMORY_S = 5.0  # over which they must agree with measured velocities
+_VELOCITY_S = 1.0  # the last fixes give a velocity over this time
+_MEMORY_S = 5.0  # and must agree with measured velocities over this one
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,11 +18,11 @@ class Anchor:
     """Where dead reckoning starts: the last accepted fix, or the start of the flight.
 
     Attributes:
-        position: there.
+        position: the position there.
         sample: its odometry; None before the first frame.
         fix: None for a start.
-        support: fixes that agreed one after the other up to this one.
-        disputed: the other source contradicted it, and its log-odds count that already.
+        support: number of successive fixes up to this one that agreed.
+        disputed: the other source contradicted it; its log-odds already count that.
     """
 
     position: PositionEstimate
@@ -33,13 +33,13 @@ class Anchor:
 
     @property
     def odometry(self) -> OdometrySample:
-        """Of an anchor that has one, as every fix does."""
+        """The odometry of an anchor that has one; every fix does."""
         assert self.sample is not None
         return self.sample
 
 
 class RecentAnchors:
-    """The fixes of the last seconds, and the velocity that they give.
+    """The fixes of the last seconds, and the velocity that follows from them.
 
     Args:
         drift: of dead reckoning.
@@ -56,7 +56,7 @@ class RecentAnchors:
         return self._anchors[0] if self._anchors else None
 
     def append(self, anchor: Anchor, *, jump: bool) -> None:
-        """Add the newest fix; after a jump those before it count no more."""
+        """Add the newest fix; after a jump, drop those before it."""
         if jump:
             self._anchors.clear()
         self._anchors.append(anchor)

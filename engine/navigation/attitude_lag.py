@@ -1,7 +1,7 @@
-"""The attitude's lag: by how much roll, pitch and heading may have changed since they were measured.
+"""The attitude's lag: how far roll, pitch and heading may have changed since they were measured.
 
-A vehicle that brakes turns by tens of degrees a second, and a tilt of one degree is 2.6 m on the ground at 150 m.
-The lag is estimated by attitudes that pictures measured; what is left of it widens the attitude's errors.
+A braking vehicle turns by tens of degrees a second, and one degree of tilt is 2.6 m on the ground at 150 m. The
+lag is estimated from attitudes measured by matching; its uncertainty widens the attitude's errors.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from engine.values import Fix, Frame
 Array = NDArray[np.float64]
 
 _MAX_INTERVAL_S = 0.5  # between frames; over longer ones the rates are unknown
-_MIN_RATE_DPS = 2.0  # of roll and pitch, below which a picture says nothing of the lag
-_DIFFERENCE_DEG = 0.6  # standard deviation of telemetry against picture without any lag
-_WALK_S = 0.01  # by which the lag changes in a second
-_MAX_LAG_DEG = 180.0  # stamps of another unit make rates of any size
-_MAX_SIGMAS = 3.0  # of the lag before it was measured: what is beyond is no lag
+_MIN_RATE_DPS = 2.0  # of roll and pitch; slower turns tell nothing about the lag
+_DIFFERENCE_DEG = 0.6  # standard deviation between telemetry and image without any lag
+_WALK_S = 0.01  # change of the lag in one second
+_MAX_LAG_DEG = 180.0  # timestamps in a wrong unit make rates of any size
+_MAX_SIGMAS = 3.0  # of the lag before it was measured: more is not a lag
 
 
 class AttitudeLag:
-    """How late the attitude of a vehicle's telemetry is.
+    """Estimates how late the telemetry's attitude is.
 
     Args:
-        sigma_s: standard deviation of the lag while no picture measured it.
-        jitter_s: of a single frame's lag about its mean.
+        sigma_s: standard deviation of the lag before images have measured it.
+        jitter_s: standard deviation of one frame's lag about its mean.
     """
 
     def __init__(self, sigma_s: float, jitter_s: float) -> None:
@@ -52,7 +52,7 @@ class AttitudeLag:
         return math.sqrt(self._variance_s2 + self._jitter_s2)
 
     def corrected(self, frame: Frame) -> Frame:
-        """The next frame with the attitude at its capture, as far as that is known."""
+        """The next frame with its attitude corrected to the time of capture, as far as the lag is known."""
         self._follow(frame)
         if self._angles_deg is None or not self._rates_dps.any():
             return frame
@@ -67,11 +67,11 @@ class AttitudeLag:
         )
 
     def note(self, fix: Fix, bias: Bias | None = None) -> None:
-        """Learn from a fix of the newest frame; one without a height did not measure its attitude.
+        """Learn from a fix of the newest frame; a fix without a height did not measure its attitude.
 
         Args:
             fix: of the newest frame.
-            bias: what else the attitude is off by.
+            bias: the attitude's other error.
         """
         rates = self._rates_dps[:2]
         square = float(rates @ rates)
@@ -88,7 +88,7 @@ class AttitudeLag:
         self._variance_s2 *= 1.0 - gain
 
     def _follow(self, frame: Frame) -> None:
-        """The attitude of the next frame, and its rates since the last."""
+        """Take the next frame's attitude and compute its rates since the last frame."""
         known = (frame.roll_deg, frame.pitch_deg, frame.heading_deg)
         time_s = None if frame.timestamp_ns is None else frame.timestamp_ns * 1e-9
         last, last_s = self._angles_deg, self._time_s

@@ -1,7 +1,7 @@
-"""Evidence: how probable it is that a match is right, by its own figures and by what else is known.
+"""Evidence: the probability that a match is right, from its own figures and from other knowledge.
 
-Log-odds, log(p / (1 - p)), of independent evidence add up. Evidence that shares its source does not: the prior
-that a matcher searched by is in the match's own probability already, and frames of one ground show one texture.
+Log-odds, log(p / (1 - p)), of independent evidence add up. Evidence with a common source does not: a match's own
+probability already includes the prior it was searched with, and frames of the same ground show the same texture.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from engine.orthomap import OrthoMap
 from engine.values import Fix, Prior
 
 MAX_PROBABILITY = 0.9999
-"""Of a match or of a track: the confidence models were tested on some ten thousand matches, not on more."""
+"""Highest probability of a match or track: confidence models were tested on only some ten thousand matches."""
 UNSTATED_PROBABILITY = 0.98
-"""Of a match that states none, as the paper's."""
-_SAME_GROUND = 0.5  # what a match of ground that was matched before counts
-_HEIGHT_M = 100.0  # assumed where it is unknown
+"""Probability assumed for a match that states none, as the paper's."""
+_SAME_GROUND = 0.5  # weight of a match of ground that was matched before
+_HEIGHT_M = 100.0  # assumed if it is unknown
 
 
 def log_odds(probability: float) -> float:
-    """log(p / (1 - p)), limited by :data:`MAX_PROBABILITY` on either side."""
+    """log(p / (1 - p)), limited to :data:`MAX_PROBABILITY` on either side."""
     p = min(max(probability, 1.0 - MAX_PROBABILITY), MAX_PROBABILITY)
     return math.log(p / (1.0 - p))
 
@@ -36,16 +36,16 @@ def probability(odds: float) -> float:
 
 
 def match_log_odds(fix: Fix) -> float:
-    """Of a match by itself, where every second frame shows a place in its window."""
+    """Log-odds of a match by itself, if every second frame shows a place in its window."""
     return log_odds(UNSTATED_PROBABILITY if fix.confidence is None else fix.confidence)
 
 
 def position_of(prior: Prior, site: OrthoMap) -> PositionEstimate:
-    """The position of another source, as far as it can be relied on.
+    """The position from another source, as reliable as that source can be.
 
     Args:
         prior: by the other source.
-        site: the map, whose axes count.
+        site: the map that defines the axes.
     """
     if prior.east_m is not None and prior.north_m is not None:
         return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m, log_odds(RELIABILITY))
@@ -56,7 +56,7 @@ def position_of(prior: Prior, site: OrthoMap) -> PositionEstimate:
 
 
 def new_ground_share(moved_m: float, height_m: float | None) -> float:
-    """The share of the ground of a second frame that the first did not show.
+    """The share of a second frame's ground that the first did not show.
 
     Args:
         moved_m: between the two.
@@ -68,20 +68,19 @@ def new_ground_share(moved_m: float, height_m: float | None) -> float:
 def repeated_log_odds(fix: Fix, agreement: float, new_share: float) -> float:
     """What a second match of one place adds to the first.
 
-    A wrong match of repeated structure comes again, and at the same place, as long as the frame shows the same
-    ground.
+    A wrong match of repeated structure recurs at the same place as long as the frame shows the same ground.
 
     Args:
         fix: the second match.
-        agreement: of its position with the first, as log-odds.
-        new_share: of the ground.
+        agreement: how well it agrees with the first position, as log-odds.
+        new_share: the share of its ground that is new.
     """
     weight = _SAME_GROUND + (1.0 - _SAME_GROUND) * new_share
     return weight * match_log_odds(fix) + new_share * agreement
 
 
 def agreement_log_odds(estimate: PositionEstimate, fix: Fix, area_m2: float) -> float:
-    """What an estimate that the match does not know of adds to its log-odds.
+    """What an independent estimate adds to the match's log-odds.
 
     A right match lies about the estimate by the covariances of both, a wrong one anywhere in the area that was
     searched. Where the estimate itself is wrong, it says nothing.
@@ -89,11 +88,11 @@ def agreement_log_odds(estimate: PositionEstimate, fix: Fix, area_m2: float) -> 
     Args:
         estimate: of the position, by other means.
         fix: the match.
-        area_m2: that was searched.
+        area_m2: the searched area.
     """
     covariance = 2.0 * math.pi * estimate.difference_covariance_m2(fix)
     log_density = -0.5 * (estimate.chi_square(fix) + math.log(float(np.linalg.det(covariance))))
-    log_area = math.log(area_m2 + 2.0 * math.pi * estimate.sigma_m**2)  # an estimate that is vaguer adds nothing
+    log_area = math.log(area_m2 + 2.0 * math.pi * estimate.sigma_m**2)  # a vaguer estimate adds nothing
     wrong = probability(-estimate.log_odds)
     log_right = math.log1p(-wrong) + log_area + log_density
     return min(float(np.logaddexp(log_right, math.log(wrong))), log_odds(MAX_PROBABILITY))
@@ -101,14 +100,14 @@ def agreement_log_odds(estimate: PositionEstimate, fix: Fix, area_m2: float) -> 
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """What is known of the position at one frame, besides its picture.
+    """What is known about the position at one frame, apart from its image.
 
     Attributes:
         own: dead reckoning from the last fix or the start.
-        given: by another source, with the frame.
-        pending: dead reckoning from a match that is not accepted yet.
-        searched: the one of them about which the matcher searched; None for the whole map.
-        prior: for the matcher, made of that.
+        given: from another source, with the frame.
+        pending: dead reckoning from a match that has not been accepted yet.
+        searched: the estimate around which the matcher searched; None for the whole map.
+        prior: the matcher's prior, made from ``searched``.
     """
 
     own: PositionEstimate | None
@@ -117,21 +116,21 @@ class Sources:
     searched: PositionEstimate | None = None
     prior: Prior | None = None
 
-    def vouching(
+    def evidence_of(
         self, estimate: PositionEstimate | None, fix: Fix, window_m2: float, gate: float, trusted_sigma_m: float
     ) -> float:
         """What an estimate adds to the log-odds of a match.
 
-        The confidence of a match holds where every second frame shows a place in its window, and weighs how well
-        position and prior agree. Of the estimate that was searched about, only the rest is added: how probable it
-        is that the window shows the place. A match without a confidence has not weighed a vague estimate.
+        A match's confidence assumes that every second frame shows a place in its window, and already weighs how
+        well position and prior agree. The estimate that was searched around therefore adds only the probability
+        that the window shows the place. A match without a confidence has not weighed a vague estimate.
 
         Args:
-            estimate: one of these; None adds nothing.
+            estimate: one of these estimates; None adds nothing.
             fix: the match.
             window_m2: area of the window that was searched.
             gate: chi-square beyond which the two contradict each other.
-            trusted_sigma_m: beyond which an estimate is vague.
+            trusted_sigma_m: an estimate less certain than this is vague.
         """
         if estimate is None:
             return 0.0
@@ -143,5 +142,5 @@ class Sources:
         return estimate.log_odds if weighed else 0.0
 
     def searched_m2(self, window_m2: float) -> float:
-        """The area of the places that were as probable: the whole window, or that of the prior's Gaussian."""
+        """The area of equally probable places: the whole window, or that of the prior's Gaussian."""
         return window_m2 if self.prior is None else 2.0 * math.pi * self.prior.sigma_m**2

@@ -1,4 +1,4 @@
-"""Hypotheses: places that matches of successive frames speak for, moved along by odometry and added up.
+"""Hypotheses: places supported by matches of successive frames, moved by odometry while evidence adds up.
 
 A match that is not accepted is not lost: the next frames speak for its place, or against it. What a match adds is
 counted by the ground that is new (:mod:`engine.navigation.evidence`). Matches that the matcher itself doubts count
@@ -26,17 +26,17 @@ from engine.navigation.motion import DriftModel, OdometrySample, PositionEstimat
 from engine.values import MAX_SIGMA_M, Fix
 
 MAX_HYPOTHESES = 16
-_MIN_LOG_ODDS = -3.0  # below which a hypothesis is dropped
-_SEARCHED_MISS, _MISS = math.log(0.1), math.log(0.5)  # what a frame without a match of a right place adds
+_MIN_LOG_ODDS = -3.0  # a hypothesis with less is dropped
+_SEARCHED_MISS, _MISS = math.log(0.1), math.log(0.5)  # evidence of a frame without a match of the place
 
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """A match of the newest frame that is not accepted yet.
+    """A match of the newest frame that has not been accepted yet.
 
     Attributes:
         fix: the match.
-        log_odds: of itself and of the estimates that it agrees with or contradicts; of a first match.
+        log_odds: as of a first match, from itself and from the estimates that it agrees with or contradicts.
         doubted: the matcher refused it.
     """
 
@@ -47,13 +47,13 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A place with the evidence for it.
+    """A place and the evidence for it.
 
     Attributes:
         fix: the newest match of it.
-        sample: the odometry of that.
-        count: matches of it.
-        log_odds: of all of them.
+        sample: the odometry at that match.
+        count: number of its matches.
+        log_odds: from all of them.
         doubted: how many of them the matcher refused.
     """
 
@@ -69,7 +69,7 @@ class Hypotheses:
 
     Args:
         drift: of dead reckoning.
-        gate: chi-square beyond which a match is of another place.
+        gate: chi-square beyond which a match belongs to another place.
     """
 
     def __init__(self, drift: DriftModel, gate: float) -> None:
@@ -78,9 +78,9 @@ class Hypotheses:
 
     @property
     def pending(self) -> Hypothesis | None:
-        """The strongest that the matcher itself vouches for, about which others are looked for."""
-        vouched = [each for each in self._known if each.doubted < each.count]
-        return max(vouched, key=lambda each: each.log_odds, default=None)
+        """The strongest hypothesis that the matcher itself supports; the search centres on it."""
+        supported = [each for each in self._known if each.doubted < each.count]
+        return max(supported, key=lambda each: each.log_odds, default=None)
 
     def clear(self) -> None:
         """Forget all of them."""
@@ -104,14 +104,14 @@ class Hypotheses:
         """Add the matches of one frame; each hypothesis takes the best that agrees with it.
 
         Args:
-            matches: of the frame; none where there is nothing in it.
+            matches: of the frame; may be empty.
             now: its odometry.
             sources: what else was known, and where the matcher searched.
-            map_m2: area of the window where the whole map was searched.
+            map_m2: area of the window if the whole map was searched.
             height_m: above the ground.
 
         Returns:
-            Hypothesis | None: the strongest that a match of this frame speaks for.
+            Hypothesis | None: the strongest that a match of this frame supports.
         """
         grown: list[Hypothesis] = []
         used: set[int] = set()
@@ -135,7 +135,7 @@ class Hypotheses:
         return next((each for each in self._known if each.sample is now), None)
 
     def lead(self, hypothesis: Hypothesis) -> float:
-        """Log-odds of a hypothesis against all others; of one that the matcher vouches for, its own."""
+        """Log-odds of a hypothesis against all others; its own log-odds if the matcher supports it."""
         if not hypothesis.doubted:
             return hypothesis.log_odds
         rivals = [each.log_odds for each in self._known if each is not hypothesis]
@@ -150,14 +150,14 @@ def _extended(
     searched_m2: float | None,
     height_m: float | None,
 ) -> Hypothesis:
-    """A hypothesis with one match more.
+    """A hypothesis with one more match.
 
     Args:
-        known: it.
-        match: that agrees with it.
+        known: the hypothesis.
+        match: the match that agrees with it.
         now: its odometry.
         before: where the hypothesis predicted it.
-        searched_m2: area that was searched; None where it was searched about this prediction.
+        searched_m2: the searched area; None if the search was around this prediction.
         height_m: above the ground.
     """
     fix = match.fix

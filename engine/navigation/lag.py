@@ -1,4 +1,4 @@
-"""The delay of a camera's pictures behind the attitude, from how far the optical axis turned between pictures."""
+"""Camera delay behind the attitude, from the turn of the optical axis between images."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ Array = NDArray[np.float64]
 _STEP_S = 0.002
 _MIN_PICTURES = 30
 _MIN_CORRELATION = 0.8
-_MIN_TURN_DEG = 0.2  # root of the mean square, between pictures
-_SMALL_PX = 160  # width at which pictures are compared
+_MIN_TURN_DEG = 0.2  # root mean square, between pictures
+_SMALL_PX = 160  # width to which pictures are reduced for comparison
 
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """A delay, and how well the turns in the pictures then agree with those of the attitude, up to 1."""
+    """A delay, and how well the turns of pictures and attitude then agree, up to 1."""
 
     delay_s: float
     correlation: float
 
 
 def turn_between(first: NDArray[np.uint8], second: NDArray[np.uint8], focal_px: float) -> float:
-    """Angle by which the optical axis turned, as the shift of a picture shows it.
+    """Angle by which the optical axis turned, measured by the shift between two pictures.
 
     Args:
         first: (H, W) grey.
@@ -48,17 +48,17 @@ def turn_between(first: NDArray[np.uint8], second: NDArray[np.uint8], focal_px: 
 
 
 def camera_lag(times_s: Array, turns_rad: Array, attitude: Array, mount: Array, max_lag_s: float = 0.6) -> Lag:
-    """The delay at which the pictures turn as the vehicle did.
+    """The delay at which the turns of pictures and vehicle agree best.
 
     Args:
-        times_s: (N,) arrival of the pictures.
+        times_s: (N,) arrival times of the pictures.
         turns_rad: (N - 1,) from each to the next.
         attitude: (M, 4) time in seconds, roll, pitch and heading in degrees, on the same clock.
         mount: (3, 3) of the camera on the vehicle.
-        max_lag_s: largest delay that is tried.
+        max_lag_s: largest delay to try.
 
     Returns:
-        Lag: the delay of best agreement.
+        Lag: the delay with the best agreement.
 
     Raises:
         TelemetryError: too few pictures, too little movement, or pictures and attitude do not agree.

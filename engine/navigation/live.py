@@ -1,7 +1,7 @@
-"""Live: frames as they are captured, answers in time. A queue of one, in which the newest frame wins.
+"""Live matching: answer frames by a deadline as they are captured. The queue holds one frame, the newest.
 
-A worker thread matches. A watchdog answers in its place when the deadline comes first, and replaces it where it
-hangs or dies. The result of a worker whose frame was already answered is discarded.
+A worker thread matches. A watchdog answers in its place if the deadline comes first, and replaces it if it hangs
+or dies. A worker's result is discarded if its frame was already answered.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from engine.values import Fix, Frame, NoFix, Prior, Reason, Result, check_positi
 
 _log = logging.getLogger("scenematch")
 
-_JOIN_S = 5.0  # that closing waits for abandoned workers; one that hangs for good is left behind
+_JOIN_S = 5.0  # closing waits this long for abandoned workers, then leaves them behind
 _MAX_MS = 60_000.0  # of any wait in flight
-_MAX_DOUBLINGS = 10  # how often the time to create a navigator is doubled at most
-_LOOK_S = 0.02  # how often a clock of another speed is read while something is due
+_MAX_DOUBLINGS = 10  # the time allowed to create a navigator doubles at most this often
+_LOOK_S = 0.02  # polling interval of a clock of another speed while something is due
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveOptions:
-    """How long a frame and a worker are waited for.
+    """How long to wait for a frame and for a worker.
 
     Attributes:
-        deadline_ms: age, counted from capture, by which a frame is answered.
-        patience_ms: beyond the deadline, after which a worker counts as hanging and is replaced. One that creates
-            its navigator has as long from its start, and twice as long after each that hung in doing so.
-        max_speed_mps: of the vehicle, by which the uncertainty at a new worker's start grows with time.
-        realtime: how the worker and the watchdog are scheduled; None is as usual.
+        deadline_ms: age since capture by which a frame is answered.
+        patience_ms: time beyond the deadline after which a worker counts as hanging and is replaced. A worker that
+            creates its navigator has this long from its start, doubled after each that hung while creating one.
+        max_speed_mps: of the vehicle; the position uncertainty of a new worker's start grows at this speed.
+        realtime: how to schedule the worker and the watchdog; None leaves scheduling unchanged.
     """
 
     deadline_ms: float = 121.0
@@ -54,7 +54,7 @@ class LiveOptions:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of one frame.
+    """The outcome of one frame.
 
     Attributes:
         frame: as it was submitted.
@@ -69,7 +69,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What went in and what came out: submitted = answered + dropped + at most one that waits and one in work."""
+    """Counts of frames: submitted = answered + dropped + at most one waiting and one in work."""
 
     submitted: int = 0
     dropped: int = 0
@@ -83,7 +83,7 @@ class _Job:
     frame: Frame
     prior: Prior | None
     captured_ns: int
-    submitted_ns: int  # on the machine's clock, as a worker that hangs does so on this machine's time
+    submitted_ns: int  # on the machine's clock, by which a hanging worker is detected
     answered: bool = False
 
 
@@ -91,20 +91,20 @@ class Live:
     """Answers a stream of frames.
 
     Args:
-        make_navigator: creates a navigator that starts at a prior, or anywhere where that is None; called once by
-            the constructor, and in its own thread by every worker that replaces another.
-        deliver: takes each answer, one at a time, from one of the engine's threads.
+        make_navigator: creates a navigator that starts at a prior, or anywhere if that is None; called once by the
+            constructor, and by every replacement worker in its own thread.
+        deliver: called with each answer, one at a time, from one of the engine's threads.
         start: where the flight begins.
         options: settings.
-        clock_ns: on which frames are captured and grow old, such as a simulator's; None is ``time.monotonic_ns``.
-        machine_ns: by which a worker hangs; None is the same.
+        clock_ns: clock of the frames' capture and age, such as a simulator's; None is ``time.monotonic_ns``.
+        machine_ns: clock that detects a hanging worker; None is the same.
 
     Raises:
-        OptionError, BackendError: real time was asked for, and the system is not Linux or does not permit it.
+        OptionError, BackendError: real time was requested, and the system is not Linux or does not permit it.
 
     Convention:
-        Python cannot stop a thread: one that hangs is left behind, and nothing of it is used any more. A hang that
-        holds Python's lock stops the whole process.
+        Python cannot stop a thread: a hanging one is abandoned and its results are ignored. A hang that holds
+        Python's global lock stops the whole process.
     """
 
     def __init__(
@@ -124,29 +124,29 @@ class Live:
         self._delivering = threading.Lock()
         self._waiting: _Job | None = None
         self._working: _Job | None = None
-        self._number = 0  # of the present worker
-        self._creating_since_ns: int | None = None  # when the worker began to; None while it has one, or pauses
+        self._number = 0  # of the current worker
+        self._creating_since_ns: int | None = None  # start of creation; None with a navigator or in a pause
         self._hung_creations = 0  # in a row
         self._counts = Counts()
         self._closed = False
         self._threads: list[threading.Thread] = []
         check_realtime(self._options.realtime)
         self._start_thread(self._work, make_navigator(start), 0)
-        self._start_thread(self._watch, above=1)  # a worker that computes must not keep it from answering
+        self._start_thread(self._watch, above=1)  # a computing worker must not keep it from answering
 
     @property
     def counts(self) -> Counts:
-        """What went in and came out so far."""
+        """The counts so far."""
         with self._changed:
             return self._counts
 
     def submit(self, frame: Frame, prior: Prior | None = None, captured_ns: int | None = None) -> None:
-        """Hand in the newest frame; one that still waits is dropped. Never blocks for longer than a lock is held.
+        """Submit the newest frame; one still waiting is dropped. Blocks only as long as a lock is held.
 
         Args:
             frame: newer than every frame before it.
             prior: of its position by another source.
-            captured_ns: when it was captured, on the clock of this pipeline; None is now.
+            captured_ns: time of capture on this pipeline's clock; None is now.
 
         Raises:
             StateError: the pipeline was closed.
@@ -162,10 +162,10 @@ class Live:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Take no more frames; the one in work is answered still, one that waits is dropped.
+        """Take no more frames; the one in work is still answered, one that waits is dropped.
 
-        Waits also for workers whose frames were answered without them: a process that ends while one of its
-        threads is within compiled code is aborted.
+        Also waits for workers whose frames were answered without them: a process that ends while one of its
+        threads runs compiled code is aborted.
         """
         with self._changed:
             self._closed = True
@@ -177,7 +177,7 @@ class Live:
             self._changed.wait_for(lambda: self._working is None and (job is None or job.answered), timeout=due_s)
         until = time.monotonic() + _JOIN_S
         for thread in self._threads:
-            if thread is not threading.current_thread():  # a receiver may close, too
+            if thread is not threading.current_thread():  # the receiver may also call close
                 thread.join(max(0.0, until - time.monotonic()))
 
     def __enter__(self) -> Live:
@@ -217,7 +217,7 @@ class Live:
                 return
 
     def _create_navigator(self, number: int) -> Navigator | None:
-        """A navigator that starts at the last fix; None, after a pause, where creating it failed."""
+        """A navigator that starts at the last fix; None, after a pause, if creating it failed."""
         navigator = None
         try:
             navigator = self._make_navigator(self._resume())
@@ -240,7 +240,7 @@ class Live:
             # A search of the whole map may outlast its frame's deadline: the next frame profits from it.
             budget = Budget(total_ms=left_ms, search_ms=left_ms + self._options.patience_ms)
             return navigator.update(job.frame, job.prior, budget), True
-        except EngineError as error:  # this frame cannot be used; the next may
+        except EngineError as error:  # this frame is unusable; the next may be usable
             return _refusal(job, Reason.FAILED, str(error)), True
         except Exception as error:
             return _refusal(job, Reason.FAILED, f"{type(error).__name__}: {error}"), False
@@ -270,18 +270,18 @@ class Live:
                 self._replace(number)
 
     def _hangs_in_ms(self) -> float:
-        """Time until the worker counts as hanging, in an answered frame or in creating its navigator."""
+        """Time until the worker counts as hanging, on an answered frame or while creating its navigator."""
         deadline_ms, patience_ms = self._options.deadline_ms, self._options.patience_ms
         if self._creating_since_ns is not None:
             creating_for_ms = (self._machine_ns() - self._creating_since_ns) * 1e-6
-            # A creation that is only slow would never finish if each attempt got the same time.
+            # A slow creation would never finish if each attempt got the same time.
             return (deadline_ms + patience_ms) * 2.0 ** min(self._hung_creations, _MAX_DOUBLINGS) - creating_for_ms
         if self._working is None or not self._working.answered:
             return math.inf
         return deadline_ms + patience_ms - (self._machine_ns() - self._working.submitted_ns) * 1e-6
 
     def _answer(self, job: _Job, result: Result) -> None:
-        """Deliver one answer a frame; a fix that came too late becomes a refusal."""
+        """Deliver one answer per frame; a late fix becomes a refusal."""
         with self._delivering:
             age_ms = self._age_ms(job)
             late = age_ms > self._options.deadline_ms
@@ -295,7 +295,7 @@ class Live:
                 result = _refusal(job, Reason.LATE, f"the fix came {age_ms:.0f} ms after capture")
             try:
                 self._deliver(Answer(job.frame, result, age_ms))
-            except Exception:  # the receiver's error is no reason to stop answering
+            except Exception:  # an error in the receiver must not stop the answers
                 _log.exception("deliver failed")
 
     def _replace(self, number: int) -> None:
@@ -313,7 +313,7 @@ class Live:
         self._start_thread(self._work, None, number + 1)
 
     def _resume(self) -> Prior | None:
-        """Where a new worker starts: at the last fix, as uncertain as the vehicle may have moved since."""
+        """Where a new worker starts: at the last fix, widened by how far the vehicle may have moved since."""
         with self._changed:
             last = self._last
         if last is None:

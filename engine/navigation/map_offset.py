@@ -1,4 +1,4 @@
-"""The map's own error: the offset of positions on the map from those of another source, estimated in flight."""
+"""The map's own error: its offset from positions of another source, estimated in flight."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from engine.values import Fix
 
 Array = NDArray[np.float64]
 
-_SOURCE_S = 60.0  # for as long an error of another source lasts; satellite navigation wanders over minutes
+_SOURCE_S = 60.0  # how long an error of the other source lasts; satellite navigation wanders over minutes
 
 
 @dataclass(frozen=True, slots=True)
 class MapOffset:
-    """What is added to a position on the map to be where the other source says.
+    """The offset to add to a position on the map to agree with the other source.
 
     Attributes:
         en_m: (2,) east and north.
-        covariance_m2: (2, 2) of that.
+        covariance_m2: (2, 2) of the offset.
     """
 
     en_m: Array
     covariance_m2: Array
 
     def corrected(self, fix: Fix, frame: LocalFrame) -> Fix:
-        """A fix moved by the offset; of the map's error only what is left of it counts.
+        """A fix moved by the offset; only the offset's uncertainty remains of the map's error.
 
         Args:
             fix: of the same map.
             frame: of the map.
 
         Returns:
-            Fix: ``map_xy_px`` stays where the map shows the place.
+            Fix: ``map_xy_px`` stays at the place that the map shows.
         """
         east, north = en_m(fix) + self.en_m
         lat, lon = frame.geodetic_from_enu(east, north)
@@ -57,8 +57,8 @@ class MapOffset:
 class MapOffsetEstimator:
     """Averages the differences between fixes and the positions of another source.
 
-    The offset is one error of the map with the standard deviation that the fixes state. An error of the other
-    source lasts for about a minute, so that a minute of differences counts as one.
+    The offset is a single error of the map, with the standard deviation that the fixes state. An error of the
+    other source lasts for about a minute, so a minute of differences counts as one.
     """
 
     def __init__(self) -> None:
@@ -67,18 +67,18 @@ class MapOffsetEstimator:
 
     @property
     def offset(self) -> MapOffset | None:
-        """The estimate; None before a first difference, or where the map has no error."""
+        """The estimate; None before the first difference, or if the map has no error."""
         if self._time_s is None:
             return None
         return MapOffset(self._mean.copy(), np.asarray(np.linalg.inv(self._precision), np.float64))
 
     def add(self, fix: Fix, given: PositionEstimate, time_s: float) -> None:
-        """Add a fix and the other source's position at the same time.
+        """Add a fix and the other source's position at that time.
 
         Args:
-            fix: that was accepted.
-            given: by the other source.
-            time_s: of both; what is no later than the last one is left out.
+            fix: an accepted fix.
+            given: the other source's position.
+            time_s: of both; ignored unless later than the last one.
         """
         if fix.map_sigma_m <= 0.0 or (self._time_s is not None and time_s <= self._time_s):
             return

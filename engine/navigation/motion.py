@@ -24,9 +24,9 @@ class OdometrySample:
         time_s: since the first frame.
         moved_m: (2,) displacement east and north since then.
         blind_s: the part of that time without a measured velocity.
-        stated_s: the part of it whose velocity came with its own accuracy, which the next two add up.
-        lasting_m: errors that last, of both axes.
-        noise_m2: variance per axis of those that do not.
+        stated_s: the part of that time whose velocity came with its accuracy; the next two accumulate it.
+        lasting_m: accumulated errors that last, both axes.
+        noise_m2: variance per axis of errors that do not last.
     """
 
     time_s: float
@@ -39,16 +39,16 @@ class OdometrySample:
 
 @dataclass(frozen=True, slots=True)
 class GroundMotion:
-    """How far the vehicle moved over the ground between two pictures, as these show it.
+    """Movement over the ground between two pictures, measured from them.
 
     Attributes:
         interval_s: between them.
         moved_m: (2,) east and north.
         noise_m2: (2, 2) covariance of the errors of this step.
-        lasting_share: of the way; the error by height and heading, which stays the same for long.
-        drift: by how much more than alone such steps add to the variance of a long way, since an error stays the
-            same for some of them.
-        points: that agreed.
+        lasting_share: lasting error as a share of the way, from height and heading.
+        drift: factor by which a step adds more variance to a long way than alone, because some errors last for
+            several steps.
+        points: number of points that agreed.
     """
 
     interval_s: float
@@ -65,12 +65,12 @@ class GroundMotion:
 
     @property
     def velocity_covariance_m2ps2(self) -> Array:
-        """(2, 2) of that velocity, with the error that lasts."""
+        """(2, 2) covariance of that velocity, including the lasting error."""
         lasting_m2 = self.lasting_share**2 * float(self.moved_m @ self.moved_m)
         return np.asarray((self.noise_m2 + lasting_m2 * np.eye(2)) / self.interval_s**2)
 
     def added_to(self, last: OdometrySample) -> OdometrySample:
-        """The sample at the later picture, where the last one is the earlier's."""
+        """The sample at the later picture, given that of the earlier."""
         return OdometrySample(
             last.time_s + self.interval_s,
             last.moved_m + self.moved_m,
@@ -83,18 +83,18 @@ class GroundMotion:
 
 @dataclass(frozen=True, slots=True)
 class VelocityEstimate:
-    """A velocity (2,) east and north, and one standard deviation of each of the two."""
+    """A velocity (2,) east and north, and its standard deviation per axis."""
 
     mps: Array
     sigma_mps: float
 
 
 class DeadReckoning:
-    """Integrates the frames' velocities over their stamps.
+    """Integrates the frames' velocities over time.
 
     Args:
         late_s: how much older than the newest frame a frame may be.
-        default_interval_s: time between frames that carry no stamp.
+        default_interval_s: time between frames without a timestamp.
     """
 
     def __init__(self, late_s: float, default_interval_s: float) -> None:
@@ -102,7 +102,7 @@ class DeadReckoning:
         self._samples: deque[OdometrySample] = deque()  # of the last late_s
         self._stamps: deque[int] = deque()  # of the same
         self._newest_ns: int | None = None
-        self._measured: Array | None = None  # velocity of the newest frame, where it had one
+        self._measured: Array | None = None  # velocity of the newest frame, if it had one
 
     @property
     def last(self) -> OdometrySample | None:
@@ -130,12 +130,12 @@ class DeadReckoning:
     def sample(
         self, frame: Frame, velocity: VelocityEstimate | None, seen: GroundMotion | None = None
     ) -> OdometrySample:
-        """The sample of a frame; nothing is changed by it.
+        """The sample of a frame; changes no state.
 
         Args:
             frame: a new one, or a late one.
-            velocity: assumed where the frame came without one; None assumes none.
-            seen: by the pictures, since the newest frame; in place of a velocity that is assumed.
+            velocity: assumed if the frame came without one; None assumes none.
+            seen: motion since the newest frame, measured from pictures; replaces an assumed velocity.
         """
         last = self.last
         if last is None:
@@ -158,7 +158,7 @@ class DeadReckoning:
                 lasting_m=last.lasting_m + lasting_m,
             )
         if seen is not None and math.isclose(seen.interval_s, interval_s, abs_tol=1e-6):
-            return seen.added_to(last)  # else a frame between failed, whose way nobody knows
+            return seen.added_to(last)  # else a frame in between failed: its way is unknown
         step_m = np.zeros(2) if velocity is None else velocity.mps * interval_s
         return replace(
             last,
@@ -182,7 +182,7 @@ class DeadReckoning:
             self._samples.popleft()
 
     def _between(self, time_s: float) -> OdometrySample:
-        """The sample at a time between two frames; of an earlier time the first of all."""
+        """The sample at a time, interpolated between frames; before the first frame, the first sample."""
         times = [sample.time_s for sample in self._samples]
         rows = np.array([(*s.moved_m, s.blind_s, s.stated_s, s.lasting_m, s.noise_m2) for s in self._samples])
         east, north, *others = (float(np.interp(time_s, times, column)) for column in rows.T)
@@ -194,10 +194,10 @@ class DriftModel:
     """How the error of dead reckoning grows.
 
     Attributes:
-        measured_sigma_mps: of a measured velocity. Such errors last: they add up with time, not with its root.
-        acceleration_mps2: how hard the vehicle accelerates, for a second at a time and then some other way, while
-            its velocity is not measured.
-        max_speed_mps: where nothing is known of it.
+        measured_sigma_mps: of a measured velocity. Such errors last: they grow with time, not its square root.
+        acceleration_mps2: the vehicle's acceleration while its velocity is not measured; its direction changes
+            every second.
+        max_speed_mps: speed assumed if it is unknown.
     """
 
     measured_sigma_mps: float
@@ -212,7 +212,7 @@ class DriftModel:
         Args:
             start: either of the two.
             end: the other.
-            velocity: assumed where none was measured; None where none was assumed.
+            velocity: assumed if none was measured; None if none was assumed.
         """
         blind_s = abs(end.blind_s - start.blind_s)
         measured_s = max(0.0, abs(end.time_s - start.time_s) - blind_s - abs(end.stated_s - start.stated_s))
@@ -224,31 +224,31 @@ class DriftModel:
         return math.hypot(lasting_m + blind_m, math.sqrt(abs(end.noise_m2 - start.noise_m2)))
 
     def velocity(self, apart_m: Array, sigma_m: float, interval_s: float) -> VelocityEstimate | None:
-        """The velocity at the later of two fixes; None where they are so far apart that it predicts nothing.
+        """The velocity at the later of two fixes; None if they are so far apart that it predicts nothing.
 
         Args:
-            apart_m: (2,) from one to the other.
-            sigma_m: of that, per axis.
+            apart_m: (2,) from the earlier to the later.
+            sigma_m: standard deviation of that difference, per axis.
             interval_s: between them.
 
         Returns:
             VelocityEstimate | None: (2,) m/s to the east and north, and its standard deviation.
         """
         changed_mps = self.acceleration_mps2 * math.sqrt(interval_s / 3.0)
-        if 2.0 * changed_mps >= 0.5 * self.max_speed_mps:  # over as long an interval it changes as much again
+        if 2.0 * changed_mps >= 0.5 * self.max_speed_mps:  # it changes as much again in the next interval
             return None
         return VelocityEstimate(apart_m / interval_s, sigma_m / interval_s + changed_mps)
 
 
 @dataclass(frozen=True, slots=True)
 class PositionEstimate:
-    """A position by other means than the match that it is compared with.
+    """A position from another source than the match it is compared with.
 
     Attributes:
         en_m: (2,) east and north.
         sigma_m: one standard deviation of each.
-        log_odds: log(p / (1 - p)) of the probability that it holds within its standard deviation.
-        on_map: it came from the same map, and shares the error of its georeference.
+        log_odds: log(p / (1 - p)), with p the probability that it is right to within its standard deviation.
+        on_map: whether it came from the same map and so shares its georeferencing error.
     """
 
     en_m: Array
@@ -257,7 +257,7 @@ class PositionEstimate:
     on_map: bool = False
 
     def difference_covariance_m2(self, fix: Fix) -> Array:
-        """Covariance of the difference to a fix; an error of the map cancels between two fixes on it.
+        """Covariance of the difference to a fix; the map's error cancels between two fixes on it.
 
         Args:
             fix: on the map.
@@ -269,21 +269,21 @@ class PositionEstimate:
         return np.asarray(covariance + self.sigma_m**2 * np.eye(2))
 
     def chi_square(self, fix: Fix) -> float:
-        """Squared distance of a fix in units of both covariances: two degrees of freedom."""
+        """Squared Mahalanobis distance to a fix by both covariances: two degrees of freedom."""
         return chi_square(en_m(fix) - self.en_m, self.difference_covariance_m2(fix))
 
     def refusal(self, fix: Fix) -> NoFix:
-        """The refusal of a fix that contradicts this."""
+        """The refusal of a fix that contradicts this estimate."""
         apart_m = float(np.hypot(*(en_m(fix) - self.en_m)))
         sigma_m = math.hypot(self.sigma_m, fix.relative_sigma_m if self.on_map else fix.sigma_m)
         detail = f"{apart_m:.1f} m from the prediction, sigma {sigma_m:.1f} m"
         return fix.refused(Reason.INCONSISTENT, detail)
 
     def prior(self, widened: float = 1.0, moved_m: Array | None = None, map_sigma_m: float = 0.0) -> Prior:
-        """The same as a prior.
+        """This estimate as a prior.
 
         Args:
-            widened: factor on the standard deviation, which is bounded by :data:`engine.values.MAX_SIGMA_M`.
+            widened: factor on the standard deviation; the product is at most :data:`engine.values.MAX_SIGMA_M`.
             moved_m: (2,) movement east and north since the last frame; None is 0.
             map_sigma_m: error of the map between this position and a place on it.
 

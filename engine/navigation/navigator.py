@@ -1,4 +1,4 @@
-"""Navigator: frames in the order of capture, to fixes; it carries the window from one to the next."""
+"""Navigator: turns frames in order of capture into fixes and carries the search window from frame to frame."""
 
 from __future__ import annotations
 
@@ -45,25 +45,25 @@ Array = NDArray[np.float64]
 
 
 class Matcher(Protocol):
-    """What a navigator needs of a matcher; :class:`engine.matching.matcher.SceneMatcher` is one."""
+    """What a navigator needs from a matcher; :class:`engine.matching.matcher.SceneMatcher` is one."""
 
     site: OrthoMap
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
-        """Where the camera was when the frame was taken."""
+        """The camera's position when the frame was taken."""
 
 
 class Navigator:
-    """Follows a flight: each frame is matched in the window that dead reckoning from the last fix gives.
+    """Follows a flight: matches each frame in the window predicted by dead reckoning from the last fix.
 
-    A fix is accepted where the evidence for it is enough: its own, and its agreement with predictions, other
+    A fix is accepted if there is enough evidence for it: its own, and its agreement with predictions, other
     sources and other fixes; see ``docs/integrity.md``.
 
     Args:
         matcher: matches single frames.
-        start: where the flight begins; None searches the whole map until a first fix.
-        budget: of each frame; None does not hurry.
-        options: settings; the defaults serve. Their ``odometry`` needs a matcher with a ``camera``.
+        start: where the flight begins; None searches the whole map until the first fix.
+        budget: of each frame; None sets no limit.
+        options: settings; ``odometry`` needs a matcher with a ``camera``.
     """
 
     def __init__(
@@ -88,12 +88,12 @@ class Navigator:
         self._map_offset = MapOffsetEstimator()
         self._hypotheses = Hypotheses(self._drift, o.gate)
         self._refusals = self._frames_lost = 0  # in a row
-        self._fixed = self._lost = False  # whether the newest frame was; whether the flight is
+        self._fixed = self._lost = False  # whether the newest frame was fixed; whether the flight is lost
         self._resets = 0
 
     @property
     def state(self) -> NavigatorState:
-        """How much is known after the last frame."""
+        """How well the position is known after the last frame."""
         if self._anchor is None or self._anchor.fix is None:
             return NavigatorState.SEARCHING
         if self._lost:
@@ -102,7 +102,7 @@ class Navigator:
 
     @property
     def tracking(self) -> bool:
-        """Whether there is a fix to carry on from."""
+        """Whether there is a fix to continue from."""
         return self.state in (NavigatorState.TRACKING, NavigatorState.COASTING)
 
     @property
@@ -115,7 +115,7 @@ class Navigator:
 
     @property
     def healthy(self) -> bool:
-        """Whether the position rests on a fix of the last ``healthy_s`` seconds."""
+        """Whether the position is based on a fix from the last ``healthy_s`` seconds."""
         age_s = self.anchor_age_s
         return self.tracking and age_s is not None and age_s <= self._options.healthy_s
 
@@ -134,28 +134,28 @@ class Navigator:
 
     @property
     def ground_motion(self) -> GroundMotion | None:
-        """The way to the newest frame as pictures show it; None where they do not, or were not asked."""
+        """Motion to the newest frame, measured from pictures; None if it was not measured."""
         return self._motion
 
     @property
     def map_offset(self) -> MapOffset | None:
-        """How far the map is off by the priors of :meth:`update`; no fix is moved by it. None without priors."""
+        """The map's offset from the priors of :meth:`update`; it moves no fix. None without priors."""
         return self._map_offset.offset
 
     @property
     def calibration(self) -> Calibration:
-        """By how much the telemetry's attitude, its clock and its height are off, with their uncertainties."""
+        """Estimated errors of the telemetry's attitude, clock and height, with their uncertainties."""
         return self._errors.calibration
 
     def update(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """The fix of the next frame.
 
         Args:
-            frame: the newest, or one that comes late by at most ``late_s``. A late one is matched where the
-                vehicle was then, and moves nothing back.
-            prior: of this frame's position by another source, not by the map; searched about where it is tighter
-                than dead reckoning, and evidence for or against a match in any case.
-            budget: of this frame, in place of the navigator's.
+            frame: the newest, or one late by at most ``late_s``. A late frame is matched where the vehicle was
+                then, and does not turn back the navigator's state.
+            prior: this frame's position from a source other than the map. The search centres on it if it is
+                tighter than dead reckoning; it always counts as evidence for or against a match.
+            budget: of this frame; replaces the navigator's.
 
         Raises:
             TelemetryError: the frame came before, or is older than ``late_s``.
@@ -197,12 +197,12 @@ class Navigator:
     # ------------------------------------------------------------------------------------------ predictions
 
     def _seen_motion(self, pictures: VisualOdometry, frame: Frame) -> GroundMotion | None:
-        """How far the vehicle moved since the last frame, where the pictures show it."""
+        """How far the vehicle moved since the last frame, if the pictures show it."""
         motion = pictures.update(self._with_height(self._errors.without_errors(frame)))
         return motion if isinstance(motion, GroundMotion) else None
 
     def _reckoned(self, now: OdometrySample, anchor: Anchor | None = None) -> PositionEstimate | None:
-        """Dead reckoning from an anchor, or from the last one."""
+        """Dead reckoning from an anchor; by default the last one."""
         anchor = anchor or self._anchor
         if anchor is None or anchor.sample is None:
             return None if anchor is None else anchor.position
@@ -215,7 +215,7 @@ class Navigator:
         return PositionEstimate(place_m, sigma_m, odds, anchor.position.on_map)
 
     def _forget_way(self, now: OdometrySample) -> None:
-        """The way since the last fix was measured by a velocity that is wrong: nothing is known of it."""
+        """Treat the way since the last fix as unknown, because the velocity that measured it is wrong."""
         anchor = self._anchor
         if anchor is not None and anchor.sample is not None:
             unknown_s = now.time_s - anchor.sample.time_s
@@ -225,7 +225,7 @@ class Navigator:
         self._hypotheses.clear()
 
     def _sources(self, now: OdometrySample, prior: Prior | None, *, late: bool) -> Sources:
-        """What is known of the position, and where the matcher looks for it."""
+        """What is known about the position, and where the matcher searches."""
         given = None if prior is None else position_of(prior, self._matcher.site)
         sources = Sources(self._reckoned(now), given, self._pending_position(now))
         chosen, chosen_prior = self._searched(sources, now, late=late)
@@ -238,7 +238,7 @@ class Navigator:
     def _searched(
         self, sources: Sources, now: OdometrySample, *, late: bool
     ) -> tuple[PositionEstimate | None, Prior | None]:
-        """About which estimate of its own the matcher searches, and by which prior; None for the whole map."""
+        """The navigator's own estimate to search around, and the prior made from it; None for the whole map."""
         estimate, options = sources.own, self._options
         if self._lost or estimate is None:
             pending = sources.pending
@@ -254,22 +254,22 @@ class Navigator:
         return estimate, estimate.prior(growth, moved_m, map_m)
 
     def _is_turn(self, count: int) -> bool:
-        """Whether this one of the frames that know no better searches the whole map."""
+        """Whether this frame, of those without a useful prediction, searches the whole map."""
         return self._matcher.site.is_searchable and count % self._options.search_every == 0
 
     def _pending_position(self, now: OdometrySample) -> PositionEstimate | None:
-        """Dead reckoning from the strongest match that waits for others."""
+        """Dead reckoning from the strongest pending match."""
         pending = self._hypotheses.pending
         return None if pending is None else self._hypotheses.position(pending, now)
 
     def _ground_below(self, fix: Fix) -> float | None:
-        """Height of the ground below a fix that measured its height; None over ground that is taken for flat."""
+        """Height of the ground below a fix that measured its height; None if the ground is assumed flat."""
         site = self._matcher.site
         known = fix.up_m is not None and site.has_surface
         return float(site.ground_at(np.array(fix.map_xy_px))) if known else None
 
     def _with_height(self, frame: Frame) -> Frame:
-        """The frame with the last fix's height where it came without one."""
+        """The frame, with the last fix's height if it came without one."""
         fix = None if self._anchor is None or self._lost else self._anchor.fix
         if frame.height_agl_m is not None or fix is None or fix.up_m is None:
             return frame
@@ -280,17 +280,17 @@ class Navigator:
     # ---------------------------------------------------------------------------------------------- acceptance
 
     def _judge(self, fix: Fix, now: OdometrySample, sources: Sources, raw: Frame, *, late: bool) -> Fix | NoFix:
-        """The fix where the evidence for it is enough; else it is pending, and refused for now."""
+        """The fix if there is enough evidence for it; otherwise keep it pending and refuse it for now."""
         if not is_valid(fix):
             return fix.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
         if not late and self._velocity.note(fix, raw, now.time_s):
             self._forget_way(now)
             sources = replace(sources, own=self._reckoned(now), pending=None)
         required, against = self._options.min_log_odds, self._against(fix, now)
-        own, given = (self._vouching(source, fix, sources) for source in (sources.own, sources.given))
+        own, given = (self._evidence_of(source, fix, sources) for source in (sources.own, sources.given))
         disputed = given < 0.0
         if self._anchor is not None and self._anchor.disputed:
-            given = 0.0  # an error of the other source lasts: until it agrees again it counts neither way
+            given = 0.0  # an error of the other source lasts: ignore it until it agrees again
         others = match_log_odds(fix) + given
         if against is None and own + others >= required:
             self._accept(fix, now, 1, own + others, jump=False, disputed=disputed)
@@ -305,7 +305,7 @@ class Navigator:
     def _add_doubted(
         self, refusal: NoFix, now: OdometrySample, sources: Sources, height_m: float | None
     ) -> Fix | NoFix:
-        """The refusal, whose candidates speak for hypotheses; or the fix that these then make."""
+        """Add a refusal's candidates to the hypotheses; return the fix that one now yields, else the refusal."""
         candidates = [fix for fix in refusal.candidates if is_valid(fix)]
         matches = [Match(fix, match_log_odds(fix), doubted=True) for fix in candidates]
         map_m2 = self._map_m2(candidates[0]) if candidates else 0.0
@@ -313,7 +313,7 @@ class Navigator:
         return (None if found is None else self._decide(found, now, found.fix, disputed=False)) or refusal
 
     def _decide(self, found: Hypothesis | None, now: OdometrySample, fix: Fix, *, disputed: bool) -> Fix | None:
-        """The fix of a hypothesis that enough matches speak for."""
+        """The fix of a hypothesis that enough matches support."""
         if found is None or found.count < 2 or self._hypotheses.lead(found) < self._options.min_log_odds:
             return None
         against = self._against(fix, now)
@@ -324,10 +324,10 @@ class Navigator:
             return fix
         return replace(fix, confidence=probability(min(found.log_odds, log_odds(MAX_PROBABILITY))))
 
-    def _vouching(self, estimate: PositionEstimate | None, fix: Fix, sources: Sources) -> float:
+    def _evidence_of(self, estimate: PositionEstimate | None, fix: Fix, sources: Sources) -> float:
         """What an estimate adds to the log-odds of a match."""
         options = self._options
-        return sources.vouching(estimate, fix, self._map_m2(fix), options.gate, options.trusted_sigma_m)
+        return sources.evidence_of(estimate, fix, self._map_m2(fix), options.gate, options.trusted_sigma_m)
 
     def _map_m2(self, fix: Fix) -> float:  # area of the window
         return float(fix.window.area_px * self._matcher.site.gsd_m_per_px**2)
@@ -335,7 +335,7 @@ class Navigator:
     def _against(self, fix: Fix, now: OdometrySample) -> PositionEstimate | None:
         """A trusted prediction that a fix contradicts: from the last fix, or from one some seconds ago.
 
-        From frame to frame wrong matches may drift slowly enough; over seconds, measured velocities show it.
+        Wrong matches may drift too slowly to show from frame to frame; velocities over seconds reveal it.
         """
         predictions = [self._reckoned(now)]
         oldest = self._recent.oldest
@@ -348,23 +348,23 @@ class Navigator:
         return None
 
     def _dead_reckoning_outweighs(self, now: OdometrySample, against: int) -> bool:
-        """Whether dead reckoning counts more than so many fixes that agree with each other and not with it."""
+        """Whether dead reckoning outweighs this many fixes that agree with each other but not with it."""
         anchor = self._anchor
         if anchor is None or anchor.sample is None or now.blind_s > anchor.sample.blind_s:
-            return False  # it was not measured
+            return False  # the velocity was not measured
         return against <= anchor.support and now.time_s - anchor.sample.time_s <= self._options.hold_s
 
     def _accept(
         self, fix: Fix, now: OdometrySample, count: int, odds: float, *, jump: bool, disputed: bool
     ) -> None:
-        """Dead reckoning goes on from this fix, by the log-odds of all that speaks for it."""
+        """Continue dead reckoning from this fix, with the log-odds of all evidence for it."""
         last = self._anchor
         known = last is not None and last.fix is not None
         if known and last is not None and last.sample is not None and now.time_s < last.sample.time_s:
             return  # a late one
         jump = jump or self._lost
         self._resets += known and jump
-        if jump:  # what was learnt, was learnt where the vehicle was not
+        if jump:  # what was learnt came from a wrong position
             self._errors.forget()
         support = count if last is None or jump else last.support + count
         odds = min(odds, log_odds(MAX_PROBABILITY))
@@ -375,10 +375,10 @@ class Navigator:
         self._hypotheses.clear()
 
     def _refuse_match(self, fix: Fix, against: PositionEstimate | None, odds: float) -> NoFix:
-        """The refusal of a match that is not accepted."""
+        """The refusal of a match without enough evidence."""
         if against is not None:
             return replace(against.refusal(fix), candidates=(fix,))
-        asked = f"{self._options.min_confidence:g} is asked for"
+        asked = f"{self._options.min_confidence:g} is required"
         return fix.refused(Reason.UNCONFIRMED, f"right with a probability of {probability(odds):.4f}, {asked}")
 
     def _note_loss(self, now: OdometrySample) -> None:
@@ -386,7 +386,7 @@ class Navigator:
         anchor, options = self._anchor, self._options
         if anchor is None or self._fixed:
             return
-        if self._refusals == options.lost_after:  # a wrong bias, or one that is no more, would keep them refused
+        if self._refusals == options.lost_after:  # a wrong or outdated bias would keep them refused
             self._errors.forget()
         estimate = self._reckoned(now)
         far = estimate is not None and estimate.sigma_m > options.lost_sigma_m

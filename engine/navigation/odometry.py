@@ -1,8 +1,8 @@
-"""Visual odometry: how far the vehicle moved between two pictures of the ground, by points that both show.
+"""Visual odometry: motion between two images of the ground, from points that both show.
 
-Corners of the earlier picture are followed into the later one by pyramidal Lucas-Kanade, from where attitude and
-height let them be expected. Those that one homography explains give the camera's motion over level ground at the
-known height. What is left of the rotation is solved for with it, since a fraction of a degree looks like metres.
+Pyramidal Lucas-Kanade follows corners of the earlier picture into the later one, starting where attitude and
+height predict them. Those that fit one homography give the camera's motion over level ground at the known height.
+The remaining rotation is estimated jointly, since a fraction of a degree looks like metres.
 
 References:
     Lucas and Kanade, An iterative image registration technique, IJCAI 1981.
@@ -29,30 +29,30 @@ from engine.values import Attitude, Frame
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-_SMALL_PX = 160  # width at which a first shift is looked for
-_MAX_SIDE_PX = 640  # larger pictures are made smaller first
+_SMALL_PX = 160  # width at which a first shift is estimated
+_MAX_SIDE_PX = 640  # larger pictures are reduced first
 _LEVELS, _WINDOW_PX = 3, 15  # of Lucas-Kanade
-_APART_PX, _QUALITY = 8, 0.01  # between corners; of the weakest, by the strongest
+_APART_PX, _QUALITY = 8, 0.01  # distance between corners; weakest over strongest
 _RANSAC_PX, _RANSAC_CONFIDENCE = 1.5, 0.999
-_MAX_OFF_DEG = 70.0  # from the vertical, up to which a point lies on the ground
-_STEPS, _CONVERGED = 6, 1e-6  # of Gauss-Newton at most; the last one's length, as a share of the height
-_LEAST_PX = 0.05  # of a point's error
+_MAX_OFF_DEG = 70.0  # largest angle off the vertical of a point on the ground
+_STEPS, _CONVERGED = 6, 1e-6  # most Gauss-Newton steps; length of the last, as a share of the height
+_MIN_PX = 0.05  # of a point's error
 _HUBER_SIGMAS = 2.0
-_MAX_POINTS, _MIN_POINTS = 200, 20  # followed from picture to picture; that must agree on one motion
-_MIN_SHARE = 0.5  # of those that were followed, which must agree
-_MIN_SPREAD = 0.12  # of those, as a share of the picture's sides: what is fixed to the camera often fills a corner
-_MAX_SIGMA_MPS = 2.0  # a velocity that is less certain is refused
+_MAX_POINTS, _MIN_POINTS = 200, 20  # followed between pictures; needed to agree on one motion
+_MIN_SHARE = 0.5  # of the followed points that must agree
+_MIN_SPREAD = 0.12  # of those, as a share of the picture's sides: parts of the vehicle often fill a corner
+_MAX_SIGMA_MPS = 2.0  # a less certain velocity is refused
 _MAX_INTERVAL_S = 3.0  # between two pictures
 _TILT_CHANGE_SIGMA_DEG, _HEADING_CHANGE_SIGMA_DEG = 1.0, 2.0  # between two pictures
-_RELIEF_SHARE = 0.01  # by which the ground that is followed lies above or below the one that the height is over
-_POINTS_PER_ERROR = 3.0  # followed points whose errors are one and the same
-_ERROR_MEMORY_S = 1.0  # how long an error stays the same, since the same ground is followed
-_LEVEL_DEG = 0.02  # where roll and pitch are unknown their change is not solved for: see docs/odometry.md
+_RELIEF_SHARE = 0.01  # height difference between the followed ground and that below the vehicle
+_POINTS_PER_ERROR = 3.0  # followed points that share one error
+_ERROR_MEMORY_S = 1.0  # how long an error persists, since the same ground is followed
+_LEVEL_DEG = 0.02  # if roll and pitch are unknown their change is not estimated: see docs/odometry.md
 
 
 @dataclass(frozen=True, slots=True)
 class NoMotion:
-    """Two pictures gave no motion; why, in a few words."""
+    """Why two pictures gave no motion, in a few words."""
 
     reason: str
 
@@ -67,29 +67,29 @@ class VisualOdometry:
     """Follows the ground from picture to picture.
 
     Args:
-        camera: that took them, its lens included.
+        camera: the camera, including its lens.
     """
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
         self._last: _Picture | None = None
-        self._velocity_mps: Array | None = None  # (3,) that is expected of the next step
+        self._velocity_mps: Array | None = None  # (3,) expected in the next step
 
     def update(self, frame: Frame) -> GroundMotion | NoMotion:
         """How far the vehicle moved since the last frame.
 
         Args:
-            frame: the newest, with stamp, heading and height; roll and pitch where they are known. One that comes
-                with a velocity is kept for the next and not followed.
+            frame: the newest, with timestamp, heading and height; roll and pitch if known. A frame with a velocity
+                is only kept for the next one.
 
         Returns:
-            GroundMotion | NoMotion: the latter where pictures or telemetry do not support a motion.
+            GroundMotion | NoMotion: the latter if pictures or telemetry do not support a motion.
 
         Raises:
             CalibrationError: the frame is not of the camera's resolution.
         """
         self._camera.check_size(frame.image.shape)
-        gray = to_gray(frame).copy()  # a buffer may be filled again
+        gray = to_gray(frame).copy()  # the buffer may be reused
         last, self._last = self._last, _Picture(frame, gray)
         if frame.east_velocity_mps is not None and frame.north_velocity_mps is not None:
             motion: GroundMotion | NoMotion = NoMotion("the velocity is known")
@@ -104,7 +104,7 @@ class VisualOdometry:
         """The motion from one picture to the next."""
         earlier, later = last.frame, now.frame
         if earlier.timestamp_ns is None or later.timestamp_ns is None:
-            return NoMotion("a frame has no stamp")
+            return NoMotion("a frame has no timestamp")
         interval_s = (later.timestamp_ns - earlier.timestamp_ns) * 1e-9
         if not 0.0 < interval_s <= _MAX_INTERVAL_S:
             return NoMotion(f"the pictures are {interval_s:.1f} s apart")
@@ -112,10 +112,8 @@ class VisualOdometry:
         if height_m is None or begin is None or end is None:
             return NoMotion("height or heading is unknown")
         if np.array_equal(last.gray, now.gray):
-            self._last = (
-                None  # it was not taken when its stamp says, so that the next way would be of another time
-            )
-            return NoMotion("the picture is the last one again")
+            self._last = None  # its timestamp is wrong, so the next interval would be too
+            return NoMotion("the picture repeats the last one")
         view = _View(self._camera, begin, end, height_m)
         moved_m = np.zeros(3) if self._velocity_mps is None else self._velocity_mps * interval_s
         moved_m[2] = (later.height_agl_m or height_m) - height_m
@@ -129,7 +127,7 @@ class VisualOdometry:
         known = None not in (earlier.roll_deg, earlier.pitch_deg, later.roll_deg, later.pitch_deg)
         solved = view.solve(*agreed, moved_m, has_tilt=known)
         if solved is None:
-            return NoMotion("the ground is seen too obliquely, or shows no one motion")
+            return NoMotion("the ground is seen too obliquely, or shows no single motion")
         return self._judged(earlier, interval_s, *solved, len(agreed[0]))
 
     def _judged(
@@ -146,7 +144,7 @@ class VisualOdometry:
         return GroundMotion(interval_s, moved_m, noise_m2, lasting, drift, points)
 
     def _agreed(self, begin_px: Array, end_px: Array) -> tuple[Array, Array] | NoMotion:
-        """Those of the points that one homography explains, as places (N, 2) one ahead of the lens."""
+        """The points that fit one homography, as normalised image coordinates (N, 2)."""
         camera = self._camera
         if len(begin_px) < _MIN_POINTS:
             return NoMotion(f"{len(begin_px)} points could be followed, {_MIN_POINTS} are needed")
@@ -178,10 +176,10 @@ class VisualOdometry:
 
 
 def odometry_of(matcher: object) -> VisualOdometry:
-    """Odometry by the camera of a matcher.
+    """Odometry with a matcher's camera.
 
     Raises:
-        OptionError: it has none.
+        OptionError: the matcher has no camera.
     """
     camera = getattr(matcher, "camera", None)
     if not isinstance(camera, Camera):
@@ -195,8 +193,8 @@ def track_corners(earlier: Gray, later: Gray, expected: Array) -> tuple[Array, A
     Args:
         earlier: (H, W) uint8.
         later: the same.
-        expected: (3, 3) homography from pixels of the earlier to those of the later; what it explains need not be
-            found, so that a turn or a long way costs nothing.
+        expected: (3, 3) homography from pixels of the earlier to those of the later; only the motion beyond it is
+            searched for, so a turn or a long way costs nothing.
 
     Returns:
         Two (N, 2) lists of pixels.
@@ -230,7 +228,7 @@ def _shifted(earlier: Gray, later: Gray, expected: Array) -> Array:
 
 
 class _View:
-    """Two pictures of level ground: what becomes of it between them, by the motion of the camera."""
+    """Two pictures of level ground: how it moves between them as the camera moves."""
 
     def __init__(self, camera: Camera, begin: Attitude, end: Attitude, height_m: float) -> None:
         self._camera, self._height_m = camera, height_m
@@ -244,10 +242,10 @@ class _View:
         return np.asarray(matrix @ turned @ np.linalg.inv(matrix))
 
     def solve(self, begin: Array, end: Array, moved_m: Array, *, has_tilt: bool) -> tuple[Array, Array] | None:
-        """The motion by places (N, 2) one ahead of the lens, before and after, from a first guess (3,) of it.
+        """The motion from normalised image coordinates (N, 2) before and after, and a first guess (3,) of it.
 
         Returns:
-            (2,) metres east and north, and their covariance (2, 2); None where it cannot be solved for.
+            (2,) metres east and north, and their covariance (2, 2); None if it cannot be solved for.
         """
         rays = np.column_stack([begin, np.ones(len(begin))]) @ self._begin.T
         steep = -rays[:, 2] / np.linalg.norm(rays, axis=1)
@@ -263,7 +261,7 @@ class _View:
             if seen is None:
                 return None
             off = end - seen
-            weights = _weights(np.hypot(*off.T), _LEAST_PX / self._camera.focal_px) / _POINTS_PER_ERROR
+            weights = _weights(np.hypot(*off.T), _MIN_PX / self._camera.focal_px) / _POINTS_PER_ERROR
             weighted = (by_state * weights[:, None, None]).reshape(-1, 6).T
             try:
                 covariance = np.linalg.inv(weighted @ by_state.reshape(-1, 6) + prior)
@@ -292,6 +290,6 @@ class _View:
 
 
 def _weights(off: Array, least: float) -> Array:
-    """Precision of each point by its distance (N,) to what is expected (Huber), from ``least`` up."""
+    """Weight of each point by its distance (N,) from the expected place (Huber); sigma is at least ``least``."""
     sigma = max(float(np.median(off)) / math.sqrt(2.0 * math.log(2.0)), least)  # the median of Rayleigh's law
     return np.minimum(1.0, _HUBER_SIGMAS * sigma / np.maximum(off, 1e-12)) / sigma**2

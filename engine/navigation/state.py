@@ -1,13 +1,13 @@
-"""How much a navigator knows of where the vehicle is."""
+"""How well a navigator knows the vehicle's position."""
 
 import enum
 
 
 class NavigatorState(enum.Enum):
-    """How much a navigator knows.
+    """How well a navigator knows the position.
 
-    ``SEARCHING`` before the first fix, ``TRACKING`` where the newest frame gave a fix, ``COASTING`` on dead
-    reckoning since the last one, ``LOST`` where that leads nowhere any more.
+    ``SEARCHING`` before the first fix, ``TRACKING`` if the newest frame gave a fix, ``COASTING`` on dead reckoning
+    since the last fix, ``LOST`` when dead reckoning has become useless.
     """
 
     SEARCHING = "searching"

@@ -10,26 +10,26 @@ from engine.navigation.attitude_lag import AttitudeLag
 from engine.options import NavigatorOptions
 from engine.values import Fix, Frame
 
-# Standard deviations of a height against the telemetry's: by refinement or features, as a share of it.
+# Standard deviations of a measured height, by refinement or features, as a share of the telemetry's.
 _HEIGHT_SHARE, _HEIGHT_M = 0.01, 1.0
-_FIRST_SHARE = 0.2  # of the height, by which it may be off while no picture measured it
-_LEAST_SHARE, _LEAST_SIGMAS, _LEAST_FIXES = 0.03, 3.0, 3  # of an error of the height that is taken off
-_FIRST_SEARCH, _SEARCH_GROWTH = 3, 1.5  # refusals in a row before heading and height are searched for, and again
-_SEARCHED_HEADING_DEG = 12.0  # standard deviation of a heading that was searched for
-_WALK_SHARE = 1e-3  # of the height, by which its error changes in a second
+_FIRST_SHARE = 0.2  # error of the height before a picture measured it, as a share
+_MIN_SHARE, _MIN_SIGMAS, _MIN_FIXES = 0.03, 3.0, 3  # of a height error before it is corrected
+_FIRST_SEARCH, _SEARCH_GROWTH = 3, 1.5  # refusals in a row before a search; growth until the next
+_SEARCHED_HEADING_DEG = 12.0  # standard deviation of a searched heading
+_WALK_SHARE = 1e-3  # change of the height's error in one second, as a share
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What is to be added to a telemetry that is off, as far as fixes measured it; None where they did not.
+    """Corrections to add to the telemetry, as far as fixes measured them; None if they did not.
 
     Attributes:
-        attitude: of roll, pitch and heading. A mount that is off and a principal point look the same.
+        attitude: of roll, pitch and heading. A mount error and a principal point error look the same.
         attitude_lag_s: how late the attitude is.
-        attitude_lag_sigma_s: standard deviation of that.
-        height_m: to be added to the height above ground. A focal length that is too short by a share makes heights
-            too low by it: ``height_factor``.
-        height_factor: of a measured height to the telemetry's.
+        attitude_lag_sigma_s: standard deviation of the lag.
+        height_m: to be added to the height above ground. If the focal length is too short by some share, heights
+            are too low by that share: ``height_factor``.
+        height_factor: ratio of the measured height to the telemetry's.
         height_sigma_m: standard deviation of ``height_m``.
     """
 
@@ -42,10 +42,10 @@ class Calibration:
 
 
 class TelemetryErrors:
-    """Learns what a vehicle's telemetry is off by, and takes it off.
+    """Learns errors of the vehicle's telemetry and corrects them.
 
     Args:
-        options: of the navigator; how far off attitudes may be.
+        options: of the navigator; they state how far off attitudes may be.
     """
 
     def __init__(self, options: NavigatorOptions) -> None:
@@ -56,8 +56,8 @@ class TelemetryErrors:
         self._off_m = self._variance_m2 = 0.0
         self._time_s: float | None = None
         self._heights = 0
-        self._next_search = _FIRST_SEARCH  # refusals in a row at which heading and height are searched for
-        self._settling = 0  # fixes that are missing until what a search found is taken off
+        self._next_search = _FIRST_SEARCH  # refusals in a row at which heading and height are searched
+        self._settling = 0  # further fixes needed before a search's result is applied
         self._searched = False  # whether the newest frame is the first of a search
 
     @property
@@ -72,16 +72,16 @@ class TelemetryErrors:
         )  # fmt: skip
 
     def corrected(self, frame: Frame, time_s: float, *, late: bool, refusals: int = 0) -> Frame:
-        """The frame with the attitude at its capture and the height that pictures showed.
+        """The frame with the attitude at its capture and the height that pictures measured.
 
-        Where frames are refused, heading and height may be off by more than a match bears: then both are searched
-        for, ever more rarely as that does not help, and after a fix until enough of them settled what they are.
+        If frames are refused, heading and height may be off by more than a match tolerates. Then both are
+        searched, less often each time that fails, and after a fix until enough fixes have confirmed them.
 
         Args:
             frame: the newest, or a late one.
-            time_s: of the newest on any one clock.
-            late: whether it is one.
-            refusals: in a row before it.
+            time_s: time of the newest frame on any one clock.
+            late: whether the frame is a late one.
+            refusals: number of refusals in a row before it.
         """
         if late:
             return self._at_its_height(self._bias.corrected(frame))
@@ -97,7 +97,7 @@ class TelemetryErrors:
             return shown
         self._searched = refusals >= self._next_search
         if self._searched:
-            self._next_search, self._settling = math.ceil(_SEARCH_GROWTH * refusals), _LEAST_FIXES
+            self._next_search, self._settling = math.ceil(_SEARCH_GROWTH * refusals), _MIN_FIXES
         elif refusals:
             self._settling = 0
         else:
@@ -105,14 +105,14 @@ class TelemetryErrors:
         return replace(shown, is_doubted=True) if self._settling else shown
 
     def without_errors(self, frame: Frame) -> Frame:
-        """The newest frame without what is known of its attitude's bias and height, before :meth:`corrected`."""
+        """The newest frame with the known bias of attitude and height removed; call before :meth:`corrected`."""
         return self._at_its_height(self._bias.corrected(frame))
 
     def _at_its_height(self, frame: Frame) -> Frame:
-        """The frame at the height that pictures showed, where that differs by more than a match bears."""
-        if frame.height_agl_m is None or self._heights < _LEAST_FIXES:
+        """The frame at the height that pictures measured, if it differs by more than a match tolerates."""
+        if frame.height_agl_m is None or self._heights < _MIN_FIXES:
             return frame
-        least_m = max(_LEAST_SHARE * frame.height_agl_m, _LEAST_SIGMAS * math.sqrt(self._variance_m2))
+        least_m = max(_MIN_SHARE * frame.height_agl_m, _MIN_SIGMAS * math.sqrt(self._variance_m2))
         height_m = frame.height_agl_m + self._off_m
         if abs(self._off_m) < least_m or height_m <= 0.0:
             return frame
@@ -122,12 +122,12 @@ class TelemetryErrors:
         """Learn from an accepted fix of the newest frame.
 
         Args:
-            fix: that was accepted.
-            ground_m: height of the ground below it; None over ground that is taken for flat, where a slope passes
-                for a tilt.
+            fix: an accepted fix.
+            ground_m: height of the ground below it; None if the ground is assumed flat, where a slope looks like a
+                tilt.
         """
         self._settling = max(self._settling - 1, 0)
-        if self._searched:  # what was known before it did not hold
+        if self._searched:  # earlier estimates were wrong
             self._searched, self._heights = False, 0
             self._bias.doubt(_SEARCHED_HEADING_DEG)
         self._lag.note(fix, self._bias.bias)
@@ -138,7 +138,7 @@ class TelemetryErrors:
             self._note_height(fix.up_m - ground_m - self._height_m, self._height_m)
 
     def forget(self) -> None:
-        """What was learnt, was learnt where the vehicle was not, or holds no more."""
+        """Forget what was learnt: it came from a wrong position, or no longer holds."""
         self._bias = self._unknown_bias()
         self._heights, self._off_m, self._variance_m2 = 0, 0.0, 0.0
 

@@ -1,7 +1,7 @@
-"""What an autopilot may be sent: fixes that continue the track so far, or that somebody else vouches for.
+"""Decides what may be sent to an autopilot: fixes that continue the track or that another source confirms.
 
-An estimator that has long had no fix takes the next one for a new alignment, however far away it is. A navigator
-gives in to matches that agree with each other for long enough. Together they would follow a map that is shifted.
+An estimator that has long had no fix realigns to the next one, however far away it is. A navigator accepts matches
+that agree with each other for long enough. Together they would follow a shifted map.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason
 
 TOLERANCE_M = 5.0
-"""Contradictions that are smaller are left to the estimator's own gate."""
-_IN_A_ROW = 3  # matches that contradict the track before it is in dispute, and that agree before it is not
-_MAX_GAP_S = 1.0  # between frames over which a stated velocity is integrated
+"""Smaller contradictions are left to the estimator's own gate."""
+_IN_A_ROW = 3  # matches that contradict the track to start a dispute, or agree with it to end one
+_MAX_GAP_S = 1.0  # longest gap between frames to integrate a stated velocity over
 
 
 @dataclass(frozen=True, slots=True)
 class _Track:
-    """A Kalman filter of matches: where they lead by the stated velocity, and by how much that is wrong.
+    """A Kalman filter of matches: estimates the position and the error of the stated velocity.
 
     Attributes:
         en_m: (2,) position at the newest frame.
-        off_mps: (2,) velocity less the stated one.
+        off_mps: (2,) true velocity minus the stated one.
         covariance: (2, 2) of position and velocity error along each axis.
-        last: the last match alone, carried on as the position is: a filter lags behind a velocity that changes.
-        matches: that it is made of.
-        silent_s: since the last of them.
+        last: the last match alone, propagated like the position: a filter lags behind a changing velocity.
+        matches: number of matches in it.
+        silent_s: time since the last of them.
     """
 
     en_m: Array
@@ -47,11 +47,11 @@ class _Track:
 
     @property
     def found_mps(self) -> float:
-        """By how much the stated velocity was found wrong along each axis, beyond what matches know of it."""
+        """Error of the stated velocity found along each axis, beyond its uncertainty."""
         return math.sqrt(max(0.5 * float(self.off_mps @ self.off_mps) - self.covariance[1, 1], 0.0))
 
     def carried(self, stated_mps: Array, sigma_mps: float, elapsed_s: float) -> _Track:
-        """The track at a later frame; a velocity's error is never known better than to ``sigma_mps``."""
+        """The track at a later frame; the velocity error stays uncertain by at least ``sigma_mps``."""
         step, covariance = np.array([[1.0, elapsed_s], [0.0, 1.0]]), self.covariance.copy()
         covariance[1, 1] = max(covariance[1, 1], sigma_mps**2)
         moved_m = (stated_mps + self.off_mps) * elapsed_s
@@ -64,7 +64,7 @@ class _Track:
         )
 
     def continued(self, fix: Fix) -> _Track:
-        """The track with one more match; a position that is not the map's gives way to it."""
+        """The track with one more match, which replaces a position from another source than the map."""
         apart_m, variance_m2 = en_m(fix) - self.en_m, fix.relative_sigma_m**2
         gain, covariance = np.array([1.0, 0.0]), np.diag([variance_m2, self.covariance[1, 1]])
         if self.last.on_map:
@@ -85,8 +85,8 @@ class _Rival:
 
     Attributes:
         track: of these matches.
-        first: of them.
-        parted: the track that it contradicted, at its frame.
+        first: the first of them.
+        parted: the track that the first match contradicted, at its frame.
     """
 
     track: _Track
@@ -95,7 +95,7 @@ class _Rival:
 
     @property
     def meeting(self) -> PositionEstimate:
-        """Where the first match is expected if the velocity's error became that of these matches meanwhile."""
+        """Where the first match is expected if the velocity error changed to that of these matches."""
         parted, last = self.parted, self.parted.last
         changed_m = 0.5 * (self.track.off_mps - parted.off_mps) * parted.silent_s
         sigma_m = math.hypot(parted.estimate.sigma_m, last.sigma_m, *changed_m)
@@ -103,23 +103,23 @@ class _Rival:
 
 
 class TrackGuard:
-    """Follows what the autopilot was sent, and matches that contradict it.
+    """Tracks the fixes sent to the autopilot and the matches that contradict them.
 
-    The track is the fixes that were sent, carried on by the velocity that the vehicle states. The error of that
-    velocity is estimated with it: by as much as the fixes found it wrong, it may be wrong from then on. A match
-    contradicts the track where it is further away than both their uncertainties explain, and more than 5 m. Three
-    in a row that continue each other, its rival, put it in dispute. While it is, no match is trusted that
-    continues the rival, however vague the track becomes meanwhile. It ends
+    The track consists of the fixes that were sent, propagated by the velocity that the vehicle states. It also
+    estimates the error of that velocity, and assumes errors of the same size from then on. A match contradicts the
+    track if it is further away than their uncertainties explain, and more than 5 m. Three such matches in a row
+    that continue each other form a rival and start a dispute. During a dispute no match that continues the rival
+    is trusted, however vague the track becomes. A dispute ends
 
-    - by three matches in a row that agree with a track still known to 50 m;
-    - by a rival whose own way proves the stated velocity wrong, if by its velocity it began where the track had
-      ended: as after an outage, while a map that shifts jumps;
-    - by a rival that agrees with what was known before, where the track since then is fewer than three fixes;
-    - by :meth:`confirm`.
+    - with three matches in a row that agree with a track still known to 50 m;
+    - with a rival whose own motion proves the stated velocity wrong, if that motion leads back to the end of the
+      track: this happens after an outage, whereas a shifted map causes a jump;
+    - with a rival that agrees with the earlier track, if there have been fewer than three fixes since;
+    - with :meth:`confirm`.
 
     Args:
-        start: where the flight begins; None where that is not known.
-        options: those of the navigator, whose drift and gates count here, too.
+        start: where the flight begins; None if unknown.
+        options: those of the navigator; its drift and gates also apply here.
     """
 
     def __init__(self, start: PositionEstimate | None = None, options: NavigatorOptions | None = None) -> None:
@@ -128,15 +128,15 @@ class TrackGuard:
         self._stated_mps = np.zeros(2)  # the newest one
         self._sigma_mps = self._unknown_mps
         self._track = None if start is None else _begun(start)
-        self._before = self._track  # when its position was last vague, carried on without the fixes since
+        self._before = self._track  # as last vague, propagated without the fixes since
         self._rival: _Rival | None = None
         self._agreements = 0
         self._distance_m = 0.0
-        self.has_fix = False  # whether the autopilot was sent one
+        self.has_fix = False  # whether one was sent to the autopilot
 
     @property
     def is_disputed(self) -> bool:
-        """Whether matches contradict the track, so that nobody knows which of the two is right."""
+        """Whether matches contradict the track, so that it is unknown which of the two is right."""
         return self._rival is not None and self._rival.track.matches >= _IN_A_ROW
 
     @property
@@ -145,17 +145,17 @@ class TrackGuard:
         return self._distance_m
 
     def confirm(self) -> None:
-        """Take the next fix for the track, wherever it is: an operator has vouched for it."""
+        """Continue the track at the next fix, wherever it is: an operator has confirmed it."""
         self._track = self._before = self._rival = None
         self._agreements = 0
 
     def anchor(self, position: PositionEstimate) -> None:
-        """Take another source's position at the newest frame for the track, until a first fix is sent."""
+        """Start the track at another source's position at the newest frame, until a first fix is sent."""
         if not self.has_fix:
             self._track = self._before = _begun(position)
 
     def advance(self, frame: Frame, time_ns: int) -> None:
-        """Carry track and rival on to the time of a frame, by the velocity that came with it."""
+        """Propagate track and rival to the time of a frame by the velocity that came with it."""
         elapsed_s = 0.0 if self._newest_ns is None else (time_ns - self._newest_ns) * 1e-9
         if elapsed_s < 0.0:
             return
@@ -178,7 +178,7 @@ class TrackGuard:
             self._rival = replace(self._rival, track=track)
 
     def trusts(self, result: Fix | NoFix) -> bool:
-        """Whether a fix may be sent; refused matches count for and against the track, too."""
+        """Whether a fix may be sent; refused matches also count for and against the track."""
         fix = _match(result)
         if fix is None:
             return False
@@ -210,11 +210,11 @@ class TrackGuard:
 
     @property
     def _unknown_mps(self) -> float:
-        """Of each axis of a velocity of which nothing is known."""
+        """Standard deviation per axis of an unknown velocity."""
         return 0.5 * self._options.max_speed_mps
 
     def _is_right(self, rival: _Rival, track: _Track, fix: Fix) -> bool:
-        """Whether the evidence is for a rival: the track is a fix or two, or the stated velocity misled it."""
+        """Whether the evidence favours a rival: the track has a fix or two, or the stated velocity misled it."""
         if track.matches < _IN_A_ROW:
             return self._before is None or not self._contradicts(self._before.estimate, fix)
         off_mps = rival.track.off_mps
@@ -223,7 +223,7 @@ class TrackGuard:
         return is_velocity_wrong and not self._contradicts(rival.meeting, rival.first)
 
     def _contradicts(self, estimate: PositionEstimate, fix: Fix) -> bool:
-        """Whether a fix is further from a position than the uncertainties explain, and than is tolerated."""
+        """Whether a fix is further from a position than the uncertainties and the tolerance allow."""
         is_far = float(np.hypot(*(en_m(fix) - estimate.en_m))) > TOLERANCE_M
         return is_far and estimate.chi_square(fix) > self._options.gate
 
@@ -233,7 +233,7 @@ def _begun(position: PositionEstimate, velocity_sigma_mps: float = 0.0) -> _Trac
 
 
 def _match(result: Fix | NoFix) -> Fix | None:
-    """The match of a frame, also of one that was refused for contradicting the navigator's own track."""
+    """The match of a frame, including one refused for contradicting the navigator's own track."""
     if isinstance(result, Fix):
         return result
     return next(iter(result.candidates), None) if result.reason is Reason.INCONSISTENT else None

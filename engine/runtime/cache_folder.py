@@ -1,4 +1,4 @@
-"""Where what one run leaves for the next is kept."""
+"""The folder that keeps files from one run for the next."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from pathlib import Path
 
 
 def cache_folder() -> Path:
-    """``$XDG_CACHE_HOME/scenematch``, else ``~/.cache/scenematch``; it need not be there."""
+    """``$XDG_CACHE_HOME/scenematch``, else ``~/.cache/scenematch``; it may not exist yet."""
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     return Path(folder) / "scenematch"

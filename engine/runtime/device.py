@@ -1,4 +1,4 @@
-"""Where pictures are worked on: NumPy arrays on the CPU, and on a GPU tensors, for which torch is loaded."""
+"""Devices: images are NumPy arrays on the CPU and torch tensors on a GPU; only a GPU loads torch."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 AnyArray = NDArray[Any]
 Picture: TypeAlias = Any
-"""An array on the CPU, a tensor on a GPU; what both have, such as slices and shapes, is written once."""
+"""An array on the CPU, a tensor on a GPU; code for what both support, such as slices, is shared."""
 
 _NAME = re.compile(r"(cpu|cuda)(:[0-9]+)?")
 
@@ -42,7 +42,7 @@ def resolve(device: str | torch.device = "auto") -> Device:
     """The device of a name, if it is available.
 
     Args:
-        device: "cpu", "cuda", "cuda:N", a torch.device, or "auto" (CUDA where there is one, else the CPU).
+        device: "cpu", "cuda", "cuda:N", a torch.device, or "auto" (CUDA if available, else the CPU).
 
     Raises:
         DeviceError: the device was requested by name and is missing; only "auto" falls back.
@@ -54,14 +54,12 @@ def resolve(device: str | torch.device = "auto") -> Device:
     if match is None:
         raise OptionError(f"device: expected cpu, cuda or auto, got {device!r}")
     if match[1] == "cuda" and int((match[2] or ":0")[1:]) >= _cuda_devices():
-        raise DeviceError(
-            f"device: {device} was asked for, but this machine offers {_cuda_devices()} CUDA devices"
-        )
+        raise DeviceError(f"device: {device} was requested, but this machine has {_cuda_devices()} CUDA devices")
     return Device(match[0])
 
 
 def _cuda_devices() -> int:
-    """How many devices torch has; it is not loaded to say that there are none."""
+    """Number of torch's devices; 0 without loading torch if there is no driver."""
     if not _may_have_cuda():
         return 0
     from engine.runtime.tensors import torch
@@ -71,7 +69,7 @@ def _cuda_devices() -> int:
 
 @cache
 def _may_have_cuda() -> bool:
-    """Whether there is a driver of CUDA or ROCm; without one torch need not be asked."""
+    """Whether there is a CUDA or ROCm driver; without one torch need not be loaded."""
     try:
         ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
@@ -88,11 +86,11 @@ def synchronise(device: Device | torch.device) -> None:
 
 
 def placed(array: AnyArray, device: Device | torch.device) -> Picture:
-    """An array where it is worked on.
+    """An array on the device.
 
     Args:
         array: of any shape.
-        device: where.
+        device: the device.
 
     Returns:
         The array itself on the CPU, elsewhere a tensor of its shape and type.
@@ -111,7 +109,7 @@ def on_host(picture: Picture) -> AnyArray:
         picture: of any shape.
 
     Returns:
-        Itself, or what is copied from its device.
+        The picture itself, or a copy from its device.
     """
     return picture if isinstance(picture, np.ndarray) else np.asarray(picture.cpu())
 
@@ -129,14 +127,14 @@ def as_float(picture: Picture, name: str) -> Picture:
 
 
 def plain(*pictures: Picture) -> list[Picture]:
-    """The arrays of tensors on the CPU, in the same memory; those of a GPU, or with gradients, as they are."""
+    """CPU tensors as arrays in the same memory; tensors on a GPU or with gradients unchanged."""
     if any(not isinstance(v, np.ndarray) and (v.device.type != "cpu" or v.requires_grad) for v in pictures):
         return list(pictures)
     return [v if isinstance(v, np.ndarray) else v.numpy() for v in pictures]
 
 
 def as_tensor(picture: Picture) -> Picture:
-    """A tensor as it is, and an array as one, in the same memory."""
+    """A tensor unchanged; an array as a tensor in the same memory."""
     if not isinstance(picture, np.ndarray):
         return picture
     from engine.runtime.tensors import torch
@@ -145,7 +143,7 @@ def as_tensor(picture: Picture) -> Picture:
 
 
 def like(given: Picture, found: Picture) -> Picture:
-    """What was found as an array or a tensor, as what was given is."""
+    """The result as an array or a tensor, whichever the input was."""
     if isinstance(given, np.ndarray):
         return found if isinstance(found, np.ndarray) else found.numpy()
     return as_tensor(found)

@@ -16,14 +16,14 @@ from engine.runtime import workers
 
 _FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}  # not "nnan": a flat picture divides by zero
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": _FAST, "no_cfunc_wrapper": True}
-_signatures: list[tuple[Any, str]] = []  # of the loops that Python calls
+_signatures: list[tuple[Any, str]] = []  # of loops called from Python
 
 
 def compiled(*signatures: str):
     """Compile a loop by :func:`prepare`, else at its first call; cached on disk if a folder for it is writable.
 
     Args:
-        signatures: of the arguments that it is called with; none for one that only other loops call.
+        signatures: types of the arguments; none for a loop that only other loops call.
     """
 
     def decorate(function):
@@ -38,26 +38,26 @@ def compiled(*signatures: str):
 
 
 def inlined(function):
-    """Make a function part of the loops that call it, within which it takes less time to compile than alone."""
+    """Inline a function into the loops that call it: this compiles faster than a separate loop."""
     return njit(inline="always", **_OPTIONS)(function)
 
 
 def prepare(modules: Iterable[str], report: Callable[[int, int], None] = lambda done, total: None) -> None:
     """Compile the loops of modules of :mod:`engine.kernels`, or load them from the cache.
 
-    Where something is to be compiled, a second process begins at the other end, until both meet: what it compiled,
-    this one loads.
+    If something must be compiled, a second process starts at the other end until both meet; this process then
+    loads what the other compiled.
 
     Args:
         modules: of :mod:`engine.kernels`, by name.
-        report: takes how many loops are done, and of how many.
+        report: called with the number of finished loops and the total.
     """
     names = [import_module(f"engine.kernels.{module}").__name__ for module in modules]
     written = [entry for name in names for entry in _signatures if entry[0].__module__ == name]
-    # As a first call has them: the cache tells a text from the types that it stands for.
+    # Types as in a first call: the cache distinguishes a text from the types that it denotes.
     loops = [(loop, normalize_signature(text)[0]) for loop, text in written]  # type: ignore[no-untyped-call]
     helper, is_collecting = None, gc.isenabled()
-    gc.disable()  # of what a compiler allocates little is garbage before it is done
+    gc.disable()  # little of a compiler's memory is garbage before it is done
     try:
         for number, (loop, signature) in enumerate(loops, 1):
             loop.compile(signature)
@@ -78,7 +78,7 @@ def _compile(loops: list[tuple[Any, Any]]) -> None:
 
 
 class _Watch(event.Listener):
-    """Counts what is compiled or loaded."""
+    """Counts compiled and loaded loops."""
 
     count = 0
 

@@ -1,4 +1,4 @@
-"""Public names of a package that are imported when they are used: torch alone takes seconds."""
+"""Import the public names of a package on first use: torch alone takes seconds."""
 
 from __future__ import annotations
 

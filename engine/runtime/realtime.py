@@ -1,8 +1,8 @@
-"""Real-time scheduling on Linux of the threads that match frames, so that other work does not make them late.
+"""Real-time scheduling on Linux for matching threads, so that other work does not delay them.
 
 Convention:
-    Threads and processes that such a thread starts are scheduled as usual: a camera's command or a simulator does
-    not get in the way of the frames.
+    Threads and processes started by such a thread are scheduled normally, so that a camera command or a simulator
+    does not delay frames.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _log = logging.getLogger("scenematch")
 _MLOCK_CURRENT, _MLOCK_FUTURE, _MLOCK_ON_FAULT = 1, 2, 4  # of mlockall(2); the last: only pages that are used
 _CAP_IPC_LOCK = 14
 _KERNEL = Path("/proc/sys/kernel")
-_MAX_LOAD = 0.9  # of a core: above it the kernel's limit for real-time threads is near
+_MAX_LOAD = 0.9  # load of a core above which the kernel's limit for real-time threads is near
 _LOAD_OVER_S = 2.0
 _FIFO_CURE = "CAP_SYS_NICE, `ulimit -r 20`, or in a unit of systemd LimitRTPRIO=20"
 _NICE_CURE = "CAP_SYS_NICE, `ulimit -e 40`, or in a unit of systemd LimitNICE=40"
@@ -32,14 +32,14 @@ _MEMORY_CURE = "CAP_IPC_LOCK, `ulimit -l unlimited`, or in a unit of systemd Lim
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Realtime:
-    """How threads that match frames are scheduled.
+    """Scheduling of the threads that match frames.
 
     Attributes:
-        priority: of SCHED_FIFO, 1 to 98: such a thread runs before all that are scheduled as usual. The watchdog
-            of :class:`engine.Live` has one more.
-        nice: -20 to -1, a greater share of the processor in place of SCHED_FIFO; None takes SCHED_FIFO.
-        cores: that the threads run on; () leaves them those of the process.
-        lock_memory: whether the pages that the process has used are kept in memory.
+        priority: of SCHED_FIFO, 1 to 98: such a thread runs before all normal ones. The watchdog of
+            :class:`engine.Live` has one more.
+        nice: -20 to -1, a greater processor share instead of SCHED_FIFO; None takes SCHED_FIFO.
+        cores: the threads' cores; () keeps those of the process.
+        lock_memory: whether to keep the process's used pages in memory.
 
     Raises:
         OptionError: a number is out of its range, or this machine has no such core.
@@ -87,7 +87,7 @@ def set_realtime(realtime: Realtime | None = None) -> None:
 
 
 def check_realtime(realtime: Realtime | None) -> None:
-    """Refuse what is not permitted before anything depends on it: tried in a thread that ends at once.
+    """Refuse settings that are not permitted before anything depends on them, by a trial in a short thread.
 
     Raises:
         OptionError, BackendError: as of :func:`set_realtime`.
@@ -114,12 +114,12 @@ def check_realtime(realtime: Realtime | None) -> None:
 def start_thread(
     target: Callable[[], None], name: str, realtime: Realtime | None, *, above: int = 0
 ) -> threading.Thread:
-    """Start a daemon thread, in real time where that is wanted.
+    """Start a daemon thread, in real time if wanted.
 
     Args:
         target: what it runs.
         name: of the thread.
-        realtime: how it is scheduled; None is as usual. What is no longer permitted is logged.
+        realtime: its scheduling; None is normal. Settings that are no longer permitted are logged.
         above: added to the priority.
     """
 
@@ -139,10 +139,10 @@ def start_thread(
 
 
 class LoadWatch:
-    """Says once that a thread computes so much of the time that the kernel's limit is near.
+    """Warns once that a thread computes so much that the kernel's limit is near.
 
     Args:
-        realtime: of the thread; None and a nice value know no limit.
+        realtime: of the thread; None and a nice value have no limit.
     """
 
     def __init__(self, realtime: Realtime | None) -> None:
@@ -151,7 +151,7 @@ class LoadWatch:
         self._busy_s = 0.0
 
     def add(self, begin_s: float, end_s: float) -> None:
-        """Note that the thread was busy, from and until a time in seconds."""
+        """Record that the thread was busy between two times in seconds."""
         if not self._watches:
             return
         if self._begin_s is None:
@@ -172,7 +172,7 @@ class LoadWatch:
 
 
 def limited_share() -> float:
-    """The share of the time that the kernel gives real-time threads at most; 1 where it does not limit them."""
+    """The largest share of time that the kernel gives real-time threads; 1 if it does not limit them."""
     try:
         runtime, period = (int((_KERNEL / f"sched_rt_{name}_us").read_text()) for name in ("runtime", "period"))
     except (OSError, ValueError):
@@ -192,7 +192,7 @@ def _pin(cores: tuple[int, ...]) -> None:
     try:
         os.sched_setaffinity(0, cores)
     except OSError as error:
-        raise BackendError(f"cores: {_listed(cores)} cannot be had: {error.strerror}") from None
+        raise BackendError(f"cores: {_listed(cores)} are not available: {error.strerror}") from None
     if (had := os.sched_getaffinity(0)) != set(cores):
         raise BackendError(f"cores: expected {_listed(cores)}, got {_listed(tuple(sorted(had)))} only")
 
@@ -204,8 +204,8 @@ def _use_fifo(priority: int) -> None:
         if not isinstance(error, PermissionError):
             raise BackendError(f"realtime: this system has no SCHED_FIFO: {error.strerror}") from None
         where = ""
-        if os.geteuid() == 0:  # a kernel with RT_GROUP_SCHED
-            where = "; root may where the control group has real time (cpu.rt_runtime_us)"
+        if os.geteuid() == 0:  # the kernel has RT_GROUP_SCHED
+            where = "; root may if its control group has real-time budget (cpu.rt_runtime_us)"
         raise BackendError(f"realtime: SCHED_FIFO is not permitted; it needs {_FIFO_CURE}{where}") from None
 
 
@@ -216,12 +216,12 @@ def _use_nice(nice: int) -> None:
         os.setpriority(os.PRIO_PROCESS, 0, nice)  # on Linux of the calling thread
     except OSError as error:
         if not isinstance(error, PermissionError):
-            raise BackendError(f"realtime: a nice value of {nice} cannot be had: {error.strerror}") from None
+            raise BackendError(f"realtime: a nice value of {nice} cannot be set: {error.strerror}") from None
         raise BackendError(f"realtime: a nice value of {nice} is not permitted; it needs {_NICE_CURE}") from None
 
 
 def _check_lockable() -> None:
-    import resource  # which other systems lack
+    import resource  # not available on other systems
 
     # With a limit the lock might succeed now, and memory run out in flight.
     limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)

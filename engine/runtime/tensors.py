@@ -1,8 +1,8 @@
-"""torch, held to the number of threads that was chosen, and copies of arrays to a device and from it.
+"""torch with the chosen number of threads, and copies of arrays to and from a device.
 
-It is the only module that imports torch, and whatever works on tensors imports it at the top. Loading torch takes
-seconds and 180 MB, and NCC on the CPU works on NumPy arrays: modules on its way import those that work on tensors
-where they have a tensor.
+Only this module imports torch; modules that work on tensors import it from here, at the top. Loading torch takes
+seconds and 180 MB, and NCC on the CPU works on NumPy arrays: its modules import tensor code only if they have a
+tensor.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def download(tensors: Sequence[Tensor]) -> list[AnyArray]:
 
 
 def _packed(tensors: Sequence[Tensor]) -> Tensor:
-    """The bytes of tensors, each beginning on a multiple of what the largest element needs."""
+    """The bytes of tensors, each aligned for the largest element."""
     parts = [tensor.contiguous().view(-1).view(torch.uint8) for tensor in tensors]
     return torch.cat([functional.pad(part, (0, -len(part) % _ALIGNMENT)) for part in parts])
 

@@ -1,6 +1,6 @@
-"""The number of threads that OpenCV, torch and the engine's own loops take, and work divided among them.
+"""The number of threads of OpenCV, torch and the engine's own loops, and work divided among them.
 
-torch is configured where it is loaded already, else when it is loaded (:mod:`engine.runtime.tensors`).
+torch is configured now if loaded, else when it is loaded (:mod:`engine.runtime.tensors`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _chosen: list[int] = []  # empty, or the number that was chosen, for the whole p
 def set_threads(count: int) -> None:
     """Set the number of threads of torch and of OpenCV, before or after a matcher is made.
 
-    Without it, and without ``OMP_NUM_THREADS``, the first matcher sets one: where other work shares the processor,
+    Without it, and without ``OMP_NUM_THREADS``, the first matcher sets one: if other work shares the processor,
     several threads wait for each other, and frames come late.
 
     Raises:
@@ -41,7 +41,7 @@ def set_threads(count: int) -> None:
 
 
 def tell(torch: Any) -> None:
-    """Give torch the number of threads that was chosen, if one was."""
+    """Give torch the chosen number of threads, if any."""
     if _chosen:
         torch.set_num_threads(_chosen[0])
 
@@ -53,7 +53,7 @@ def default_threads() -> None:
 
 
 def count() -> int:
-    """The number of threads: as chosen, else torch's where it is loaded, else one a core."""
+    """The number of threads: as chosen, else torch's if loaded, else one per core."""
     if _chosen:
         return _chosen[0]
     if "torch" in sys.modules:
@@ -71,7 +71,7 @@ def parts(size: int, max_count: int) -> list[tuple[int, int]]:
 def in_parallel(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
     """Return the results of a function on each piece, computed by as many threads as :func:`count` says.
 
-    It is faster only where the function releases Python's global lock. A call inside a worker runs in that worker,
+    It is faster only if the function releases Python's global lock. A call inside a worker runs in that worker,
     so that no worker waits for another.
     """
     helpers = min(count(), len(pieces)) - 1
@@ -85,14 +85,14 @@ def in_parallel(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
             for number in left:
                 done[number] = work(pieces[number])
         except BaseException:
-            for _ in left:  # nothing more is begun
+            for _ in left:  # start nothing more
                 pass
             raise
 
     waiting = [_workers(count()).submit(take) for _ in range(helpers)]
     try:
         take()  # the calling thread works, too, and waits for no worker that has not woken before all is taken
-    finally:  # nobody writes any more where the caller goes on
+    finally:  # no thread still writes when the caller continues
         begun = [worker for worker in waiting if not worker.cancel()]
         wait(begun)
     for worker in begun:

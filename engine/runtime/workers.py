@@ -1,4 +1,4 @@
-"""Forked workers: copies of this process that share its memory and do independent tasks between them.
+"""Forked workers: copies of this process that share its memory and divide independent tasks.
 
 Threads do not help here: half of a frame's time is spent under Python's global lock, in hundreds of short calls
 that each wait for it.
@@ -25,20 +25,20 @@ from engine.errors import BackendError, EngineError
 T = TypeVar("T")
 
 _ALONE_S = 0.05  # of work in this process first
-_WORTH_S = 0.5  # of work that is left; less is done sooner than workers are started
-_AHEAD = 2  # tasks that a worker has: while one result travels, it works on the next
+_WORTH_S = 0.5  # of remaining work; less is done before workers would start
+_AHEAD = 2  # tasks per worker: while one result travels, it works on the next
 _Workers = dict[Connection, BaseProcess]
 
 
 def can_fork() -> bool:
-    """Whether this process may be copied: not off Linux, whose libraries survive it, nor as a daemonic process."""
+    """Whether this process may fork: only on Linux, whose libraries survive it, and not if daemonic."""
     return sys.platform == "linux" and not multiprocessing.current_process().daemon
 
 
 def safe_count() -> int:
-    """One worker a core where a copy of this process is safe, else 1.
+    """One worker per core if forking is safe, else 1.
 
-    It is not while other threads of Python run: a lock that one of them holds is never released in the copy.
+    It is unsafe while other Python threads run: a lock that one of them holds is never released in the copy.
     """
     if not can_fork() or threading.active_count() > 1:
         return 1
@@ -46,14 +46,14 @@ def safe_count() -> int:
 
 
 def in_order(work: Callable[[int], T], count: int, workers: int) -> Iterator[T]:
-    """Yield ``work(0)`` to ``work(count - 1)``, computed by workers where that is faster.
+    """Yield ``work(0)`` to ``work(count - 1)``, computed by workers if that is faster.
 
-    The first tasks are done in this process: what they cache, all workers share.
+    This process does the first tasks: all workers share what they cache.
 
     Args:
-        work: its results and exceptions travel through a pipe, it does not.
+        work: the task; its results and exceptions pass through a pipe.
         count: number of tasks.
-        workers: as many at most; with 1 all is done in this process.
+        workers: most workers; with 1 this process does everything.
 
     Raises:
         BackendError: a worker ended.
@@ -71,7 +71,7 @@ def in_order(work: Callable[[int], T], count: int, workers: int) -> Iterator[T]:
 
 
 def start_helper(work: Callable[[], None]) -> BaseProcess | None:
-    """Begin some work in a copy of this process, for its caller to end; None where such a copy is not safe."""
+    """Start work in a fork of this process, which the caller must end; None if forking is not safe."""
     if safe_count() < 2:
         return None
     with _forkable():
@@ -81,7 +81,7 @@ def start_helper(work: Callable[[], None]) -> BaseProcess | None:
 
 
 def _by_workers(work: Callable[[int], T], tasks: range, workers: int) -> Iterator[T]:
-    """The results of tasks in their order; what one raised is raised in its turn."""
+    """The results of tasks in order; a task's exception is raised in its turn."""
     started: _Workers = {}
     try:
         with _forkable():
@@ -99,7 +99,7 @@ def _by_workers(work: Callable[[int], T], tasks: range, workers: int) -> Iterato
             value, error = results.pop(task)
             if error is not None:
                 raise error
-            yield value  # type: ignore[misc]  # None only where that is the result
+            yield value  # type: ignore[misc]  # None only if that is the result
     finally:
         for pipe, process in started.items():
             process.kill()  # it may have inherited a handler of gentler signals
@@ -139,7 +139,7 @@ def _start(work: Callable[[int], Any], started: _Workers) -> None:
 
 def _serve(work: Callable[[int], Any], pipe: Connection, inherited: list[Connection]) -> None:
     """The worker's process: tasks in, results out, until its parent ends it or is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is asked, and ends us
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and ends us
     for end in inherited:
         end.close()
     try:

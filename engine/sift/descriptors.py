@@ -1,4 +1,4 @@
-"""The windows of SIFT's orientation and of its descriptor, as weights of the samples about a keypoint."""
+"""Windows of SIFT's orientation and descriptor, as weights of the samples around a keypoint."""
 
 from functools import lru_cache
 

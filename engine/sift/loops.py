@@ -95,7 +95,7 @@ def filters(inputs: int, sigmas: tuple[float, ...], reach: tuple[int, ...], up: 
 
     Returns:
         Weights (levels, up, taps), reach (levels,) and the gains (2, levels, E) of the first and of the last E
-        outputs, which make up for what a filter misses beyond an edge; all others have 1.
+        outputs, which compensate for what a filter misses beyond an edge; all others have 1.
     """
     weights, below = _weights(sigmas, reach, up)
     near, outputs = np.array(reach), up * (inputs - 1) + 1
@@ -127,7 +127,7 @@ def find_features(images: Tensor, mask: Tensor | None, choice: SiftChoice) -> Fe
     Args:
         images: (B, H, W) float32 on the CPU.
         mask: (B, 1, H, W) bool, True where keypoints are allowed; None is everywhere.
-        choice: what is kept and described.
+        choice: which keypoints to keep and describe.
 
     Returns:
         Features on the CPU.

@@ -1,4 +1,4 @@
-"""Descriptors matched by distance: Lowe's ratio test, a mutual test, and what is known of rotation and scale."""
+"""Match descriptors by distance: Lowe's ratio test, a mutual test, and limits on rotation and scale."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from engine.sift.values import Features, Matches
 Floats = NDArray[np.float32]
 AnyArray = NDArray[Any]
 
-_TRAIN_CHUNK = 4096  # train slots that are compared at a time, which bounds the memory for a whole map's
+_TRAIN_CHUNK = 4096  # train slots compared at a time, to bound memory for a whole map
 _FAR = 1e30
 _FORBIDDEN = -2.0  # below every cosine
 _ROUNDING = 2e-3  # distance between a descriptor and itself by float32 rounding
@@ -74,7 +74,7 @@ def _by_tensors(query: Features, train: Features, limits: _Limits, ratio: float,
     with torch.inference_mode():
         first, index, second, is_mutual = _nearest(query, train, limits)
         nearest, next_nearest = _distance(first), _distance(second)
-        # Two equal distances give a ratio of 1, also where rounding puts one of them at 0.
+        # Two equal distances give a ratio of 1, even if rounding makes one of them 0.
         quotient = (nearest.clamp_min(_ROUNDING) / next_nearest.clamp_min(_ROUNDING)).nan_to_num(1.0)
         valid = nearest.isfinite() & (quotient <= ratio)
     return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
@@ -90,7 +90,7 @@ def _nearest(query: Features, train: Features, limits: _Limits) -> tuple[Tensor,
 
 
 def _distance(cosine: Tensor) -> Tensor:
-    """Distance of unit vectors; infinite where the pair was forbidden."""
+    """Distance of unit vectors; infinite for a forbidden pair."""
     return (2 - 2 * cosine).clamp_min_(0).sqrt_().masked_fill_(cosine < _FORBIDDEN, torch.inf)
 
 
@@ -190,7 +190,7 @@ def _nearest_by_loops(query: Features, train: Features, limits: _Limits) -> tupl
 
 
 def _angles_and_scales(features: Features, rotation_deg: float, scale: float, is_limited: bool) -> Floats:
-    """(3, B, N) logarithm of scale where that counts, NaN without a keypoint; cosine and sine of the angle."""
+    """(3, B, N) logarithm of scale if used, NaN without a keypoint; cosine and sine of the angle."""
     sizes = features.scale_px.float().numpy() if is_limited else np.ones(features.valid.shape, np.float32)
     angle = np.deg2rad(features.angle_deg.float().numpy() + np.float32(rotation_deg))
     log = np.log(np.where(features.valid.numpy(), np.maximum(sizes * np.float32(scale), 1e-9), np.nan))

@@ -1,4 +1,4 @@
-"""Scale space: Lowe's numbers, and where a picture's Gaussian levels lie, octave by octave, in one flat buffer."""
+"""Scale space: Lowe's numbers, and the layout of a picture's Gaussian levels in one flat buffer."""
 
 import math
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 SCALES = 3  # DoG levels searched per octave, Lowe's s
 LEVELS = SCALES + 3  # Gaussian levels per octave
 FIRST_SIGMA_PX = 0.8  # sigma of the first Gaussian level, in pixels of the image
-EDGE_RATIO = 10.0  # of the curvatures of a keypoint, from which it lies on an edge
+EDGE_RATIO = 10.0  # ratio of a keypoint's curvatures at which it lies on an edge
 _CAMERA_SIGMA_PX = 0.5  # assumed blur of an image
 _TRUNCATE = 3.0  # a Gaussian's reach in sigmas
 _MIN_OCTAVE = 12

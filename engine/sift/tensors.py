@@ -1,4 +1,4 @@
-"""SIFT as tensor ops on any torch device: kornia's pyramid, and what Lowe asks of its extrema.
+"""SIFT as tensor ops on any torch device: kornia's pyramid with Lowe's tests of its extrema.
 
 kornia refines every extremum of the doubled picture and ranks by contrast. The tests of contrast and of edges, the
 mask and the spread over the picture are those of the compiled loops (:mod:`engine.sift.loops`).
@@ -15,7 +15,7 @@ from engine.runtime.tensors import Tensor, torch
 from engine.sift.scale_space import EDGE_RATIO, SCALES
 from engine.sift.values import Features, SiftChoice
 
-_PX_PER_EXTREMUM = 4  # extrema are never denser than this; of more the weakest are left out
+_PX_PER_EXTREMUM = 4  # highest density of extrema; the weakest beyond it are dropped
 _MIN_EXTREMA = 256
 _FRAME_SIGMAS = 6.0  # half the side of kornia's frames
 
@@ -55,7 +55,7 @@ def find_features(images: Tensor, mask: Tensor | None, choice: SiftChoice) -> Fe
     Args:
         images: (B, H, W) float32.
         mask: (B, 1, H, W) bool, True where keypoints are allowed; None is everywhere.
-        choice: what is kept and described; the pictures are doubled whatever it says.
+        choice: which keypoints to keep and describe; pictures are always upsampled.
 
     Returns:
         Features on the pictures' device.
@@ -77,7 +77,7 @@ def find_features(images: Tensor, mask: Tensor | None, choice: SiftChoice) -> Fe
 def _network(device: torch.device, root: bool) -> Any:
     from kornia.feature import SIFTFeatureScaleSpace  # takes a second
 
-    # The stages are called one by one, so that only what is kept is described; kornia's version is pinned for it.
+    # Calling the stages one by one describes only kept keypoints; kornia's version is pinned for this.
     return SIFTFeatureScaleSpace(rootsift=root, device=device, descriptor_backend="pyramid").eval()
 
 
@@ -108,7 +108,7 @@ def _allowed(xy_px: Tensor, mask: Tensor) -> Tensor:
 def _strongest(
     found: _Extrema, valid: Tensor, shape: tuple[int, ...], choice: SiftChoice
 ) -> tuple[Tensor, Tensor]:
-    """Slots (B, M) to keep by precedence, and whether each holds a keypoint; M is at most what is asked for."""
+    """Slots (B, M) to keep by precedence, and whether each holds a keypoint; M is at most the requested number."""
     strength = torch.where(valid, found.contrast * found.scale_px.sqrt(), -1.0)
     order = strength.argsort(dim=1, descending=True, stable=True)
     side, valid = choice.spread, valid.gather(1, order)
@@ -129,7 +129,7 @@ def _rank(group: Tensor) -> Tensor:
 
 
 def _described(kept: _Extrema, pyramid: list[Tensor], descriptor: Any, choice: SiftChoice) -> Features:
-    """What is kept with its angles and descriptors, in all slots that were asked for."""
+    """The kept keypoints with angles and descriptors, in all requested slots."""
     lafs, valid = kept.lafs, kept.valid
     lafs = lafs * valid[..., None, None]  # frames of no size are not described
     if choice.up_rad is not None:

@@ -75,7 +75,7 @@ class Matches:
 
     Attributes:
         train_index: (B, N) int64.
-        distance: (B, N) Euclidean distance of the descriptors, in [0, 2]; infinite where none was allowed.
+        distance: (B, N) Euclidean distance of the descriptors, in [0, 2]; infinite if none was allowed.
         ratio: (B, N) distance over the second nearest's, in [0, 1]; 0 where there is no second, 1 where both are
             0.
         valid: (B, N) bool.

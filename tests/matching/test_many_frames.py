@@ -124,7 +124,7 @@ def test_every_frame_has_the_budget(matchers, questions):
 
 def test_frames_and_priors_of_different_number_are_refused(matchers, questions):
     frames, priors = questions
-    with pytest.raises(OptionError, match=r"^priors: expected one a frame, 10, got 9$"):
+    with pytest.raises(OptionError, match=r"^priors: expected one per frame, 10, got 9$"):
         matchers["ncc"].locate_many(frames, priors[1:])
 
 

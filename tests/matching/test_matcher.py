@@ -566,7 +566,7 @@ def test_a_frame_of_another_resolution_does_not_fit_the_calibration(matchers, sh
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
 def test_a_device_that_is_missing_is_an_error_and_only_auto_falls_back(ground, camera):
-    with pytest.raises(DeviceError, match=r"^device: cuda was asked for"):
+    with pytest.raises(DeviceError, match=r"^device: cuda was requested"):
         SceneMatcher(ground.site, camera, device="cuda")
     assert SceneMatcher(ground.site, camera, device="auto").device.type == "cpu"
 

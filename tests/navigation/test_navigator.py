@@ -590,7 +590,7 @@ def test_a_picture_that_repeats_while_the_vehicle_moves_is_refused():
     again = replace(at(1.0, (4.0, 0.0)), image=first.image.copy())
     result = navigator.update(again)
     assert result.reason is Reason.FAILED
-    assert result.detail == "the picture is the one of 1.0 s and 4.0 m ago"
+    assert result.detail == "the picture repeats the one 1.0 s and 4.0 m ago"
     assert navigator.state.value == "coasting"
     assert isinstance(navigator.update(replace(at(1.1, (0.0, 0.0)), image=first.image.copy())), NoFix)
 

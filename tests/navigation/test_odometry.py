@@ -165,7 +165,7 @@ def test_pictures_that_show_no_one_motion_are_refused():
     refused(frame(waves[0]), frame(waves[1], INTERVAL_S), "agree on one motion")
     dark = [np.clip(rng.normal(6.0, 2.0, (240, 320)), 0, 255).astype(np.uint8) for _ in range(2)]
     refused(frame(dark[0]), frame(dark[1], INTERVAL_S), "agree on one motion")
-    refused(frame(ground), frame(ground, INTERVAL_S), "the last one again")
+    refused(frame(ground), frame(ground, INTERVAL_S), "repeats the last one")
 
 
 def test_what_is_fixed_to_the_camera_over_water_is_no_hover():
@@ -180,7 +180,7 @@ def test_telemetry_that_does_not_support_a_motion_is_refused():
     first, second = frame(picture((0, 0), LEVEL)), frame(picture((5, 0), LEVEL), INTERVAL_S)
     refused(replace(first, height_agl_m=None), second, "height or heading")
     refused(first, replace(second, heading_deg=None), "height or heading")
-    refused(replace(first, timestamp_ns=None), second, "no stamp")
+    refused(replace(first, timestamp_ns=None), second, "no timestamp")
     refused(first, replace(second, timestamp_ns=9_000_000_000), "9.0 s apart")
     refused(first, replace(second, east_velocity_mps=1.0, north_velocity_mps=1.0), "velocity is known")
     refused(replace(first, pitch_deg=55.0), replace(second, pitch_deg=55.0), "too obliquely")  # 78 at an edge

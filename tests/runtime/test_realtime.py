@@ -97,7 +97,7 @@ def test_live_schedules_its_worker_and_above_it_the_watchdog():
     [
         ("sched_setscheduler", PLAIN, ("SCHED_FIFO is not permitted", "CAP_SYS_NICE", "ulimit -r", "systemd")),
         ("setpriority", Realtime(nice=-3, lock_memory=False), ("nice value of -3", "CAP_SYS_NICE", "LimitNICE")),
-        ("sched_setaffinity", Realtime(cores=(0,), lock_memory=False), ("cores: 0 cannot be had",)),
+        ("sched_setaffinity", Realtime(cores=(0,), lock_memory=False), ("cores: 0 are not available",)),
     ],
 )
 def test_what_is_not_permitted_is_told_with_its_cure(monkeypatch, call, asked, words):
