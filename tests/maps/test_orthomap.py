@@ -477,7 +477,7 @@ def test_world_file_counts_from_the_centre_of_the_first_pixel(tmp_path, ending, 
         ({}, "bounds_deg.*world file"),
         ({"bounds_deg": (33, 32, 32.9, 32.1)}, "west < east"),
         ({"bounds_deg": (33, 32, float("nan"), 32.1)}, "west < east"),
-        ({"bounds_deg": (35, 32, 35.5, 32.5), "crs": UTM}, "no rectangle"),
+        ({"bounds_deg": (35, 32, 35.5, 32.5), "crs": UTM}, "expected a rectangle"),
         ({"bounds_deg": (33, 32, 33.1, 32.1), "crs": "EPSG:99999999"}, "crs: expected"),
     ],
 )
