@@ -32,8 +32,7 @@ def judge_peak(peak: Peak, evidence: PeakEvidence, risk: float, *, is_tested: bo
         peak: the peak.
         evidence: for it.
         risk: allowed probability of a wrong fix.
-        is_tested: whether the evidence was tested by the null
-        hypothesis.
+        is_tested: whether the evidence was tested by the null hypothesis.
     """
     if not peak.curvature.any():
         return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"

@@ -177,13 +177,12 @@ class Correlator:
             window: in full-resolution map pixels.
             quick: which peaks of a wide window to keep although not every place was scored.
         """
-        query, options = self.query, self.options
         height, width = aligned.template.shape
-        with query.scheduler.stage("map"):
+        with self.query.scheduler.stage("map"):
             region = self.cut(window, aligned.level)
         if region.window.width_px < width or region.window.height_px < height:
             return None
-        exclusion_px = options.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
+        exclusion_px = self.exclusion_px(aligned.level)
         quick = None if quick is None else _about(quick, region.window)
         peak = self._peak(region, aligned.template, exclusion_px, quick)
         return None if peak.score <= -1.0 and region.valid is not None else _moved(peak, region.window)
@@ -224,6 +223,10 @@ class Correlator:
             return find_peak(self.masked_scores(region, template[None])[0], exclusion_px=exclusion_px)
         own = placed(template, self.query.device)
         return match_template(region.search, own, exclusion_px=exclusion_px, exhaustive=True)
+
+    def exclusion_px(self, level: int) -> float:
+        """Distance within which a rival is the peak itself, in pixels of a level."""
+        return self.options.exclusion_m / (self.query.site.gsd_m_per_px * 2.0**level)
 
     @property
     def is_centred(self) -> bool:

@@ -14,7 +14,7 @@ from engine.geo import attitude_from_rotation
 from engine.maps.landmarks import LandmarkMap
 from engine.matching.acceptance import judge_pose
 from engine.matching.covariance import tilt_covariance
-from engine.matching.evidence import PoseEvidence, is_beyond_doubt, prior_chi_square, probability
+from engine.matching.evidence import PoseEvidence, is_beyond_doubt, probability
 from engine.matching.feature_matching import NOMINAL_SCALE, Matched, match_views
 from engine.matching.point_finding import PointFinder
 from engine.matching.pose import PoseStats, solve_pose
@@ -239,14 +239,10 @@ class FeatureMatcher:
             variance = errors.height_sigma_m(height_m) ** 2 + float(fix.covariance_m2[2, 2]) - errors.map_m**2
             ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
             height_chi_square = (fix.up_m - ground_m - height_m) ** 2 / variance
-        off = None
-        if query.prior is not None and query.prior_px is not None:
-            prior_m = query.site.enu_from_pixel(query.prior_px)
-            off = prior_chi_square(fix, prior_m, query.prior.sigma_m)
         log10_nfa, rival_share = stats.log10_nfa, 0.0
         if vote is not None:
             log10_nfa, rival_share = vote.log10_nfa, vote.rival / vote.votes
-        evidence = PoseEvidence(log10_nfa, off, height_chi_square, rival_share)
+        evidence = PoseEvidence(log10_nfa, query.prior_chi_square(fix), height_chi_square, rival_share)
         return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
 
 

@@ -157,8 +157,7 @@ def _coarse(
     templates, trims = _same_size(fitting)
     if templates.shape[1] > region.window.height_px or templates.shape[2] > region.window.width_px:
         return []
-    exclusion_m = correlator.options.exclusion_m
-    separation = max(2, round(exclusion_m / (query.site.gsd_m_per_px * 2.0**level)))
+    separation = max(2, round(correlator.exclusion_px(level)))
     found: list[tuple[float, GridPose, Array]] = []
     with query.scheduler.stage("match"):
         for aligned, trim, scores in zip(fitting, trims, _surfaces(correlator, region, templates), strict=True):
@@ -275,7 +274,7 @@ def _best_at_full_resolution(
 def _best_elsewhere(correlator: Correlator, found: list[tuple[Peak, Aligned]]) -> float:
     """The best score at a place other than the winner's."""
     winner = correlator.nadir_px(*found[0])
-    distance_px = correlator.options.exclusion_m / correlator.query.site.gsd_m_per_px
+    distance_px = correlator.exclusion_px(0)
     scores = [
         peak.score
         for peak, aligned in found[1:]

@@ -20,7 +20,6 @@ from engine.matching.evidence import (
     independent_places,
     is_beyond_doubt,
     is_hopeless,
-    prior_chi_square,
     probability,
     sigmas_of,
 )
@@ -38,7 +37,6 @@ class PeakCandidate:
         aligned: the hypothesis that it belongs to.
         fix: the fix that the peak gives if accepted, with its probability.
         evidence: for it.
-        tried: places, times headings and heights, among which the peak is the best.
         searched: whether heading and height were fitted to the picture.
         is_tested: whether the null hypothesis is among its rivals, or would change nothing. A score maximised by a
             fit is no evidence until the structure around the place confirms it.
@@ -48,7 +46,6 @@ class PeakCandidate:
     aligned: Aligned
     fix: Fix
     evidence: PeakEvidence
-    tried: float
     searched: bool
     is_tested: bool
 
@@ -92,16 +89,13 @@ def candidate_of(
         is_tested: whether the null hypothesis is among its rivals, or would change nothing.
     """
     query, (rows, columns) = correlator.query, aligned.template.shape
-    fix, off = fix_of(correlator, aligned, peak, window, searched=searched), None
-    if query.prior is not None and query.prior_px is not None:
-        off = prior_chi_square(fix, query.site.enu_from_pixel(query.prior_px), query.prior.sigma_m)
+    fix = fix_of(correlator, aligned, peak, window, searched=searched)
     sigma = score_sigma(rows * columns) if sigma is None else sigma
     measured = places_in(aligned, window)
-    tried = max(tried, measured)
     scores = (sigmas_of(peak.score, sigma), sigmas_of(peak.second_score, sigma))
-    evidence = PeakEvidence(*scores, measured, tried, off)
+    evidence = PeakEvidence(*scores, measured, max(tried, measured), query.prior_chi_square(fix))
     fix = replace(fix, confidence=probability(evidence.nats))
-    return PeakCandidate(peak, aligned, fix, evidence, tried, searched, is_tested)
+    return PeakCandidate(peak, aligned, fix, evidence, searched, is_tested)
 
 
 def places_in(aligned: Aligned, window: Window) -> float:
@@ -120,7 +114,10 @@ def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
     matters = found.evidence.nats >= query.needed_nats
     null_score = _null_score(correlator, aligned, window, peak.second_score, matters=matters)
     peak = replace(peak, second_score=max(peak.second_score, null_score))
-    return candidate_of(correlator, aligned, peak, window, tried=found.tried, is_tested=True)
+    rival_sigmas = sigmas_of(peak.second_score, score_sigma(aligned.template.size))
+    evidence = replace(found.evidence, rival_sigmas=rival_sigmas)
+    fix = replace(found.fix, confidence=probability(evidence.nats))
+    return replace(found, peak=peak, fix=fix, evidence=evidence, is_tested=True)
 
 
 def _null_score(
@@ -176,8 +173,7 @@ def candidates_of(correlator: Correlator, found: PeakCandidate) -> tuple[Fix, ..
     query, aligned, window = correlator.query, found.aligned, found.fix.window
     if not found.is_tested or query.prior is None or query.scheduler.deadline.remaining_ms < 0:
         return ()
-    exclusion_px = correlator.options.exclusion_m / (query.site.gsd_m_per_px * 2.0**aligned.level)
-    apart_px = max(2, round(exclusion_px))
+    apart_px = max(2, round(correlator.exclusion_px(aligned.level)))
     with query.scheduler.stage("candidates"):
         best = correlator.best_places(aligned, window, apart_px, _MAX_CANDIDATES)
     if best is None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.geo import angle_covariance_deg2, enu_from_body, inverse_2x2, transport_covariance, wrap_heading_deg
 from engine.matching.covariance import with_frame_accuracy
-from engine.matching.evidence import needed_nats
+from engine.matching.evidence import needed_nats, prior_chi_square
 from engine.matching.pose import AttitudePrior
 from engine.options import AssumedErrors
 from engine.orthomap import OrthoMap
@@ -72,6 +72,12 @@ class Query:
             assert prior.lat_deg is not None  # a Prior has one of the two
             assert prior.lon_deg is not None
             return self.site.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
+
+    def prior_chi_square(self, fix: Fix) -> float | None:
+        """Chi-square of a fix against the prior (:func:`.prior_chi_square`); None without a prior."""
+        if self.prior is None or self.prior_px is None:
+            return None
+        return prior_chi_square(fix, self.site.enu_from_pixel(self.prior_px), self.prior.sigma_m)
 
     @cached_property
     def telemetry(self) -> GridPose:

@@ -84,7 +84,7 @@ def hopeful_look(correlator: Correlator, aligned: Aligned, window: Window) -> Se
     about = second_look(correlator, aligned, correlator.near(aligned, nadir, _ABOUT_PX << aligned.level))
     if about is None:
         return None
-    exclusion_px = correlator.options.exclusion_m / (site.gsd_m_per_px * 2.0**aligned.level)
+    exclusion_px = correlator.exclusion_px(aligned.level)
     rivals = [p.score for p, _ in found if np.hypot(p.x - best.x, p.y - best.y) > exclusion_px]
     second = max([about.peak.second_score, *rivals])
     return SecondLook(replace(about.peak, second_score=second), about.chance_sigma)
@@ -128,8 +128,7 @@ def second_look(correlator: Correlator, aligned: Aligned, window: Window) -> Sec
     chance = scores[1:][scores[1:] > -1.0]
     if not chance.size:
         return None
-    options, site = correlator.options, correlator.query.site
-    peak = find_peak(scores[0], exclusion_px=options.exclusion_m / (site.gsd_m_per_px * 2.0**aligned.level))
+    peak = find_peak(scores[0], exclusion_px=correlator.exclusion_px(aligned.level))
     peak = replace(
         peak,
         x=peak.x + crop.x0,
@@ -192,6 +191,6 @@ def confirmed(correlator: Correlator, found: PeakCandidate, looked: SecondLook, 
         peak = replace(peak, second_score=max(peak.second_score, elsewhere))
     own = candidate_of(
         correlator, found.aligned, peak, window,
-        searched=found.searched, tried=found.tried, sigma=looked.chance_sigma, is_tested=True,
+        searched=found.searched, tried=found.evidence.tried, sigma=looked.chance_sigma, is_tested=True,
     )  # fmt: skip
     return replace(own, fix=replace(own.fix, window=found.fix.window))
