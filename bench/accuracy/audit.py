@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import RESULTS, SHARED
-from bench.accuracy.confidence import fitted
 from bench.accuracy.flights import STEPS, Recorded, recorded
 from bench.inputs.farmland import farmland
 from bench.inputs.scenes import mosaic
@@ -222,6 +221,24 @@ def all_trials(grounds: list[Ground], count: int, seed: int) -> list[Trial]:
 
 def auc_of(found: list[Trial]) -> float:
     return auc(np.array([t.predicted for t in found]), np.array([t.right for t in found], bool))
+
+
+def fitted(x: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[float, ...]:
+    """Weights by maximum likelihood, by Newton's method with a whisper of ridge that keeps it finite.
+
+    Args:
+        x: (N, K) terms.
+        right: (N,) whether each place was right.
+    """
+    weights, y = np.zeros(x.shape[1]), right.astype(np.float64)
+    for _ in range(50):
+        p = 1.0 / (1.0 + np.exp(-np.clip(x @ weights, -30, 30)))
+        hessian = (x * (p * (1.0 - p))[:, None]).T @ x + 0.1 * np.eye(x.shape[1])
+        step = np.linalg.solve(hessian, x.T @ (y - p) - 0.1 * weights)
+        weights += step
+        if np.abs(step).max() < 1e-8:
+            break
+    return tuple(float(round(w, 3)) for w in weights)
 
 
 def fit(found: list[Trial]) -> tuple[float, ...]:

@@ -29,24 +29,6 @@ UNTOLD = 0.25  # how often something is left out
 SCALES = (0.5, 0.35, 0.25)  # of the frame, as a budget asks for
 
 
-def fitted(x: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[float, ...]:
-    """Weights by maximum likelihood, by Newton's method with a whisper of ridge that keeps it finite.
-
-    Args:
-        x: (N, K) terms.
-        right: (N,) whether each place was right.
-    """
-    weights, y = np.zeros(x.shape[1]), right.astype(np.float64)
-    for _ in range(50):
-        p = 1.0 / (1.0 + np.exp(-np.clip(x @ weights, -30, 30)))
-        hessian = (x * (p * (1.0 - p))[:, None]).T @ x + 0.1 * np.eye(x.shape[1])
-        step = np.linalg.solve(hessian, x.T @ (y - p) - 0.1 * weights)
-        weights += step
-        if np.abs(step).max() < 1e-8:
-            break
-    return tuple(float(round(w, 3)) for w in weights)
-
-
 def alarms(nats: NDArray[np.float64], right: NDArray[np.bool_]) -> str:
     """How many wrong places have more evidence than a few nats, beside how many may have.
 

@@ -21,11 +21,8 @@ from engine.errors import MapError
 from scenematch.files.flight import open_flight
 from scenematch.files.truth import read_truth
 
-SIDE_PX, LINE_PX, SPAN_M = (
-    360,
-    40,
-    380.0,
-)  # of each half, of the line below, and the ground that the map's half shows
+SIDE_PX, LINE_PX = 360, 40  # of each half, and of the line below
+SPAN_M = 380.0  # of the ground in the map's half
 MAP_SIGMA_M = 0.07  # of this map, whose georeference is known from the world that it was drawn from
 ENLARGED = 10.0  # the ellipse
 TRAIL, FOUND, WINDOW, TEXT, BACK = "#ffd21f", "#22d35e", "#38a8ff", "#f4f6f8", "#14181d"

@@ -7,7 +7,7 @@ import numpy as np
 
 def test_the_fit_finds_the_weights_that_drew_the_labels():
     """Labels drawn with known weights: the fit has them again, to the scatter of 20,000 draws."""
-    from bench.accuracy.confidence import fitted
+    from bench.accuracy.audit import fitted
 
     rng = np.random.default_rng(0)
     x = np.c_[np.ones(20_000), rng.uniform(0.5, 3.0, 20_000), rng.random(20_000), rng.uniform(0, 12, 20_000)]

@@ -24,6 +24,8 @@ from bench.live.bridge_counts import free_port
 from bench.live.flights.faults import FAULTS, FLIGHT_S, Fault
 from bench.live.fly_standin import off_m, recorded, wait_for_bridge
 from bench.live.standin import MS, Agenda, RealClock, S, Standin, State
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
 
 RATE_HZ = 5.0
 FAR_M = 5.0
@@ -139,9 +141,6 @@ def longest_silence_s(arrived_s: NDArray[np.float64], begin_s: float, end_s: flo
 
 def draw(folder: Path, seed: int) -> None:
     """A town and the flight over it."""
-    from scenematch.runs.simulation import write_flight
-    from scenematch.simulator import plan_flight
-
     write_flight(folder, plan_flight(seed, frames=round(FLIGHT_S * RATE_HZ), rate_hz=RATE_HZ))
 
 
