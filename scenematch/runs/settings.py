@@ -10,7 +10,7 @@ from typing import Any
 
 from engine.errors import OptionError
 from engine.matching import METHODS
-from engine.options import PROFILES, LearnedOptions, MatcherOptions, NavigatorOptions, NccOptions, SiftOptions
+from engine.options import LearnedOptions, MatcherOptions, NavigatorOptions, NccOptions, SiftOptions
 from scenematch.files.settings import (
     merged,
     nearest,
@@ -62,7 +62,7 @@ class TrackSettings:
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
-        check_choice("profile", self.profile, PROFILES)
+        self.matcher_options()  # refuses a profile or a risk that is none
         if self.profile == "paper" and self.method not in ("ncc", "sift"):
             raise OptionError(f"method: expected ncc or sift with `profile` paper, got {self.method!r}")
         if self.profile == "paper" and self.navigator.odometry:

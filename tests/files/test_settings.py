@@ -59,6 +59,21 @@ def test_values_arrive(tmp_path):
     assert changed(TrackSettings()) == {}
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("risk = 5", "risk: expected a probability above 0 and below 1, got 5.0"),
+        ('profile = "fast"', "profile: expected one of engine, paper, got 'fast'"),
+    ],
+)
+def test_what_the_matcher_would_refuse_is_refused_as_the_file_is_read(tmp_path, text, message):
+    path = tmp_path / "bad.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(OptionError) as caught:
+        read_settings(path, TrackSettings)
+    assert str(caught.value) == f"{path}: {message}"
+
+
 def test_the_command_line_counts_more_than_the_file(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('method = "sift"\nbudget_ms = 40\n', encoding="utf-8")
