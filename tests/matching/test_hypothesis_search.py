@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
-from engine.matching import hypothesis_search, ncc
+from engine.matching import hypothesis_search, peak_evidence
 from engine.options import NccOptions
 from scenematch.simulator import FlightStyle, SensorNoise, plan_flight
 from tests.support.towns import drawn_town, site_of
@@ -64,13 +64,13 @@ def turn_between(a_deg, b_deg):
 @pytest.fixture
 def aligned_heights(monkeypatch):
     """The heights of the hypotheses behind the fixes; a fix does not have them."""
-    heights, real = [], ncc.fix_of
+    heights, real = [], peak_evidence.fix_of
 
     def noting(correlator, aligned, *rest, **named):
         heights.append(aligned.pose.height_agl_m)
         return real(correlator, aligned, *rest, **named)
 
-    monkeypatch.setattr(ncc, "fix_of", noting)
+    monkeypatch.setattr(peak_evidence, "fix_of", noting)
     return heights
 
 
