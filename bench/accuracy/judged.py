@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -118,7 +119,7 @@ class Bench:
         again = None if isinstance(result, Fix) else ncc.find_again(query, found)
         if again is not None:
             found, result = again, ncc.judge(query, again)
-        ratio = found.evidence.rival_sigmas / max(found.evidence.sigmas, 1e-3)
+        ratio = math.sqrt(found.evidence.rival / max(found.evidence.surprise, 1e-6))
         scores = [found.fix.confidence or 0.0, found.peak.score, _psr(query, ncc, found), -ratio]
         return self.row(made, "NCC", found.fix, isinstance(result, Fix), scores, [found.evidence.nats])
 
@@ -147,7 +148,11 @@ class Bench:
             found = sift.find(replace(query, risk=1.0 - 1e-9), replace(options, pose=LOOSE))
         if isinstance(found, NoFix):
             return self.row(made, "SIFT", None, False, [], [])
-        scores = [found.fix.confidence or 0.0, -found.evidence.log10_nfa, found.fix.score]
+        scores = [
+            found.fix.confidence or 0.0,
+            found.evidence.surprise - math.log(found.evidence.tried),
+            found.fix.score,
+        ]
         return self.row(made, "SIFT", found.fix, fixed, scores, [found.evidence.nats])
 
     def row(

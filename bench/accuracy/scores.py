@@ -29,7 +29,7 @@ from engine.matching.acceptance import judge_peak
 from engine.matching.align import to_gray
 from engine.matching.correlation import Aligned, Correlator
 from engine.matching.covariance import score_sigma
-from engine.matching.evidence import PeakEvidence, sigmas_of
+from engine.matching.evidence import Evidence, surprise_of
 from engine.matching.peak_evidence import places_in
 from engine.matching.query import Query
 from engine.ncc_fft import match_template, prepare
@@ -117,9 +117,9 @@ def search(query: Query, prepared: PreparedMap, options: NccOptions, truth: NDAr
     nadir = site.full_from_level(np.array([peak.x, peak.y]) - aligned.patch.offset_px, level)
     error_m = float(np.hypot(*(site.enu_from_pixel(nadir) - truth)))
     lead = (peak.score - peak.second_score) / score_sigma(pixels)
-    sigmas, rival = (sigmas_of(score, score_sigma(pixels)) for score in (peak.score, peak.second_score))
+    surprise, rival = (surprise_of(score, score_sigma(pixels)) for score in (peak.score, peak.second_score))
     places = places_in(aligned, window)
-    accepted = judge_peak(peak, PeakEvidence(sigmas, rival, places, places, None), RISK) is None
+    accepted = judge_peak(peak, Evidence(surprise, rival, places, places, None), RISK) is None
     return Trial(error_m, lead if error_m <= WRONG_M else -lead, accepted)
 
 

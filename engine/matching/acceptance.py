@@ -5,13 +5,14 @@ The evidence for the match and the allowed risk decide, see :mod:`engine.matchin
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import chi_square
-from engine.matching.evidence import PeakEvidence, PoseEvidence, needed_nats, probability
+from engine.matching.evidence import Evidence, needed_nats, probability
 from engine.values import Fix, Peak, Reason
 
 Array = NDArray[np.float64]
@@ -25,7 +26,7 @@ Refusal = tuple[Reason, str]
 """Why a match is not accepted, and the figures behind it."""
 
 
-def judge_peak(peak: Peak, evidence: PeakEvidence, risk: float, *, is_tested: bool = True) -> Refusal | None:
+def judge_peak(peak: Peak, evidence: Evidence, risk: float, *, is_tested: bool = True) -> Refusal | None:
     """The reason to refuse a correlation peak, or None if it is accepted.
 
     Args:
@@ -38,35 +39,38 @@ def judge_peak(peak: Peak, evidence: PeakEvidence, risk: float, *, is_tested: bo
         return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"
     if is_tested and evidence.nats >= needed_nats(risk):
         return None
-    if replace(evidence, rival_sigmas=0.0, prior_chi_square=None).nats < needed_nats(risk):
-        return Reason.LOW_SCORE, f"best NCC {peak.score:.3f}, {evidence.sigmas:.1f} sigmas, may be chance"
-    figures = f"NCC {evidence.sigmas:.1f} sigmas, rival at {evidence.rival_sigmas:.1f}, {_known(evidence)}"
+    sigmas, rival = (math.sqrt(2.0 * surprise) for surprise in (evidence.surprise, evidence.rival))
+    if replace(evidence, rival=0.0, prior_chi_square=None).nats < needed_nats(risk):
+        return Reason.LOW_SCORE, f"best NCC {peak.score:.3f}, {sigmas:.1f} sigmas, may be chance"
+    figures = f"NCC {sigmas:.1f} sigmas, rival at {rival:.1f}, {_known(evidence)}"
     if not is_tested:
         return Reason.UNCONFIRMED, f"found by a search, not confirmed by the structure about the place ({figures})"
     return Reason.AMBIGUOUS, f"{_wrong(evidence.nats, risk)} ({figures})"
 
 
-def judge_pose(evidence: PoseEvidence, risk: float) -> Refusal | None:
+def judge_pose(evidence: Evidence, risk: float) -> Refusal | None:
     """The reason to refuse a pose by matched features, or None if it is accepted.
 
     Args:
-        evidence: of the pose.
-        risk: probability of a wrong fix that is allowed.
+        evidence: for it.
+        risk: allowed probability of a wrong fix.
     """
     if evidence.nats >= needed_nats(risk):
         return None
-    alarms, wrong = f"log10 of false alarms {evidence.log10_nfa:.1f}", _wrong(evidence.nats, risk)
-    if replace(evidence, null_log10_nfa=0.0).nats >= needed_nats(risk):
-        figures = f"{alarms} against {evidence.null_log10_nfa:.1f}"
+    by_chance = f"by chance once in 10^{evidence.surprise / math.log(10):.1f}"
+    wrong = _wrong(evidence.nats, risk)
+    if replace(evidence, null=0.0).nats >= needed_nats(risk):
+        figures = f"{by_chance} against 10^{evidence.null / math.log(10):.1f}"
         return Reason.AMBIGUOUS, f"the mirrored frame fits the map as well ({figures}): {wrong}"
-    return Reason.BAD_POSE, f"{wrong} ({alarms}, rival at {evidence.rival_share:.0%}, {_known(evidence)})"
+    rival = f"rival once in 10^{evidence.rival / math.log(10):.1f}"
+    return Reason.BAD_POSE, f"{wrong} ({by_chance}, {rival}, {_known(evidence)})"
 
 
 def _wrong(nats: float, risk: float) -> str:
     return f"wrong with probability {1.0 - probability(nats):.1g}, at most {risk:g} is allowed"
 
 
-def _known(evidence: PeakEvidence | PoseEvidence) -> str:
+def _known(evidence: Evidence) -> str:
     off = evidence.prior_chi_square
     return f"chi-square {'unknown' if off is None else f'{off:.1f}'} from the prior"
 

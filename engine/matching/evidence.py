@@ -18,9 +18,6 @@ from engine.geo import chi_square
 from engine.values import Fix
 from engine.window import SPREAD_SIGMAS
 
-INDEPENDENT = 0.7
-"""Independent share of the evidence from matches: keypoints overlap, and several lie on one object. Fitted on
-towns and the places for fitting, so that evidence e for a wrong place occurs at most with probability exp(-e)."""
 RELIABILITY = 0.99
 """Probability that a position or a height is right to within its standard deviation; else it may be anything."""
 _SEARCHED = (2.0 * SPREAD_SIGMAS) ** 2 / (2.0 * math.pi)
@@ -30,37 +27,39 @@ _PLACE_PX = 4.0  # side of the area that counts as one place: enhanced pictures 
 
 
 @dataclass(frozen=True, slots=True)
-class PeakEvidence:
-    """Evidence for the highest peak of a correlation surface, from extreme values of chance.
+class Evidence:
+    """Evidence for the best of many places, from extreme values of chance.
 
-    Chance scores are normal: the best of n places is expected at sqrt(2 ln n) sigmas, and reaches s sigmas with
-    probability n exp(-s^2 / 2). The rival, the best score elsewhere or of the null hypothesis, shows what chance
-    reached. If it is higher than that many places explain, places here look alike, and sigma grows in proportion.
+    Surprise is -log of the probability that chance does as well at one place: the best of n places is expected at
+    log n, and reaches s with probability n exp(-s). The rival, the best elsewhere or of a null hypothesis, shows
+    what chance reached. If that is more than its many places explain, places here look alike, and a surprise is
+    worth so much less.
 
     Attributes:
-        sigmas: Fisher's z of the score, in standard deviations of chance.
-        rival_sigmas: the same of the rival.
-        measured: places among which the rival is the best.
-        tried: places, times headings and heights, among which the peak is the best; at least ``measured``.
+        surprise: of the match.
+        rival: the surprise of the best match elsewhere.
+        measured: places among which the rival is the best; 2 or more.
+        tried: places, times headings and heights, among which the match is the best; at least ``measured``.
         prior_chi_square: of the position against the prior, with two degrees of freedom; None without a prior.
+        height_chi_square: of the height against the telemetry's, with one degree of freedom; None if it was not
+            measured, or the telemetry's is unknown or doubted.
+        null: the surprise of the mirrored frame; 0 if it was not matched, or is among the rivals.
     """
 
-    sigmas: float
-    rival_sigmas: float
+    surprise: float
+    rival: float
     measured: float
     tried: float
     prior_chi_square: float | None
+    height_chi_square: float | None = None
+    null: float = 0.0
 
     @property
     def nats(self) -> float:
         """The sum of all of it."""
-        alike = max(1.0, min(self.rival_sigmas, self.sigmas) / _expected_sigmas(self.measured))
-        seen = (self.sigmas / alike) ** 2 / 2.0 - math.log(self.tried)
-        return max(seen, 0.0) + _of_position(self.prior_chi_square)
-
-
-def _expected_sigmas(places: float) -> float:
-    return math.sqrt(2.0 * math.log(places))
+        alike = max(1.0, min(max(self.rival, self.null), self.surprise) / math.log(self.measured))
+        seen = self.surprise / alike - math.log(self.tried)
+        return max(seen, 0.0) + _of_position(self.prior_chi_square) + _of_height(self.height_chi_square)
 
 
 def independent_places(positions: float) -> float:
@@ -68,9 +67,9 @@ def independent_places(positions: float) -> float:
     return max(positions / _PLACE_PX**2, math.e)
 
 
-def sigmas_of(score: float, sigma: float) -> float:
-    """Fisher's z of a score in [-1, 1] (0 if negative), in standard deviations of a chance score."""
-    return math.atanh(min(max(score, 0.0), 0.999)) / sigma
+def surprise_of(score: float, sigma: float) -> float:
+    """The surprise of a score in [-1, 1], 0 if negative: Fisher's z is normal, with this sigma by chance."""
+    return (math.atanh(min(max(score, 0.0), 0.999)) / sigma) ** 2 / 2.0
 
 
 def prior_chi_square(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> float:
@@ -86,35 +85,6 @@ def prior_chi_square(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> 
     """
     apart_m = np.array([fix.east_m, fix.north_m]) - prior_m
     return chi_square(apart_m, fix.relative_covariance_m2 + sigma_m**2 * np.eye(2))
-
-
-@dataclass(frozen=True, slots=True)
-class PoseEvidence:
-    """Evidence for a pose from matched keypoints.
-
-    Attributes:
-        log10_nfa: log10 of the number of false alarms, the poses that chance would support equally well.
-        prior_chi_square: of the position against the prior, with two degrees of freedom; None without a prior.
-        height_chi_square: of the height against the telemetry's, with one degree of freedom; None if the
-            height is unknown or doubted.
-        rival_share: votes of the best translation elsewhere over those of this one; 0 if matches did not vote and
-            ``log10_nfa`` refers to the pose.
-        null_log10_nfa: log10 of the false alarms that the mirrored frame reaches; 0 if it was not matched.
-    """
-
-    log10_nfa: float
-    prior_chi_square: float | None
-    height_chi_square: float | None
-    rival_share: float = 0.0
-    null_log10_nfa: float = 0.0
-
-    @property
-    def nats(self) -> float:
-        """The sum of all of it."""
-        alarms = max(-self.log10_nfa, 0.0)
-        chance = max(self.rival_share * alarms, -self.null_log10_nfa)
-        seen = INDEPENDENT * math.log(10.0) * max(alarms - chance, 0.0)
-        return seen + _of_position(self.prior_chi_square) + _of_height(self.height_chi_square)
 
 
 def _of_position(chi_square: float | None) -> float:

@@ -176,7 +176,7 @@ def _voted(
     share_px = options.vote_share * slant_m(query, height_m) / (site.gsd_m_per_px * 2.0**level)
     radius_px = max(share_px, 2.0 * options.tolerance_px)
     middle = (np.array(photo.gray.shape[::-1]) - 1.0) / 2.0
-    found = vote(photo_px - middle, map_px, radius_px)
+    found = vote(photo_px - middle, map_px, radius_px, options.pose.distinct_px)
     if found is None:
         return matched
     nadir = similarity(found.turn_deg, found.scale) @ (-photo.offset_px - middle) + found.shift_px

@@ -14,7 +14,7 @@ from engine.geo import attitude_from_rotation
 from engine.maps.landmarks import LandmarkMap
 from engine.matching.acceptance import judge_pose
 from engine.matching.covariance import tilt_covariance
-from engine.matching.evidence import PoseEvidence, is_beyond_doubt, probability
+from engine.matching.evidence import Evidence, is_beyond_doubt, probability
 from engine.matching.feature_matching import NOMINAL_SCALE, Matched, match_views
 from engine.matching.point_finding import PointFinder
 from engine.matching.pose import PoseStats, solve_pose
@@ -43,7 +43,7 @@ class PoseCandidate:
     """
 
     fix: Fix
-    evidence: PoseEvidence
+    evidence: Evidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ class FeatureMatcher:
         null = replace(self, query=mirrored)._find_with(hypothesis)
         if isinstance(null, NoFix):
             return found
-        evidence = replace(found.evidence, null_log10_nfa=min(null.evidence.log10_nfa, 0.0))
+        evidence = replace(found.evidence, null=null.evidence.surprise)
         return PoseCandidate(replace(found.fix, confidence=probability(evidence.nats)), evidence)
 
     def _attempts(self) -> Iterator[tuple[FeatureMatcher, TelemetryHypothesis]]:
@@ -239,10 +239,12 @@ class FeatureMatcher:
             variance = errors.height_sigma_m(height_m) ** 2 + float(fix.covariance_m2[2, 2]) - errors.map_m**2
             ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
             height_chi_square = (fix.up_m - ground_m - height_m) ** 2 / variance
-        log10_nfa, rival_share = stats.log10_nfa, 0.0
         if vote is not None:
-            log10_nfa, rival_share = vote.log10_nfa, vote.rival / vote.votes
-        evidence = PoseEvidence(log10_nfa, query.prior_chi_square(fix), height_chi_square, rival_share)
+            surprise, rival, tried = vote.surprise, vote.rival_surprise, float(vote.tried)
+        else:
+            surprise = (stats.log10_tried - stats.log10_nfa) * math.log(10.0)
+            rival, tried = 0.0, 10.0**stats.log10_tried
+        evidence = Evidence(surprise, rival, tried, tried, query.prior_chi_square(fix), height_chi_square)
         return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
 
 

@@ -16,12 +16,12 @@ from engine.matching.covariance import (
     score_sigma,
 )
 from engine.matching.evidence import (
-    PeakEvidence,
+    Evidence,
     independent_places,
     is_beyond_doubt,
     is_hopeless,
     probability,
-    sigmas_of,
+    surprise_of,
 )
 from engine.values import Fix, Peak, Window
 
@@ -45,7 +45,7 @@ class PeakCandidate:
     peak: Peak
     aligned: Aligned
     fix: Fix
-    evidence: PeakEvidence
+    evidence: Evidence
     searched: bool
     is_tested: bool
 
@@ -92,8 +92,8 @@ def candidate_of(
     fix = fix_of(correlator, aligned, peak, window, searched=searched)
     sigma = score_sigma(rows * columns) if sigma is None else sigma
     measured = places_in(aligned, window)
-    scores = (sigmas_of(peak.score, sigma), sigmas_of(peak.second_score, sigma))
-    evidence = PeakEvidence(*scores, measured, max(tried, measured), query.prior_chi_square(fix))
+    surprise, rival = surprise_of(peak.score, sigma), surprise_of(peak.second_score, sigma)
+    evidence = Evidence(surprise, rival, measured, max(tried, measured), query.prior_chi_square(fix))
     fix = replace(fix, confidence=probability(evidence.nats))
     return PeakCandidate(peak, aligned, fix, evidence, searched, is_tested)
 
@@ -114,8 +114,8 @@ def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
     matters = found.evidence.nats >= query.needed_nats
     null_score = _null_score(correlator, aligned, window, peak.second_score, matters=matters)
     peak = replace(peak, second_score=max(peak.second_score, null_score))
-    rival_sigmas = sigmas_of(peak.second_score, score_sigma(aligned.template.size))
-    evidence = replace(found.evidence, rival_sigmas=rival_sigmas)
+    rival = surprise_of(peak.second_score, score_sigma(aligned.template.size))
+    evidence = replace(found.evidence, rival=rival)
     fix = replace(found.fix, confidence=probability(evidence.nats))
     return replace(found, peak=peak, fix=fix, evidence=evidence, is_tested=True)
 

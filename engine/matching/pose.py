@@ -107,6 +107,7 @@ class PoseStats:
         covariance: (6, 6) of the centre (m) and of a small rotation about the camera's axes (rad).
         inliers: (N,) bool.
         log10_nfa: log10 of the number of false alarms; the lower, the more significant.
+        log10_tried: log10 of the number of poses among which it is the best.
     """
 
     rotation: Array
@@ -114,6 +115,7 @@ class PoseStats:
     covariance: Array
     inliers: Mask
     log10_nfa: float
+    log10_tried: float
 
     @property
     def covariance_center_m2(self) -> Array:
@@ -165,13 +167,13 @@ def solve_pose(
     other = _other_pose(problem, fit, options)
     if other is not None and start is None:
         return None
-    log10_nfa, covariance = _log10_nfa(problem, fit, options), match_covariance(problem, fit)
+    (log10_nfa, log10_tried), covariance = _false_alarms(problem, fit, options), match_covariance(problem, fit)
     if log10_nfa > options.max_log10_nfa or covariance is None:
         return None
     if other is not None:  # the place is known but not the tilt: either pose may be right
         apart = np.append(other.center - fit.center, np.zeros(3))
         covariance = covariance + 0.5 * apart[:, None] * apart
-    return _stats(fit, origin, covariance, known, len(points_m), log10_nfa)
+    return _stats(fit, origin, covariance, known, len(points_m), log10_nfa, log10_tried)
 
 
 def _problem(
@@ -192,7 +194,13 @@ def _problem(
 
 
 def _stats(
-    fit: Fit, origin: Array, covariance: Array, known: NDArray[np.intp], count: int, log10_nfa: float
+    fit: Fit,
+    origin: Array,
+    covariance: Array,
+    known: NDArray[np.intp],
+    count: int,
+    log10_nfa: float,
+    log10_tried: float,
 ) -> PoseStats:
     """The result of a fit to some of the matches, in metres about an origin (3,)."""
     center = fit.center + origin
@@ -204,6 +212,7 @@ def _stats(
         covariance=covariance,
         inliers=inliers,
         log10_nfa=log10_nfa,
+        log10_tried=log10_tried,
     )
 
 
@@ -281,13 +290,14 @@ def _supported(problem: Problem, fit: Fit, options: PoseOptions) -> bool:
 
 
 def _distinct(pixels: Array, options: PoseOptions) -> int:
-    """Return how many cells of the image the pixels (2, N) occupy."""
-    x, y = np.floor(pixels / options.distinct_px).astype(np.int64)
-    return len(set((x * (1 << 32) + y).tolist()))
+    """Return how many of the pixels (2, N) show something of their own."""
+    from engine.kernels import clusters  # numba takes a while to import
+
+    return clusters.count_apart(np.ascontiguousarray(pixels.T), options.distinct_px)
 
 
-def _log10_nfa(problem: Problem, fit: Fit, options: PoseOptions) -> float:
-    """Return log10 of the expected number of poses with as many inliers of N matches by chance.
+def _false_alarms(problem: Problem, fit: Fit, options: PoseOptions) -> tuple[float, float]:
+    """Return log10 of the expected number of poses with as many inliers of N matches by chance, and of all poses.
 
     NFA = (N - 3) C(N, k) C(k, 3) 4 p^(k - 3), k the distinct inliers (Moisan and Stival). p is the probability
     that a wrong match is an inlier: the share of all pairs of a map point with an image point, of other matches
@@ -295,7 +305,7 @@ def _log10_nfa(problem: Problem, fit: Fit, options: PoseOptions) -> float:
     """
     total, k = problem.pixels.shape[1], _distinct(problem.pixels[:, fit.inliers], options)
     if k < options.min_inliers:
-        return math.inf
+        return math.inf, 0.0
     from engine.kernels import clusters  # numba takes a while to import
 
     square = options.reprojection_px**2
@@ -306,13 +316,12 @@ def _log10_nfa(problem: Problem, fit: Fit, options: PoseOptions) -> float:
     extent = np.ptp(problem.pixels, axis=1) + 1
     uniform = math.pi * square / float(extent[0] * extent[1])
     p = min(max(agree / (some.shape[1] * (total - 1)), uniform), 1.0)
-    counts = (
-        _log10_choose(total, k) + _log10_choose(k, _SAMPLE) + math.log10((total - _SAMPLE) * _POSES_PER_SAMPLE)
-    )
-    return counts + (k - _SAMPLE) * math.log10(p)
+    distinct = total * k / np.count_nonzero(fit.inliers)  # among as many fewer in all
+    tried = _log10_choose(k, _SAMPLE) + math.log10((total - _SAMPLE) * _POSES_PER_SAMPLE)
+    return tried + _log10_choose(distinct, k) + (k - _SAMPLE) * math.log10(p), tried
 
 
-def _log10_choose(n: int, k: int) -> float:
+def _log10_choose(n: float, k: int) -> float:
     return (math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)) / math.log(10)
 
 

@@ -32,16 +32,18 @@ class Vote:
         scale: of the orthophoto about its middle.
         voters: (M,) bool, the matches that agree.
         shift_px: (2,) from the orthophoto, turned and scaled, to the map.
-        rival: votes of the best translation elsewhere.
-        log10_nfa: log10 of the number of false alarms: translations on which as many wrong matches would agree.
+        surprise: -log of the probability that as many wrong matches agree on one translation.
+        rival_surprise: the same of the best translation elsewhere.
+        tried: how many translations were compared.
     """
 
     turn_deg: float
     scale: float
     voters: NDArray[np.bool_]
     shift_px: Array
-    rival: int
-    log10_nfa: float
+    surprise: float
+    rival_surprise: float
+    tried: int
 
     @property
     def votes(self) -> int:
@@ -49,13 +51,14 @@ class Vote:
         return int(np.count_nonzero(self.voters))
 
 
-def vote(photo_px: Array, map_px: Array, radius_px: float) -> Vote | None:
+def vote(photo_px: Array, map_px: Array, radius_px: float, distinct_px: float) -> Vote | None:
     """The translation that most matches agree on.
 
     Args:
         photo_px: (M, 2) in the orthophoto, about its middle.
         map_px: (M, 2) on the map.
         radius_px: a match this close to a translation agrees with it.
+        distinct_px: matches nearer to each other in the orthophoto are one piece of evidence.
 
     Returns:
         Vote | None: None without a match. The first of equals, so that a turn needs more votes than no turn.
@@ -77,43 +80,53 @@ def vote(photo_px: Array, map_px: Array, radius_px: float) -> Vote | None:
     shift_px = shifts[voters].mean(axis=0)
     apart = shifts - shift_px
     elsewhere = np.einsum("ij,ij->i", apart, apart) > (_RIVAL_RADII * radius_px) ** 2
-    rival = int(np.count_nonzero(clusters.densest(shifts[elsewhere], radius_px)))
-    log10_nfa = _log10_nfa(photo_px @ similarity(turn_deg, scale).T, map_px, shift_px, voters, radius_px)
-    return Vote(turn_deg, scale, voters, shift_px, rival, log10_nfa)
+    rivals = np.flatnonzero(elsewhere)[clusters.densest(shifts[elsewhere], radius_px)]
+    by_chance = _chance(photo_px @ similarity(turn_deg, scale).T, map_px, shift_px, voters, radius_px)
+    surprise, rival_surprise = (
+        _surprise(photo_px[agreeing], len(map_px), by_chance, distinct_px) for agreeing in (voters, rivals)
+    )
+    tried = len(map_px) * len(TURNS_DEG) * len(SCALES)
+    return Vote(turn_deg, scale, voters, shift_px, surprise, rival_surprise, tried)
 
 
-def _log10_nfa(
-    photo_px: Array, map_px: Array, shift_px: Array, voters: NDArray[np.bool_], radius_px: float
-) -> float:
-    """log10 of the expected number of translations with as many votes if all matches were wrong.
+def _chance(photo_px: Array, map_px: Array, shift_px: Array, voters: NDArray[np.bool_], radius_px: float) -> float:
+    """The probability that a wrong match agrees on a translation.
 
     A match of each orthophoto point with the map point of another match is wrong, but as crowded as right ones:
-    the share of these that agree on the translation is the probability p of a vote by chance. Every match proposes
-    a translation in every turn and scale, and the others agree by a binomial law.
+    it is the share of these that agree.
     """
     from engine.kernels import clusters  # numba takes a while to import
 
-    total, votes = len(map_px), int(np.count_nonzero(voters))
-    if votes < 2:
-        return math.log10(total * len(TURNS_DEG) * len(SCALES))
+    total = len(map_px)
     some = slice(None, None, -(-total // _PAIRED))
     columns = (*(photo_px[some] + shift_px).T, *map_px.T)
     near = clusters.count_near_pairs(*map(np.ascontiguousarray, columns), radius_px)
     agree = near - int(np.count_nonzero(voters[some]))
     extent = np.ptp(map_px - photo_px, axis=0) + 2.0 * radius_px
     uniform = math.pi * radius_px * radius_px / float(extent[0] * extent[1])
-    p = min(max(agree / (len(photo_px[some]) * max(total - 1, 1)), uniform), 1.0)
-    tests = math.log10(total * len(TURNS_DEG) * len(SCALES))
-    return tests + _log10_binomial_tail(total - 1, votes - 1, p)
+    return min(max(agree / (len(photo_px[some]) * max(total - 1, 1)), uniform), 1.0)
 
 
-def _log10_binomial_tail(n: int, k: int, p: float) -> float:
-    """log10 of the probability of k or more of n, by Hoeffding's bound."""
+def _surprise(agreeing_px: Array, total: int, chance: float, distinct_px: float) -> float:
+    """-log of the probability that so many of all matches agree with one of them by chance.
+
+    Of matches that see the same pixels one counts, among as many fewer in all.
+    """
+    from engine.kernels import clusters  # numba takes a while to import
+
+    votes = len(agreeing_px)
+    if votes < 2:
+        return 0.0
+    distinct = clusters.count_apart(np.ascontiguousarray(agreeing_px), distinct_px) / votes
+    return distinct * _binomial_surprise(total - 1, votes - 1, chance)
+
+
+def _binomial_surprise(n: int, k: int, p: float) -> float:
+    """-log of the probability of k or more of n, by Hoeffding's bound."""
     q = k / n
     if q <= p:
         return 0.0
-    divergence = q * math.log(q / p) + ((1.0 - q) * math.log((1.0 - q) / (1.0 - p)) if q < 1.0 else 0.0)
-    return -n * divergence / math.log(10)
+    return n * (q * math.log(q / p) + ((1.0 - q) * math.log((1.0 - q) / (1.0 - p)) if q < 1.0 else 0.0))
 
 
 def similarity(turn_deg: float, scale: float) -> Array:

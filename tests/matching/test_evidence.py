@@ -13,39 +13,34 @@ from hypothesis import strategies as st
 from engine import Fix, Reason
 from engine.matching.acceptance import judge_peak, judge_pose
 from engine.matching.evidence import (
-    PeakEvidence,
-    PoseEvidence,
+    Evidence,
     independent_places,
     nats_of,
     needed_nats,
     prior_chi_square,
     probability,
-    sigmas_of,
+    surprise_of,
 )
 from engine.values import Peak, Timings, Window
 
-PLAIN = PoseEvidence(-10.0, 2.0, 1.0, 0.3)
+PLAIN = Evidence(40.0, 8.0, 1000.0, 1000.0, 2.0, 1.0)
 known = st.one_of(st.none(), st.floats(0, 1e9))
 
 
 @pytest.mark.parametrize(
     ("better", "worse"),
     [
-        ({"log10_nfa": -30.0}, {"log10_nfa": -7.0}),
+        ({"surprise": 70.0}, {"surprise": 30.0}),
         ({"prior_chi_square": 0.0}, {"prior_chi_square": 9.0}),
         ({"height_chi_square": 0.0}, {"height_chi_square": 9.0}),
-        ({"rival_share": 0.1}, {"rival_share": 0.9}),
-        ({}, {"null_log10_nfa": -6.0}),
+        ({"rival": 7.0}, {"rival": 20.0}),
+        ({}, {"null": 20.0}),
+        ({}, {"tried": 1e5}),
     ],
-    ids=lambda changed: " ".join(changed) or "no null",
+    ids=lambda changed: " ".join(changed) or "no more",
 )
-def test_more_evidence_makes_a_pose_more_probable(better, worse):
+def test_more_evidence_makes_a_place_more_probable(better, worse):
     assert replace(PLAIN, **better).nats >= PLAIN.nats > replace(PLAIN, **worse).nats
-
-
-def test_a_rival_with_as_many_votes_leaves_no_evidence_but_the_priors():
-    both = replace(PLAIN, rival_share=1.0)
-    assert both.nats == replace(PLAIN, log10_nfa=0.0).nats < needed_nats(0.01)
 
 
 def test_a_prior_or_a_height_that_is_wrong_costs_no_more_than_its_reliability():
@@ -59,9 +54,9 @@ def test_a_height_that_agrees_says_nothing():
     assert replace(PLAIN, height_chi_square=0.0).nats == replace(PLAIN, height_chi_square=None).nats
 
 
-@given(st.floats(-1e6, 1e6), known, known, st.floats(0, 1), st.floats(-1e6, 0))
-def test_every_pose_has_a_probability(log10_nfa, prior_chi_square, height_chi_square, rival_share, null):
-    evidence = PoseEvidence(log10_nfa, prior_chi_square, height_chi_square, rival_share, null)
+@given(st.floats(0, 1e6), st.floats(0, 1e6), st.floats(2.0, 1e12), known, known, st.floats(0, 1e6))
+def test_every_place_has_a_probability(surprise, rival, places, prior_chi_square, height_chi_square, null):
+    evidence = Evidence(surprise, rival, places, places, prior_chi_square, height_chi_square, null)
     assert 0.0 < probability(evidence.nats) < 1.0
 
 
@@ -70,9 +65,9 @@ def test_a_probability_tells_its_evidence(nats):
     assert nats_of(probability(nats)) == pytest.approx(nats, abs=1e-3)
 
 
-@given(st.floats(1e-12, 0.5), st.floats(-100, 0), known, known)
-def test_what_is_handed_out_is_wrong_with_no_more_than_the_risk(risk, log10_nfa, prior, height):
-    evidence = PoseEvidence(log10_nfa, prior, height)
+@given(st.floats(1e-12, 0.5), st.floats(0, 300), known, known)
+def test_what_is_handed_out_is_wrong_with_no_more_than_the_risk(risk, surprise, prior, height):
+    evidence = Evidence(surprise, 0.0, 1000.0, 1000.0, prior, height)
     handed_out = judge_pose(evidence, risk) is None
     assert handed_out == (evidence.nats >= needed_nats(risk))
     if handed_out and evidence.nats < 30.0:
@@ -80,74 +75,63 @@ def test_what_is_handed_out_is_wrong_with_no_more_than_the_risk(risk, log10_nfa,
 
 
 def test_a_refusal_of_a_pose_tells_its_figures():
-    reason, text = judge_pose(PoseEvidence(-1.5, None, None), 1e-4)
+    weak = Evidence(3.5 * math.log(10.0), 0.0, 1000.0, 1000.0, None)
+    reason, text = judge_pose(weak, 1e-4)
     assert reason is Reason.BAD_POSE
-    for figure in ("0.0001 is allowed", "-1.5", "rival at 0%", "chi-square unknown"):
+    for figure in ("0.0001 is allowed", "10^3.5", "rival once in 10^0.0", "chi-square unknown"):
         assert figure in text
-    assert "chi-square 3.2" in judge_pose(PoseEvidence(-1.5, 3.2, None), 1e-4)[1]
+    assert "chi-square 3.2" in judge_pose(replace(weak, prior_chi_square=3.2), 1e-4)[1]
 
 
 # ------------------------------------------------------------------------------------------------------- peaks
 
-PEAK = PeakEvidence(8.0, 4.5, 1000.0, 1000.0, 2.0)
+PEAK = Evidence(32.0, 10.0, 1000.0, 1000.0, 2.0)
 
 
 def peak(score=0.8, second=0.2, bend=((-0.02, 0.0), (0.0, -0.02))):
     return Peak(10.0, 12.0, score, second, np.array(bend))
 
 
-@pytest.mark.parametrize(
-    ("better", "worse"),
-    [
-        ({"sigmas": 12.0}, {"sigmas": 6.0}),
-        ({"rival_sigmas": 4.0}, {"rival_sigmas": 6.0}),
-        ({"prior_chi_square": 0.0}, {"prior_chi_square": 9.0}),
-        ({}, {"tried": 1e5}),
-    ],
-    ids=lambda changed: " ".join(changed) or "no more tried",
-)
-def test_more_evidence_makes_a_peak_more_probable(better, worse):
-    assert replace(PEAK, **better).nats >= PEAK.nats > replace(PEAK, **worse).nats
-
-
 def test_the_best_of_many_places_is_worth_what_chance_makes_of_so_many():
     """n draws reach s sigmas with a probability of n exp(-s^2 / 2); without a prior that is all."""
-    alone = PeakEvidence(8.0, 0.0, 1000.0, 1000.0, None)
+    alone = Evidence(32.0, 0.0, 1000.0, 1000.0, None)
     assert alone.nats == pytest.approx(32.0 - math.log(1000.0))
     assert replace(alone, tried=1e6).nats == pytest.approx(32.0 - math.log(1e6))
 
 
-def test_look_alikes_make_a_sigma_as_much_more():
-    """By hand: of 1000 places the best is expected at 3.72 sigmas; a rival at twice that halves every sigma."""
-    expected = math.sqrt(2.0 * math.log(1000.0))
-    twins = PeakEvidence(16.0, 2.0 * expected, 1000.0, 1000.0, None)
-    assert twins.nats == pytest.approx(PeakEvidence(8.0, expected, 1000.0, 1000.0, None).nats)
+def test_look_alikes_make_a_surprise_worth_as_much_less():
+    """By hand: of 1000 places the best is expected at log 1000; a rival at four times that makes all a quarter."""
+    expected = math.log(1000.0)
+    twins = Evidence(128.0, 4.0 * expected, 1000.0, 1000.0, None)
+    assert twins.nats == pytest.approx(Evidence(32.0, expected, 1000.0, 1000.0, None).nats)
 
 
-def test_a_rival_that_is_as_high_leaves_no_evidence_but_the_priors():
-    for sigmas in (4.0, 40.0):
-        assert PeakEvidence(sigmas, sigmas, 1000.0, 1000.0, None).nats == pytest.approx(0.0, abs=1e-9)
+@given(st.floats(7.0, 1e6), st.booleans())
+def test_a_rival_that_is_as_good_leaves_no_evidence_but_the_priors(surprise, mirrored):
+    rival = {"null" if mirrored else "rival": surprise}
+    alike = replace(Evidence(surprise, 0.0, 1000.0, 1000.0, None), **rival)
+    assert alike.nats == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_rate_of_alarms_is_what_the_evidence_allows():
     """Peaks of 20,000 surfaces of chance: evidence e comes no more often than exp(-e)."""
     rng = np.random.default_rng(1)
-    scores = np.sort(rng.normal(size=(20_000, 500)), axis=1)
-    nats = np.array([PeakEvidence(high, rival, 500.0, 500.0, None).nats for rival, high in scores[:, -2:]])
+    scores = np.sort(rng.normal(size=(20_000, 500)), axis=1)[:, -2:] ** 2 / 2.0
+    nats = np.array([Evidence(high, rival, 500.0, 500.0, None).nats for rival, high in scores])
     for e in (1.0, 2.0, 4.0, 6.0):
         assert np.mean(nats > e) <= math.exp(-e)
 
 
 def test_a_score_is_counted_in_sigmas_of_fishers_z():
-    assert sigmas_of(0.5, 0.1) == pytest.approx(math.atanh(0.5) / 0.1)
-    assert sigmas_of(-0.5, 0.1) == 0.0
+    assert surprise_of(0.5, 0.1) == pytest.approx((math.atanh(0.5) / 0.1) ** 2 / 2.0)
+    assert surprise_of(-0.5, 0.1) == 0.0
     assert independent_places(1600.0) == pytest.approx(100.0)
     assert independent_places(0.0) == pytest.approx(math.e)
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(1e-3, 1), st.floats(3.0, 1e12), known)
 def test_every_peak_has_a_probability(score, second, sigma, places, off):
-    evidence = PeakEvidence(sigmas_of(score, sigma), sigmas_of(second, sigma), places, places, off)
+    evidence = Evidence(surprise_of(score, sigma), surprise_of(second, sigma), places, places, off)
     assert 0.0 < probability(evidence.nats) < 1.0
 
 
@@ -165,8 +149,8 @@ def test_a_place_is_held_against_the_errors_of_both():
     [
         (PEAK, 1e-3, None),
         (PEAK, 1e-9, Reason.AMBIGUOUS),
-        (replace(PEAK, rival_sigmas=7.9), 1e-3, Reason.AMBIGUOUS),
-        (replace(PEAK, sigmas=3.0, rival_sigmas=2.0), 1e-3, Reason.LOW_SCORE),  # what chance reaches
+        (replace(PEAK, rival=31.2), 1e-3, Reason.AMBIGUOUS),
+        (replace(PEAK, surprise=4.5, rival=2.0), 1e-3, Reason.LOW_SCORE),  # what chance reaches
         (replace(PEAK, prior_chi_square=40.0), 1e-6, Reason.AMBIGUOUS),
     ],
 )
@@ -174,7 +158,7 @@ def test_a_peak_is_believed_if_the_risk_allows_it(evidence, risk, reason):
     verdict = judge_peak(peak(), evidence, risk)
     assert (verdict and verdict[0]) is reason
     if verdict:
-        assert f"{evidence.sigmas:.1f}" in verdict[1]  # the figures behind the reason
+        assert f"{math.sqrt(2.0 * evidence.surprise):.1f}" in verdict[1]  # the figures behind the reason
 
 
 def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_not_believed():
@@ -184,6 +168,6 @@ def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_not_believed():
 
 
 def test_what_a_search_fitted_waits_for_the_structure_about_the_place():
-    verdict = judge_peak(peak(), replace(PEAK, sigmas=50.0), 1e-4, is_tested=False)
+    verdict = judge_peak(peak(), replace(PEAK, surprise=1250.0), 1e-4, is_tested=False)
     assert verdict
     assert verdict[0] is Reason.UNCONFIRMED

@@ -4,11 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from engine.kernels.clusters import count_near_pairs, densest
-from engine.matching.votes import SCALES, TURNS_DEG, _log10_binomial_tail, similarity, vote
+from engine.kernels.clusters import count_apart, count_near_pairs, densest
+from engine.matching.votes import SCALES, TURNS_DEG, _binomial_surprise, similarity, vote
 
-RADIUS_PX = 4.0
+RADIUS_PX, DISTINCT_PX = 4.0, 2.0
 
 
 def planted(rng, *, right, wrong, turn_deg=0.0, scale=1.0, shift=(31.0, -12.0)):
@@ -23,36 +25,51 @@ def planted(rng, *, right, wrong, turn_deg=0.0, scale=1.0, shift=(31.0, -12.0)):
 @pytest.mark.parametrize("scale", SCALES)
 def test_one_match_in_ten_gives_the_turn_the_scale_and_the_place(turn_deg, scale):
     photo, on_map = planted(np.random.default_rng(3), right=20, wrong=180, turn_deg=turn_deg, scale=scale)
-    found = vote(photo, on_map, RADIUS_PX)
+    found = vote(photo, on_map, RADIUS_PX, DISTINCT_PX)
     assert (found.turn_deg, found.scale) == (turn_deg, scale)
     assert found.voters[:20].all()
     assert np.hypot(*(found.shift_px - (31.0, -12.0))) < 1.0
-    assert found.log10_nfa < -10
-    assert found.rival < 0.5 * found.votes
+    assert found.surprise - math.log(found.tried) > 23.0
+    assert found.rival_surprise < 0.5 * found.surprise
 
 
-def test_wrong_matches_are_taken_for_a_place_no_oftener_than_their_false_alarms_say():
-    """The number of false alarms bounds the expected number of such votes: of 200 draws 20 may have 0.1."""
+def test_chance_makes_a_vote_no_oftener_than_its_surprise_says():
+    """One of n translations surprises by log n + e with a probability of at most exp(-e): 20 of 200 by 2.3."""
     rng = np.random.default_rng(5)
-    alarms = [vote(*planted(rng, right=0, wrong=60), RADIUS_PX).log10_nfa for _ in range(200)]
-    assert sum(alarm < -1.0 for alarm in alarms) <= 20
-    assert sum(alarm < -3.0 for alarm in alarms) == 0
+    votes = [vote(*planted(rng, right=0, wrong=60), RADIUS_PX, DISTINCT_PX) for _ in range(200)]
+    excess = [found.surprise - math.log(found.tried) for found in votes]
+    assert sum(e > 2.3 for e in excess) <= 20
+    assert sum(e > 6.9 for e in excess) == 0
+
+
+def test_matches_that_see_the_same_pixels_are_one_piece_of_evidence():
+    """Four keypoints on each of 12 corners say no more than one on each."""
+    rng = np.random.default_rng(8)
+    photo, on_map = planted(rng, right=12, wrong=60)
+    jitter = rng.normal(0, 0.3, (4, 72, 2))
+    once = vote(photo, on_map, RADIUS_PX, DISTINCT_PX)
+    often = vote((photo + jitter).reshape(-1, 2), (on_map + jitter).reshape(-1, 2), RADIUS_PX, DISTINCT_PX)
+    assert once.votes >= 12
+    assert often.votes >= 48
+    assert often.surprise == pytest.approx(once.surprise, rel=0.25)
 
 
 def test_crowded_matches_count_less():
     """Where all points of frame and map lie in two small crowds, agreeing on their distance says nothing."""
     rng = np.random.default_rng(7)
     photo, on_map = rng.normal(0, 2, (40, 2)), rng.normal((31.0, -12.0), 2, (40, 2))
-    assert vote(photo, on_map, RADIUS_PX).votes > 20
-    assert vote(photo, on_map, RADIUS_PX).log10_nfa > -3
+    found = vote(photo, on_map, RADIUS_PX, DISTINCT_PX)
+    assert found.votes > 20
+    assert found.surprise - math.log(found.tried) < 6.9
 
 
 def test_a_second_place_with_as_many_votes_is_a_rival():
     rng = np.random.default_rng(9)
     photo = rng.uniform(-80, 80, (60, 2))
     on_map = photo + np.where(np.arange(60)[:, None] < 30, (31.0, -12.0), (-60.0, 50.0))
-    found = vote(photo, on_map, RADIUS_PX)
-    assert found.votes == found.rival == 30
+    found = vote(photo, on_map, RADIUS_PX, DISTINCT_PX)
+    assert found.votes == 30
+    assert found.rival_surprise == pytest.approx(found.surprise, rel=0.2)  # as many, but crowded otherwise
 
 
 def test_the_densest_place_is_where_brute_force_finds_it():
@@ -79,14 +96,24 @@ def test_near_pairs_are_counted_one_by_one():
     assert count_near_pairs(*a[:, :0], *b, 6.0) == 0
 
 
+@given(st.integers(0, 60), st.floats(0.1, 50.0), st.integers(0, 2**32 - 1))
+def test_points_apart_are_a_set_that_nothing_can_join(count, apart, seed):
+    points = np.random.default_rng(seed).uniform(0.0, 100.0, (count, 2))
+    kept: list[np.ndarray] = []
+    for point in points:
+        if all(np.hypot(*(point - other)) > apart for other in kept):
+            kept.append(point)
+    assert count_apart(points, apart) == len(kept)
+
+
 def test_without_matches_nothing_is_voted_for():
-    assert vote(np.zeros((0, 2)), np.zeros((0, 2)), RADIUS_PX) is None
-    alone = vote(np.zeros((1, 2)), np.ones((1, 2)), RADIUS_PX)
+    assert vote(np.zeros((0, 2)), np.zeros((0, 2)), RADIUS_PX, DISTINCT_PX) is None
+    alone = vote(np.zeros((1, 2)), np.ones((1, 2)), RADIUS_PX, DISTINCT_PX)
     assert alone.votes == 1
-    assert alone.log10_nfa > 0
+    assert alone.surprise == 0.0 < math.log(alone.tried)
 
 
 def test_the_tail_is_bounded_from_above():
     for n, k, p in ((40, 6, 0.01), (200, 20, 0.02), (10, 10, 0.3), (50, 1, 0.5)):
         exact = sum(math.comb(n, i) * p**i * (1 - p) ** (n - i) for i in range(k, n + 1))
-        assert math.log10(exact) <= _log10_binomial_tail(n, k, p) <= 0.0
+        assert 0.0 <= _binomial_surprise(n, k, p) <= -math.log(exact)
