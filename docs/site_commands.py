@@ -31,8 +31,8 @@ def _table(name: str) -> str:
 
 
 def _cell(metavar: str | None) -> str:
-    return f"`{_text(metavar)}`" if metavar else ""
+    return f"<code>{_text(metavar)}</code>" if metavar else ""
 
 
 def _text(words: str) -> str:
-    return " ".join(words.split()).replace("|", r"\|")
+    return " ".join(words.split()).replace("|", "&#124;")
