@@ -70,7 +70,7 @@ sbom:
 		--output-file dist/sbom.cdx.json $(SBOM_OF)
 
 docs: $(VENV)/dev.stamp
-	$(BIN)/python -m mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 
 bench: $(VENV)/bench.stamp
 	mkdir -p .benchmarks

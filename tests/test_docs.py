@@ -8,6 +8,7 @@ import pytest
 from typer.main import get_command
 
 from docs.draw_architecture import drawn, members, picture
+from docs.site_commands import with_options
 from docs.site_roles import on_page_content
 from engine.options import AssumedErrors, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, SiftOptions
 from engine.values import Reason
@@ -224,6 +225,15 @@ def test_every_option_is_in_the_lines_of_its_command(command, options):
     lines = next(iter(re.findall(r"^```\n(.*?)^```", section, re.MULTILINE | re.DOTALL)), "")
     stated = set(re.findall(r"--[a-z][a-z-]*", lines)) - {"--force"}
     assert stated == set(options)
+
+
+def test_the_site_shows_the_help_of_every_option():
+    page = read("docs/command-line.md")
+    shown = with_options(page)
+    for command, options in command_options():
+        section = shown.split(f"## {command}\n", 1)[1].split("\n## ", 1)[0]
+        rows = re.findall(r"^\| `(--[a-z-]+)[^|]*\| .* \| .+ \|$", section, re.MULTILINE)
+        assert set(options) <= set(rows), command
 
 
 def test_the_changelog_names_the_version():

@@ -1,5 +1,6 @@
 """The examples run as they stand: in a flight folder, beside a stand-in autopilot, in a ROS that is none."""
 
+import json
 import os
 import re
 import runpy
@@ -73,6 +74,25 @@ def test_beside_an_autopilot_that_hears_where_it_was(firmware, flight):
     assert came["fixes"] >= 1
     assert came["fixes"] == int(re.search(r"sent=(\d+)", said)[1])
     assert came["median_m"] < 3.0
+
+
+def test_the_notebook_prints_what_it_shows(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names = {"__name__": "first_fix"}
+    for cell in json.loads((EXAMPLES / "first_fix.ipynb").read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
+            shown = [line for output in cell["outputs"] for line in output.get("text", [])]
+            assert words(capsys.readouterr().out) == words("".join(shown))
+    assert len(names["fixes"]) == len(names["flight"])
+    assert max(names["errors_m"]) < 1.0
+
+
+def words(text):
+    """Text without its figures, whose last digits differ between processors."""
+    return re.sub(r"\d+\.\d+", "#", text)
 
 
 def test_a_video_and_its_telemetry_are_the_flight_again(flight, monkeypatch):

@@ -106,7 +106,9 @@ StartOption = Annotated[
 ]
 MethodOption = Annotated[
     str | None,
-    typer.Option("--method", metavar="auto|ncc|sift|learned", help="auto: ncc, then sift if ncc refuses."),
+    typer.Option(
+        "--method", metavar="auto|ncc|sift|learned", help="auto: ncc and sift, each checking the other (default)."
+    ),
 ]
 DeviceOption = Annotated[
     str | None,

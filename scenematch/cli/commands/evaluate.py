@@ -35,7 +35,7 @@ def evaluate(
     """Score finished tracks and redraw their reports.
 
     For one run: prints the errors and rewrites summary.json and report.html in its folder. For several: draws one
-        page with all tracks on one map and one time axis, and a table.
+    page with all tracks on one map and one time axis, and a table.
     """
     from scenematch.runs.evaluation import evaluate as evaluate_track
     from scenematch.runs.evaluation import recorded_files

@@ -46,7 +46,8 @@ def info(
 ) -> None:
     """Show size, ground sample distance, CRS and bounds.
 
-    Other commands take them as --settings input.map_bounds=W,S,E,N and --settings input.map_crs=EPSG:N.
+    For a picture without georeference --map-bounds and --map-crs say where it lies; other commands take them as
+    --settings input.map_bounds=W,S,E,N and --settings input.map_crs=EPSG:N.
     """
     from scenematch.runs.map_input import MapInput
 
