@@ -176,7 +176,9 @@ def _voted(
     share_px = options.vote_share * slant_m(query, height_m) / (site.gsd_m_per_px * 2.0**level)
     radius_px = max(share_px, 2.0 * options.tolerance_px)
     middle = (np.array(photo.gray.shape[::-1]) - 1.0) / 2.0
-    found = vote(photo_px - middle, map_px, radius_px, options.pose.distinct_px)
+    # A finer picture shows the same objects by more pixels: no more of its matches are independent.
+    distinct_px = options.pose.distinct_px * max(1.0, options.scale / NOMINAL_SCALE)
+    found = vote(photo_px - middle, map_px, radius_px, distinct_px)
     if found is None:
         return matched
     nadir = similarity(found.turn_deg, found.scale) @ (-photo.offset_px - middle) + found.shift_px
