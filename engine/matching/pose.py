@@ -293,7 +293,7 @@ def _distinct(pixels: Array, options: PoseOptions) -> int:
     """Return how many of the pixels (2, N) show something of their own."""
     from engine.kernels import clusters  # numba takes a while to import
 
-    return clusters.count_apart(np.ascontiguousarray(pixels.T), options.distinct_px)
+    return int(clusters.count_apart(np.ascontiguousarray(pixels.T), options.distinct_px))
 
 
 def _false_alarms(problem: Problem, fit: Fit, options: PoseOptions) -> tuple[float, float]:

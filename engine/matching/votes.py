@@ -100,7 +100,7 @@ def _chance(photo_px: Array, map_px: Array, shift_px: Array, voters: NDArray[np.
     total = len(map_px)
     some = slice(None, None, -(-total // _PAIRED))
     columns = (*(photo_px[some] + shift_px).T, *map_px.T)
-    near = clusters.count_near_pairs(*map(np.ascontiguousarray, columns), radius_px)
+    near = int(clusters.count_near_pairs(*map(np.ascontiguousarray, columns), radius_px))
     agree = near - int(np.count_nonzero(voters[some]))
     extent = np.ptp(map_px - photo_px, axis=0) + 2.0 * radius_px
     uniform = math.pi * radius_px * radius_px / float(extent[0] * extent[1])
@@ -117,8 +117,8 @@ def _surprise(agreeing_px: Array, total: int, chance: float, distinct_px: float)
     votes = len(agreeing_px)
     if votes < 2:
         return 0.0
-    distinct = clusters.count_apart(np.ascontiguousarray(agreeing_px), distinct_px) / votes
-    return distinct * _binomial_surprise(total - 1, votes - 1, chance)
+    distinct = int(clusters.count_apart(np.ascontiguousarray(agreeing_px), distinct_px))
+    return distinct / votes * _binomial_surprise(total - 1, votes - 1, chance)
 
 
 def _binomial_surprise(n: int, k: int, p: float) -> float:
