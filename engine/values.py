@@ -67,9 +67,6 @@ class Frame:
         heading_sigma_deg: standard deviation of the heading.
         tilt_sigma_deg: standard deviation of roll and of pitch.
         velocity_sigma_mps: standard deviation of the velocity, per axis; None takes the navigator's assumption.
-        tilt_lag_deg: by how much roll and pitch may have changed since they were measured; adds to their
-            standard deviation.
-        heading_lag_deg: the same for the heading.
         height_correction_m: added to the vehicle's own height because images showed a different one. The cause may
             be a wrong focal length, so the correction also makes a fix less certain.
         is_doubted: heading and height may be far off, so NCC searches for both; set by a navigator.
@@ -92,8 +89,6 @@ class Frame:
     heading_sigma_deg: float | None = None
     tilt_sigma_deg: float | None = None
     velocity_sigma_mps: float | None = None
-    tilt_lag_deg: float | None = None
-    heading_lag_deg: float | None = None
     height_correction_m: float | None = None
     is_doubted: bool = False
 
@@ -111,10 +106,6 @@ class Frame:
             sigma = getattr(self, name)
             if sigma is not None and not 0.0 < sigma <= MAX_SIGMA_M:
                 raise TelemetryError(f"{name}: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {sigma}")
-        for name in ("tilt_lag_deg", "heading_lag_deg"):
-            lag_deg = getattr(self, name)
-            if lag_deg is not None and not 0.0 <= lag_deg < math.inf:
-                raise TelemetryError(f"{name}: expected 0 degrees or more, got {lag_deg}")
 
     @classmethod
     def from_bgr(cls, image: NDArray[np.uint8], *args: Any, **known: Any) -> Frame:

@@ -58,9 +58,8 @@ def map_sigma_of(site: OrthoMap) -> float:
 
 
 def with_frame_accuracy(frame: Frame, errors: AssumedErrors) -> AssumedErrors:
-    """The errors, with the frame's stated accuracies in place of assumed ones, and with its lag."""
-    sigmas = (frame.heading_sigma_deg, frame.tilt_sigma_deg, frame.height_sigma_m)
-    return _with_accuracy(errors, *sigmas, frame.tilt_lag_deg or 0.0, frame.heading_lag_deg or 0.0)
+    """The errors, with the frame's stated accuracies in place of assumed ones."""
+    return _with_accuracy(errors, frame.heading_sigma_deg, frame.tilt_sigma_deg, frame.height_sigma_m)
 
 
 @lru_cache(maxsize=16)  # a frame asks several times
@@ -69,16 +68,11 @@ def _with_accuracy(
     heading_sigma_deg: float | None,
     tilt_sigma_deg: float | None,
     height_sigma_m: float | None,
-    tilt_lag_deg: float,
-    heading_lag_deg: float,
 ) -> AssumedErrors:
     stated = {"heading_deg": heading_sigma_deg, "tilt_deg": tilt_sigma_deg}
     if height_sigma_m is not None:
         stated |= {"height_m": height_sigma_m, "height_share": _NO_SHARE}
     known = {name: value for name, value in stated.items() if value is not None}
-    for name, lag_deg in (("tilt_deg", tilt_lag_deg), ("heading_deg", heading_lag_deg)):
-        if lag_deg:
-            known[name] = math.hypot(known.get(name, getattr(errors, name)), lag_deg)
     return replace(errors, **known) if known else errors
 
 

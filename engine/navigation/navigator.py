@@ -37,7 +37,7 @@ from engine.navigation.repeats import Repeats
 from engine.navigation.state import NavigatorState
 from engine.navigation.telemetry_errors import Calibration, TelemetryErrors
 from engine.navigation.velocity_check import VelocityCheck
-from engine.options import NavigatorOptions
+from engine.options import MatcherOptions, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason
 
@@ -78,7 +78,9 @@ class Navigator:
         self._options = o = options or NavigatorOptions()
         self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
         self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
-        self._errors = TelemetryErrors(o)
+        options_of = getattr(matcher, "options", None)
+        assumed = options_of.ncc.errors if isinstance(options_of, MatcherOptions) else None
+        self._errors = TelemetryErrors(o, assumed)
         self._pictures = odometry_of(matcher) if o.odometry else None
         self._motion: GroundMotion | None = None  # up to the newest frame
         self._repeats = Repeats()

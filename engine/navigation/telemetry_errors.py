@@ -1,22 +1,54 @@
-"""Errors of the telemetry that fixes reveal in flight: of attitude and of height, as a calibration."""
+"""Errors of the telemetry that last, as states of one Kalman filter that fixes measure: a calibration in flight.
+
+Without a receiver's velocity an estimator lets roll and pitch drift by a degree or two and the heading by five,
+and a mount is never quite level. A braking vehicle turns by tens of degrees a second, so an attitude that is 0.1 s
+late is degrees off. A barometer's height, or a focal length, is off by a share.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
 
-from engine.navigation.attitude_bias import AttitudeBias, Bias
-from engine.navigation.attitude_lag import AttitudeLag
-from engine.options import NavigatorOptions
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.geo import wrap_heading_deg
+from engine.options import AssumedErrors, NavigatorOptions
 from engine.values import Fix, Frame
 
-# Standard deviations of a measured height, by refinement or features, as a share of the telemetry's.
-_HEIGHT_SHARE, _HEIGHT_M = 0.01, 1.0
-_FIRST_SHARE = 0.2  # error of the height before a picture measured it, as a share
-_MIN_SHARE, _MIN_SIGMAS, _MIN_FIXES = 0.03, 3.0, 3  # of a height error before it is corrected
+Array = NDArray[np.float64]
+
+# States: what to add to roll, pitch and heading (deg) and to the height (a share); how late the attitude is (s).
+_ANGLES, _HEIGHT, _LAG = slice(0, 3), 3, 4
+_FIRST_SHARE = 0.2  # error of the height before a picture measured it
+_WALK = np.array([0.2, 0.2, 0.5, 1e-3, 0.01])  # standard deviations of the states' change in one second
+# Standard deviations of a measured attitude, refined or by features alone; of a measured height, and a share.
+_REFINED_DEG, _FEATURES_DEG, _HEIGHT_M, _HEIGHT_SHARE = 0.6, 2.0, 1.0, 0.01
+_MAX_SIGMAS = 3.0  # larger differences are clipped to this: one fix may be wrong
+_SCATTER_SHARE = 0.2  # weight of a new difference in the mean square
+_MAX_INTERVAL_S = 0.5  # between frames; over longer ones the turn rates are unknown
+_MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
+_MAX_LAG_DEG = 180.0  # timestamps in a wrong unit make rates of any size
+_MIN_FIXES = 3  # fewer are not used for correction: one of them may be wrong
+_MIN_SIGMAS, _MIN_SHARE = 2.0, 0.03  # of an error before it is corrected: every frame's matching allows for less
 _FIRST_SEARCH, _SEARCH_GROWTH = 3, 1.5  # refusals in a row before a search; growth until the next
 _SEARCHED_HEADING_DEG = 12.0  # standard deviation of a searched heading
-_WALK_SHARE = 1e-3  # change of the height's error in one second, as a share
+
+
+@dataclass(frozen=True, slots=True)
+class Bias:
+    """The correction to add to a biased attitude, as far as it is known.
+
+    Attributes:
+        roll_deg, pitch_deg, heading_deg: to be added to the telemetry's.
+        sigma_deg: standard deviations of the three.
+    """
+
+    roll_deg: float
+    pitch_deg: float
+    heading_deg: float
+    sigma_deg: tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +58,7 @@ class Calibration:
     Attributes:
         attitude: of roll, pitch and heading. A mount error and a principal point error look the same.
         attitude_lag_s: how late the attitude is.
-        attitude_lag_sigma_s: standard deviation of the lag.
+        attitude_lag_sigma_s: standard deviation of the lag of one frame.
         height_m: to be added to the height above ground. If the focal length is too short by some share, heights
             are too low by that share: ``height_factor``.
         height_factor: ratio of the measured height to the telemetry's.
@@ -46,16 +78,23 @@ class TelemetryErrors:
 
     Args:
         options: of the navigator; they state how far off attitudes may be.
+        assumed: errors of telemetry that states none.
     """
 
-    def __init__(self, options: NavigatorOptions) -> None:
-        self._options = options
-        self._lag = AttitudeLag(options.attitude_lag_s, options.attitude_jitter_s)
-        self._bias = self._unknown_bias()
-        self._height_m: float | None = None  # of the newest frame
-        self._off_m = self._variance_m2 = 0.0
+    def __init__(self, options: NavigatorOptions, assumed: AssumedErrors | None = None) -> None:
+        o, self._assumed = options, assumed or AssumedErrors()
+        self._jitter_s = o.attitude_jitter_s
+        self._first = np.array(
+            [o.tilt_bias_deg, o.tilt_bias_deg, o.heading_bias_deg, _FIRST_SHARE, o.attitude_lag_s]
+        )
+        self._mean, self._covariance = np.zeros(5), np.diag(self._first**2)
+        self._scatter_deg2 = np.zeros(3)  # mean square of recent differences in excess of the expected
+        self._fixes = 0  # that measured more than the lag
         self._time_s: float | None = None
-        self._heights = 0
+        self._stamp_ns: int | None = None
+        self._angles_deg: Array | None = None  # of the newest frame, as they came
+        self._rates_dps = np.zeros(3)
+        self._height_m: float | None = None
         self._next_search = _FIRST_SEARCH  # refusals in a row at which heading and height are searched
         self._settling = 0  # further fixes needed before a search's result is applied
         self._searched = False  # whether the newest frame is the first of a search
@@ -63,13 +102,21 @@ class TelemetryErrors:
     @property
     def calibration(self) -> Calibration:
         """All that was learnt."""
-        known = self._heights > 0 and self._height_m is not None
+        sigmas = np.sqrt(np.diag(self._covariance))
+        known, height_m, share = self._fixes > 0, self._height_m, float(self._mean[_HEIGHT])
+        is_high = known and height_m is not None
         return Calibration(
-            self._bias.bias, self._lag.mean_s, self._lag.sigma_s,
-            self._off_m if known else None,
-            1.0 + self._off_m / self._height_m if known and self._height_m else None,
-            math.sqrt(self._variance_m2) if known else None,
-        )  # fmt: skip
+            self._bias(sigmas) if known else None,
+            float(self._mean[_LAG]),
+            math.hypot(float(sigmas[_LAG]), self._jitter_s),
+            share * height_m if is_high and height_m else None,
+            1.0 + share if is_high else None,
+            float(sigmas[_HEIGHT]) * height_m if is_high and height_m else None,
+        )
+
+    def _bias(self, sigmas: Array) -> Bias:
+        (roll, pitch, heading), (a, b, c) = self._mean[_ANGLES].tolist(), sigmas[_ANGLES].tolist()
+        return Bias(roll, pitch, heading, (a, b, c))
 
     def corrected(self, frame: Frame, time_s: float, *, late: bool, refusals: int = 0) -> Frame:
         """The frame with the attitude at its capture and the height that pictures measured.
@@ -80,19 +127,13 @@ class TelemetryErrors:
         Args:
             frame: the newest, or a late one.
             time_s: time of the newest frame on any one clock.
-            late: whether the frame is a late one.
+            late: whether the frame is a late one, whose turn rates are unknown.
             refusals: number of refusals in a row before it.
         """
         if late:
-            return self._at_its_height(self._bias.corrected(frame))
-        self._height_m = frame.height_agl_m
-        if self._time_s is not None and self._height_m is not None:
-            walk_m = _WALK_SHARE * self._height_m
-            self._variance_m2 += walk_m**2 * max(time_s - self._time_s, 0.0)
-        self._time_s = time_s
-        shown = self._lag.corrected(frame)
-        self._bias.follow(shown, time_s)
-        shown = self._at_its_height(self._bias.corrected(shown))
+            return self.without_errors(frame)
+        self._follow(frame, time_s)
+        shown = self.without_errors(frame, self._rates_dps)
         if frame.heading_deg is None or self._height_m is None:
             return shown
         self._searched = refusals >= self._next_search
@@ -104,52 +145,127 @@ class TelemetryErrors:
             self._next_search = _FIRST_SEARCH
         return replace(shown, is_doubted=True) if self._settling else shown
 
-    def without_errors(self, frame: Frame) -> Frame:
-        """The newest frame with the known bias of attitude and height removed; call before :meth:`corrected`."""
-        return self._at_its_height(self._bias.corrected(frame))
+    def without_errors(self, frame: Frame, rates_dps: Array | None = None) -> Frame:
+        """A frame without the errors known so far; what is not known of them widens its standard deviations.
+
+        Args:
+            frame: the newest or a late one.
+            rates_dps: (3,) of roll, pitch and heading; None if they are unknown.
+
+        Returns:
+            Frame: the same if nothing is known to be off.
+        """
+        return self._at_its_height(self._in_its_attitude(frame, np.zeros(3) if rates_dps is None else rates_dps))
+
+    def _in_its_attitude(self, frame: Frame, rates_dps: Array) -> Frame:
+        """The frame with the attitude at its capture."""
+        angles = _angles_of(frame)
+        if angles is None:
+            return frame
+        variance = np.diag(self._covariance)
+        tilt_deg = frame.tilt_sigma_deg or self._assumed.tilt_deg
+        heading_deg = frame.heading_sigma_deg or self._assumed.heading_deg
+        off: Array = np.zeros(3)
+        wider_deg2 = rates_dps**2 * (variance[_LAG] + self._jitter_s**2)
+        if self._fixes >= _MIN_FIXES:
+            is_off = np.abs(self._mean[_ANGLES]) > _MIN_SIGMAS * np.array([tilt_deg, tilt_deg, heading_deg])
+            off = is_off.astype(np.float64)
+            wider_deg2 = wider_deg2 + variance[_ANGLES] * off + self._scatter_deg2
+        wider_deg2 = np.minimum(wider_deg2, _MAX_LAG_DEG**2)
+        if not wider_deg2.any():
+            return frame
+        roll, pitch, heading = (angles + self._mean[_ANGLES] * off + rates_dps * self._mean[_LAG]).tolist()
+        return replace(
+            frame,
+            roll_deg=roll,
+            pitch_deg=max(-90.0, min(pitch, 90.0)),
+            heading_deg=wrap_heading_deg(heading),
+            tilt_sigma_deg=math.sqrt(tilt_deg**2 + float(wider_deg2[:2].max())),
+            heading_sigma_deg=math.sqrt(heading_deg**2 + float(wider_deg2[2])),
+        )
 
     def _at_its_height(self, frame: Frame) -> Frame:
         """The frame at the height that pictures measured, if it differs by more than a match tolerates."""
-        if frame.height_agl_m is None or self._heights < _MIN_FIXES:
+        share, sigma = float(self._mean[_HEIGHT]), math.sqrt(self._covariance[_HEIGHT, _HEIGHT])
+        is_known = self._fixes >= _MIN_FIXES and abs(share) > max(_MIN_SHARE, _MAX_SIGMAS * sigma)
+        if frame.height_agl_m is None or not is_known or share <= -1.0:
             return frame
-        least_m = max(_MIN_SHARE * frame.height_agl_m, _MIN_SIGMAS * math.sqrt(self._variance_m2))
-        height_m = frame.height_agl_m + self._off_m
-        if abs(self._off_m) < least_m or height_m <= 0.0:
-            return frame
-        return replace(frame, height_agl_m=height_m, height_correction_m=self._off_m)
+        off_m = share * frame.height_agl_m
+        return replace(frame, height_agl_m=frame.height_agl_m + off_m, height_correction_m=off_m)
 
     def note(self, fix: Fix, ground_m: float | None) -> None:
         """Learn from an accepted fix of the newest frame.
 
         Args:
-            fix: an accepted fix.
+            fix: an accepted fix. One without a height did not measure its attitude.
             ground_m: height of the ground below it; None if the ground is assumed flat, where a slope looks like a
-                tilt.
+                tilt: only the lag is learnt then, from turns.
         """
         self._settling = max(self._settling - 1, 0)
         if self._searched:  # earlier estimates were wrong
-            self._searched, self._heights = False, 0
-            self._bias.doubt(_SEARCHED_HEADING_DEG)
-        self._lag.note(fix, self._bias.bias)
+            self._searched = False
+            self.forget()
+            self._covariance[2, 2] = max(self._covariance[2, 2], _SEARCHED_HEADING_DEG**2)
+        seen, known = fix.attitude, self._angles_deg
+        if fix.up_m is None:
+            return
+        if seen is not None and known is not None and abs(seen.pitch_deg) <= _MAX_PITCH_DEG:
+            apart = np.array([seen.roll_deg, seen.pitch_deg, seen.heading_deg]) - known
+            off = np.array([math.remainder(angle, 360.0) for angle in apart.tolist()])
+            design = np.zeros((3, 5))
+            design[:, _ANGLES], design[:, _LAG] = np.eye(3), self._rates_dps
+            noise_deg = _REFINED_DEG if fix.stage in ("refined", "verified") else _FEATURES_DEG
+            noise_deg2 = noise_deg**2 + (self._rates_dps * self._jitter_s) ** 2
+            excess = self._update(off, design, noise_deg2, only_lag=ground_m is None)
+            if ground_m is not None and self._fixes:
+                beyond_deg2 = np.clip(excess, 0.0, self._first[_ANGLES] ** 2)
+                self._scatter_deg2 += _SCATTER_SHARE * (beyond_deg2 - self._scatter_deg2)
         if ground_m is None:
             return
-        self._bias.note(fix)
-        if fix.up_m is not None and self._height_m is not None:
-            self._note_height(fix.up_m - ground_m - self._height_m, self._height_m)
+        if self._height_m is not None:
+            share = (fix.up_m - ground_m) / self._height_m - 1.0
+            noise = np.array([(_HEIGHT_M / self._height_m) ** 2 + _HEIGHT_SHARE**2])
+            self._update(np.array([share]), np.eye(5)[[_HEIGHT]], noise)
+        self._fixes += 1
 
     def forget(self) -> None:
-        """Forget what was learnt: it came from a wrong position, or no longer holds."""
-        self._bias = self._unknown_bias()
-        self._heights, self._off_m, self._variance_m2 = 0, 0.0, 0.0
+        """Forget what was learnt, but for the lag: it came from a wrong position, or no longer holds."""
+        lag_s, lag_s2 = self._mean[_LAG], self._covariance[_LAG, _LAG]
+        self._mean, self._covariance = np.zeros(5), np.diag(self._first**2)
+        self._mean[_LAG], self._covariance[_LAG, _LAG] = lag_s, lag_s2
+        self._scatter_deg2, self._fixes = np.zeros(3), 0
 
-    def _unknown_bias(self) -> AttitudeBias:
-        return AttitudeBias(self._options.tilt_bias_deg, self._options.heading_bias_deg)
+    def _follow(self, frame: Frame, time_s: float) -> None:
+        """Take the newest frame: let the states walk, and compute its turn rates since the last frame."""
+        elapsed_s = 0.0 if self._time_s is None else max(time_s - self._time_s, 0.0)
+        self._covariance = self._covariance + np.diag(_WALK**2 * elapsed_s)
+        narrower = np.minimum(self._first / np.sqrt(np.diag(self._covariance)), 1.0)  # no vaguer than at first
+        self._covariance *= narrower[:, None] * narrower
+        last, last_ns = self._angles_deg, self._stamp_ns
+        self._time_s, self._stamp_ns = time_s, frame.timestamp_ns
+        self._angles_deg, self._height_m, self._rates_dps = _angles_of(frame), frame.height_agl_m, np.zeros(3)
+        if last is None or last_ns is None or self._stamp_ns is None or self._angles_deg is None:
+            return
+        interval_s = (self._stamp_ns - last_ns) * 1e-9
+        if 0.0 < interval_s <= _MAX_INTERVAL_S:
+            steps = [math.remainder(float(step), 360.0) for step in self._angles_deg - last]
+            self._rates_dps = np.array(steps) / interval_s
 
-    def _note_height(self, off_m: float, height_m: float) -> None:
-        if not self._heights:
-            self._variance_m2 = (_FIRST_SHARE * height_m) ** 2
-        noise_m2 = _HEIGHT_M**2 + (_HEIGHT_SHARE * height_m) ** 2
-        gain = self._variance_m2 / (self._variance_m2 + noise_m2)
-        self._off_m += gain * (off_m - self._off_m)
-        self._variance_m2 *= 1.0 - gain
-        self._heights += 1
+    def _update(self, measured: Array, design: Array, noise: Array, *, only_lag: bool = False) -> Array:
+        """A Kalman update (Schmidt's if only the lag is learnt); by how much squares exceed the expected."""
+        total = design @ self._covariance @ design.T + np.diag(noise)
+        most = _MAX_SIGMAS * np.sqrt(np.diag(total))
+        off = np.clip(measured - design @ self._mean, -most, most)
+        gain = self._covariance @ design.T @ np.linalg.inv(total)
+        if only_lag:
+            gain[:_LAG] = 0.0
+        self._mean = self._mean + gain @ off
+        left = np.eye(5) - gain @ design
+        self._covariance = left @ self._covariance @ left.T + (gain * noise) @ gain.T
+        return np.asarray(off**2 - np.diag(total))
+
+
+def _angles_of(frame: Frame) -> Array | None:
+    """Roll, pitch and heading, if all are known."""
+    known = (frame.roll_deg, frame.pitch_deg, frame.heading_deg)
+    return None if None in known else np.array(known, np.float64)

@@ -314,10 +314,11 @@ def test_the_time_that_odometry_takes_is_the_frames(monkeypatch, total_ms, searc
 
 def test_odometry_flies_at_the_height_that_fixes_showed(monkeypatch):
     navigator = Navigator(Blind(), START, options=NavigatorOptions(odometry=True))
-    errors = navigator._errors
-    errors._height_m = HEIGHT_M
+    errors, flown = navigator._errors, frame(picture((0.0, 0.0), LEVEL))
+    higher = SimpleNamespace(attitude=None, up_m=1.2 * HEIGHT_M, stage="refined")
     for _ in range(5):
-        errors._note_height(0.2 * HEIGHT_M, HEIGHT_M)
+        errors.corrected(flown, 0.0, late=False)
+        errors.note(higher, 0.0)
     for k in range(2):
         navigator.update(frame(picture((5.0 * k, 0.0), LEVEL), k * INTERVAL_S))
     assert navigator.ground_motion.moved_m[0] == pytest.approx(5.0 * 1.2, rel=0.05)

@@ -1,69 +1,202 @@
-"""The calibration that a flight gives: attitude, its lag and the height, each within its own sigma."""
+"""Lasting errors of the telemetry: learnt from fixes within their own sigmas, taken off new and late frames."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from engine import Navigator, Prior, SceneMatcher
+from engine.errors import OptionError
 from engine.navigation.telemetry_errors import TelemetryErrors
-from engine.options import NavigatorOptions
-from engine.values import Attitude, Fix, Frame, Timings, Window
+from engine.options import ACCEPT_ALL, AssumedErrors, NavigatorOptions
+from engine.values import Attitude, Fix, Frame, NoFix, Reason, Timings, Window
 from scenematch.simulator import plan_flight
+from tests.support.fields import fields_of
 from tests.support.towns import drawn_town
 
 IMAGE = np.zeros((4, 4), np.uint8)
-GROUND_M, HEIGHT_M = 30.0, 150.0
+GROUND_M, HEIGHT_M, INTERVAL_S = 30.0, 150.0, 0.1
+ASSUMED = AssumedErrors()
+ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 
 
-def fix_of(attitude, up_m=GROUND_M + HEIGHT_M):
+def fix_of(attitude, up_m=GROUND_M + HEIGHT_M, stage="refined"):
+    roll, pitch, heading = attitude
     return Fix(timestamp_ns=None, lat_deg=0.0, lon_deg=0.0, east_m=0.0, north_m=0.0, up_m=up_m,
-               covariance_m2=np.eye(3), attitude=attitude, score=0.9, method="ncc", stage="refined",
-               window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0))  # fmt: skip
+               covariance_m2=np.eye(3), attitude=Attitude(roll, pitch, heading % 360.0), score=0.9, method="ncc",
+               stage=stage, window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0))  # fmt: skip
 
 
-def flown(off_deg=(0.0, 0.0, 0.0), off_m=0.0, frames=40, seed=1, ground_m=GROUND_M):
-    """What is learnt of a telemetry that reads too much by this."""
-    errors, rng = TelemetryErrors(NavigatorOptions()), np.random.default_rng(seed)
-    shown = None
+def angles(time_s):
+    """Roll, pitch and heading of a vehicle that brakes and turns through north, up to 30 degrees a second."""
+    return np.array(
+        [6.0 * math.sin(2.0 * time_s), 12.0 * math.sin(2.5 * time_s), 350.0 + 20.0 * math.sin(1.5 * time_s)]
+    )
+
+
+def frame_at(time_s, off=(0.0, 0.0, 0.0), lag_s=0.0, off_m=0.0, **changes):
+    roll, pitch, heading = (angles(time_s - lag_s) + off).tolist()
+    return replace(Frame(IMAGE, round(time_s * 1e9), HEIGHT_M + off_m, heading % 360.0, roll, pitch), **changes)
+
+
+def errors_of(frame, truth):
+    known = np.array([frame.roll_deg, frame.pitch_deg, frame.heading_deg])
+    return np.array([math.remainder(float(v), 360.0) for v in known - truth])
+
+
+def flown(off=(0.0, 0.0, 0.0), *, lag_s=0.0, off_m=0.0, frames=100, seed=1, noise_deg=0.4, ground_m=GROUND_M,
+          measured=True, options=None, **changes):  # fmt: skip
+    """What is learnt of a telemetry that reads too much by this, and the frames as they were corrected."""
+    errors, rng, shown = TelemetryErrors(options or NavigatorOptions()), np.random.default_rng(seed), []
     for k in range(frames):
-        true = np.array([3.0 * math.sin(0.3 * k), 2.0 * math.cos(0.2 * k), (40.0 + k) % 360.0])
-        stated = true + off_deg
-        roll, pitch, heading = stated.tolist()
-        frame = Frame(IMAGE, round(k * 2e8), HEIGHT_M + off_m, heading % 360.0, roll, pitch)
-        shown = errors.corrected(frame, 0.2 * k, late=False)
-        measured = true + rng.normal(0.0, 0.4, 3)
-        errors.note(fix_of(Attitude(*measured), GROUND_M + HEIGHT_M + rng.normal(0.0, 0.5)), ground_m)
+        time_s = k * INTERVAL_S
+        shown.append(errors.corrected(frame_at(time_s, off, lag_s, off_m, **changes), time_s, late=False))
+        up_m = GROUND_M + HEIGHT_M + rng.normal(0.0, 0.5) if measured else None
+        errors.note(fix_of(angles(time_s) + rng.normal(0.0, noise_deg, 3), up_m), ground_m)
     return errors, shown
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_what_is_off_is_recovered_within_three_sigma(seed):
-    errors, _ = flown((2.0, -1.5, 5.0), 10.0, seed=seed)
+@given(
+    off=st.tuples(st.floats(0.9, 3.0), st.floats(-3.0, -0.9), st.floats(-8.0, -2.1)),
+    lag_s=st.floats(0.0, 0.15),
+    off_m=st.floats(-20.0, 20.0),
+    seed=st.integers(0, 1000),
+)
+def test_what_is_off_is_learnt_within_its_sigma_and_taken_off(off, lag_s, off_m, seed):
+    errors, frames = flown(off, lag_s=lag_s, off_m=off_m, seed=seed)
     found = errors.calibration
-    for value, sigma, truth in zip(
-        (found.attitude.roll_deg, found.attitude.pitch_deg, found.attitude.heading_deg),
-        found.attitude.sigma_deg, (-2.0, 1.5, -5.0), strict=True,
-    ):  # fmt: skip
-        assert abs(value - truth) < 3.0 * sigma
-    assert abs(found.height_m + 10.0) < 3.0 * found.height_sigma_m
-    assert found.height_factor == pytest.approx(150.0 / 160.0, abs=0.01)
+    left = np.add([found.attitude.roll_deg, found.attitude.pitch_deg, found.attitude.heading_deg], off)
+    assert np.all(np.abs(left) <= 4.0 * np.array(found.attitude.sigma_deg))
+    assert abs(found.attitude_lag_s - lag_s) < 0.02
+    assert abs(found.height_m + off_m) < 4.0 * found.height_sigma_m
+    assert found.height_factor == pytest.approx(HEIGHT_M / (HEIGHT_M + off_m), abs=0.01)
+    last = frames[-1]
+    assert np.abs(errors_of(last, angles(99 * INTERVAL_S))).max() < 2.0
+    if abs(off_m) > 6.0:
+        assert last.height_agl_m == pytest.approx(HEIGHT_M, abs=1.5)
+        assert last.height_agl_m - last.height_correction_m == pytest.approx(HEIGHT_M + off_m)
 
 
-def test_attitude_and_height_are_corrected_and_the_height_says_by_how_much():
-    """A height that contradicts the pictures stays a contradiction: the focal length may be what is wrong."""
-    _, shown = flown((0.0, 0.0, 8.0), 20.0)
-    assert math.remainder(shown.heading_deg - 79.0, 360.0) == pytest.approx(0.0, abs=0.6)
-    assert shown.height_agl_m == pytest.approx(HEIGHT_M, abs=1.0)
-    assert shown.height_agl_m - shown.height_correction_m == pytest.approx(HEIGHT_M + 20.0)
+def test_what_is_assumed_of_any_telemetry_is_not_corrected():
+    errors, frames = flown((0.4, -0.4, 1.5), off_m=3.0, noise_deg=0.0)
+    assert errors.calibration.attitude.roll_deg == pytest.approx(-0.4, abs=0.1)
+    left = np.array([errors_of(frame, angles(k * INTERVAL_S)) for k, frame in enumerate(frames)])[50:]
+    assert np.median(left, axis=0) == pytest.approx([0.4, -0.4, 1.5], abs=0.1)
+    assert (frames[-1].height_agl_m, frames[-1].height_correction_m) == (HEIGHT_M + 3.0, None)
 
 
-def test_an_error_of_the_height_that_a_match_bears_is_left():
-    _, shown = flown(off_m=3.0)
-    assert (shown.height_agl_m, shown.height_correction_m) == (HEIGHT_M + 3.0, None)
+def test_an_unknown_lag_widens_the_attitude_of_a_vehicle_that_turns():
+    _, frames = flown(lag_s=0.1, measured=False)
+    here = angles(99 * INTERVAL_S - 0.1)
+    rates = np.abs(here - angles(99 * INTERVAL_S - 0.2)) / INTERVAL_S * math.hypot(0.1, 0.03)
+    assert frames[-1].tilt_sigma_deg == pytest.approx(math.hypot(ASSUMED.tilt_deg, rates[:2].max()))
+    assert frames[-1].heading_sigma_deg == pytest.approx(math.hypot(ASSUMED.heading_deg, rates[2]))
+    assert errors_of(frames[-1], here) == pytest.approx([0.0, 0.0, 0.0])  # nothing is corrected on suspicion
+    _, stated = flown(lag_s=0.1, measured=False, tilt_sigma_deg=2.0)
+    assert stated[-1].tilt_sigma_deg == pytest.approx(math.hypot(2.0, rates[:2].max()))
+
+
+def test_a_calm_flight_is_as_it_was():
+    errors = TelemetryErrors(NavigatorOptions())
+    for k in range(5):
+        frame = Frame(IMAGE, k * 100_000_000, HEIGHT_M, 10.0, 1.0, -2.0)
+        assert errors.corrected(frame, 0.1 * k, late=False) is frame
+        errors.note(fix_of((1.0, -2.0, 10.0)), GROUND_M)
+
+
+@pytest.mark.parametrize("changes", [{"timestamp_ns": None}, *({name: None} for name in ANGLES)])
+def test_without_stamp_or_attitude_there_is_no_rate(changes):
+    _, frames = flown(lag_s=0.1, frames=4, measured=False, **changes)
+    given = [frame_at(k * INTERVAL_S, lag_s=0.1, **changes) for k in range(4)]
+    assert list(map(fields_of, frames)) == list(map(fields_of, given))
+
+
+def test_frames_far_apart_have_no_rate_and_stamps_of_another_unit_a_bounded_one():
+    errors = TelemetryErrors(NavigatorOptions())
+    for k in range(4):
+        frame = frame_at(2.0 * k, lag_s=0.1)
+        assert errors.corrected(frame, 2.0 * k, late=False) is frame
+    turned = errors.corrected(frame_at(6.2, timestamp_ns=6_000_000_200), 6.2, late=False)  # that was milliseconds
+    assert turned.tilt_sigma_deg <= 181.0
+    assert turned.heading_sigma_deg <= 181.0
+
+
+def test_an_attitude_that_is_simply_wrong_is_no_lag_of_seconds():
+    errors = TelemetryErrors(NavigatorOptions())
+    for k in range(100):
+        frame = frame_at(k * INTERVAL_S)
+        turned = replace(frame, roll_deg=-frame.roll_deg, pitch_deg=-frame.pitch_deg)
+        errors.corrected(turned, k * INTERVAL_S, late=False)
+        errors.note(fix_of(angles(k * INTERVAL_S)), GROUND_M)
+    assert abs(errors.calibration.attitude_lag_s) <= 0.3
+
+
+def test_a_bias_that_changes_is_followed():
+    errors = TelemetryErrors(NavigatorOptions())
+    for k in range(300):
+        off = (0.0, 0.0, -4.0 if k < 150 else 4.0)
+        errors.corrected(frame_at(k * INTERVAL_S, off), k * INTERVAL_S, late=False)
+        errors.note(fix_of(angles(k * INTERVAL_S)), GROUND_M)
+    assert errors.calibration.attitude.heading_deg == pytest.approx(-4.0, abs=0.5)
+
+
+def test_one_wild_attitude_moves_it_by_little():
+    errors, _ = flown(noise_deg=0.0)
+    errors.corrected(frame_at(10.0), 10.0, late=False)
+    errors.note(fix_of(angles(10.0) + np.array([20.0, -20.0, 90.0])), GROUND_M)
+    known = errors.calibration.attitude
+    assert max(abs(known.roll_deg), abs(known.pitch_deg)) < 0.5
+    assert abs(known.heading_deg) < 1.0
+
+
+def test_differences_that_scatter_widen_the_errors():
+    calm = Frame(IMAGE, None, HEIGHT_M, 40.0, 0.0, 0.0)
+    widths = [flown(noise_deg=d)[0].without_errors(calm).tilt_sigma_deg or ASSUMED.tilt_deg for d in (0.3, 3.0)]
+    assert widths[0] < 0.7
+    assert widths[1] > 0.8  # at most hypot(0.37, 1), by the bias's own sigma
+
+
+@pytest.mark.parametrize("stage", ["refined", "fine"])
+def test_an_unsure_attitude_counts_less(stage):
+    errors = TelemetryErrors(NavigatorOptions())
+    errors.corrected(Frame(IMAGE, 0, HEIGHT_M, 350.0, 0.0, 0.0), 0.0, late=False)
+    errors.note(fix_of((2.0, 0.0, 350.0), stage=stage), GROUND_M)
+    noise_deg = {"refined": 0.6, "fine": 2.0}[stage]
+    assert errors.calibration.attitude.roll_deg == pytest.approx(2.0 / (1.0 + noise_deg**2), rel=1e-6)  # by hand
+
+
+def test_one_fix_alone_takes_nothing_off():
+    _, frames = flown((6.0, -6.0, 20.0), frames=2)
+    assert errors_of(frames[-1], angles(INTERVAL_S)) == pytest.approx([6.0, -6.0, 20.0])
+
+
+def test_a_bias_within_what_the_frame_states_of_itself_is_left():
+    errors, _ = flown((0.0, 0.0, 4.0))
+    for sigma_deg, left_deg in ((None, 0.0), (3.0, 4.0)):
+        frame = replace(Frame(IMAGE, None, HEIGHT_M, 44.0, 0.0, 0.0), heading_sigma_deg=sigma_deg)
+        assert errors.without_errors(frame).heading_deg == pytest.approx(40.0 + left_deg, abs=0.5)
+
+
+def test_the_baseline_takes_telemetry_as_it_is():
+    _, frames = flown((0.0, 0.0, -6.0), lag_s=0.1, options=ACCEPT_ALL)
+    for k, frame in enumerate(frames):
+        stated = frame_at(k * INTERVAL_S, (0.0, 0.0, -6.0), 0.1)
+        assert errors_of(frame, (stated.roll_deg, stated.pitch_deg, stated.heading_deg)) == pytest.approx(
+            [0.0] * 3
+        )
+        assert (frame.tilt_sigma_deg or ASSUMED.tilt_deg) == pytest.approx(ASSUMED.tilt_deg)
+
+
+def test_a_lag_that_is_none_is_named():
+    with pytest.raises(OptionError, match="attitude_lag_s: expected a number above 0, got -1"):
+        NavigatorOptions(attitude_lag_s=-1.0)
 
 
 def refused(frames, frame=None):
@@ -87,7 +220,7 @@ def test_after_a_fix_frames_are_doubted_until_three_fixes_settled_what_is_off():
     errors, _ = refused(4)
     doubted = []
     for k in range(6):
-        errors.note(fix_of(Attitude(0.0, 0.0, 30.0)), GROUND_M)
+        errors.note(fix_of((0.0, 0.0, 30.0)), GROUND_M)
         shown = errors.corrected(Frame(IMAGE, None, HEIGHT_M, 40.0, 0.0, 0.0), 1.0 + 0.2 * k, late=False)
         doubted.append(shown.is_doubted)
     assert doubted == [True, True, False, False, False, False]
@@ -98,23 +231,66 @@ def test_nothing_is_known_before_a_fix_nor_after_a_jump():
     errors = TelemetryErrors(NavigatorOptions())
     found = errors.calibration
     assert (found.attitude, found.height_m, found.height_factor, found.height_sigma_m) == (None, None, None, None)
-    errors, _ = flown((0.0, 0.0, 8.0), 20.0)
+    errors, _ = flown((0.0, 0.0, 8.0), off_m=20.0)
     errors.forget()
     assert (errors.calibration.attitude, errors.calibration.height_m) == (None, None)
 
 
 def test_over_ground_that_is_taken_for_flat_nothing_but_the_lag_is_learnt():
-    errors, _ = flown((2.0, 2.0, 8.0), 20.0, ground_m=None)
+    errors, _ = flown((2.0, 2.0, 8.0), lag_s=0.1, off_m=20.0, ground_m=None)
     assert (errors.calibration.attitude, errors.calibration.height_m) == (None, None)
+    assert errors.calibration.attitude_lag_s == pytest.approx(0.1, abs=0.05)
 
 
 def test_a_late_frame_is_corrected_and_teaches_nothing():
     errors, _ = flown((0.0, 0.0, 8.0))
     before = errors.calibration
-    late = replace(Frame(IMAGE, 0, HEIGHT_M, 48.0, 0.0, 0.0))
+    late = Frame(IMAGE, 0, HEIGHT_M, 48.0, 0.0, 0.0)
     shown = errors.corrected(late, 0.0, late=True)
     assert math.remainder(shown.heading_deg - 40.0, 360.0) == pytest.approx(0.0, abs=0.6)
     assert errors.calibration == before
+
+
+class Measuring:
+    """A matcher whose fixes measure another heading than the frame's, or that refuses."""
+
+    def __init__(self, heading_deg):
+        self.site = SimpleNamespace(
+            is_searchable=True,
+            has_surface=True,
+            gsd_m_per_px=1.0,
+            georeference_sigma_m=0.0,
+            ground_at=lambda _: 0.0,
+        )
+        self.heading_deg, self.frames, self.refuses = heading_deg, [], False
+
+    def locate(self, frame, prior=None, budget=None):
+        self.frames.append(frame)
+        if self.refuses:
+            return NoFix(reason=Reason.LOW_SCORE, timestamp_ns=frame.timestamp_ns)
+        return replace(fix_of((0.0, 0.0, self.heading_deg), HEIGHT_M), timestamp_ns=frame.timestamp_ns)
+
+
+def test_the_navigator_takes_it_off_new_and_late_frames_and_forgets_it_when_it_leads_nowhere():
+    matcher, numbers = Measuring(-6.0), itertools.count()
+
+    def level_at(time_s):  # a picture like no other: one that repeats is refused
+        image = np.full((8, 8), next(numbers) % 256, np.uint8)
+        still = {"east_velocity_mps": 0.0, "north_velocity_mps": 0.0}
+        return Frame(image, round(time_s * 1e9), HEIGHT_M, 0.0, 0.0, 0.0, **still)
+
+    navigator = Navigator(matcher, Prior(east_m=0.0, north_m=0.0, sigma_m=5.0))
+    for k in range(30):
+        navigator.update(level_at(0.1 * k))
+    assert navigator.calibration.attitude.heading_deg == pytest.approx(-6.0, abs=0.3)
+    assert matcher.frames[-1].heading_deg == pytest.approx(354.0, abs=0.3)
+    navigator.update(level_at(2.55))  # a late one
+    assert matcher.frames[-1].heading_deg == pytest.approx(354.0, abs=0.3)
+    matcher.refuses = True
+    for k in range(15):
+        navigator.update(level_at(3.0 + 0.1 * k))
+    assert navigator.calibration.attitude is None
+    assert matcher.frames[-1].heading_deg == 0.0
 
 
 @pytest.mark.slow
