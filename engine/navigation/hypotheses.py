@@ -1,7 +1,7 @@
 """Hypotheses: places supported by matches of successive frames, moved by odometry while evidence adds up.
 
 A match that is not accepted is not lost: the next frames speak for its place, or against it. What a match adds is
-counted by the ground that is new (:mod:`engine.navigation.evidence`). Matches that the matcher itself doubts count
+counted by the ground that is new (:mod:`engine.navigation.odds`). Matches that the matcher itself doubts count
 for new ground alone, and must leave every rival behind: track before detect, in a bounded set.
 """
 
@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from engine.matching.evidence import RELIABILITY
-from engine.navigation.evidence import (
+from engine.navigation.motion import DriftModel, OdometrySample, PositionEstimate, en_m
+from engine.navigation.odds import (
     Sources,
     agreement_log_odds,
     log_odds,
@@ -22,7 +23,6 @@ from engine.navigation.evidence import (
     new_ground_share,
     repeated_log_odds,
 )
-from engine.navigation.motion import DriftModel, OdometrySample, PositionEstimate, en_m
 from engine.values import MAX_SIGMA_M, Fix
 
 MAX_HYPOTHESES = 16

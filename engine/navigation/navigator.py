@@ -13,14 +13,6 @@ from engine.budget import Budget, Deadline
 from engine.matching.covariance import map_sigma_of
 from engine.matching.evidence import RELIABILITY
 from engine.navigation.anchors import Anchor, RecentAnchors
-from engine.navigation.evidence import (
-    MAX_PROBABILITY,
-    Sources,
-    log_odds,
-    match_log_odds,
-    position_of,
-    probability,
-)
 from engine.navigation.hypotheses import Hypotheses, Hypothesis, Match
 from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
 from engine.navigation.motion import (
@@ -31,6 +23,14 @@ from engine.navigation.motion import (
     PositionEstimate,
     en_m,
     is_valid,
+)
+from engine.navigation.odds import (
+    MAX_PROBABILITY,
+    Sources,
+    log_odds,
+    match_log_odds,
+    position_of,
+    probability,
 )
 from engine.navigation.odometry import VisualOdometry, odometry_of
 from engine.navigation.repeats import Repeats

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.matching.covariance import map_sigma_of
-from engine.navigation.evidence import position_of
+from engine.navigation.odds import position_of
 from engine.orthomap import OrthoMap
 from engine.values import Frame, Prior
 from scenematch.check.causes import findings, is_known

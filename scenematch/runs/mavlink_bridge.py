@@ -13,8 +13,8 @@ from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError, require
 from engine.matching import METHODS
 from engine.matching.matcher import SceneMatcher
-from engine.navigation.evidence import position_of
 from engine.navigation.live import LiveOptions
+from engine.navigation.odds import position_of
 from engine.options import MatcherOptions, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.realtime import Realtime, check_realtime, set_realtime

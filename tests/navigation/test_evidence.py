@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from engine import Fix, Frame, Navigator, Prior, Reason, Timings, Window
-from engine.navigation.evidence import (
+from engine.navigation.motion import PositionEstimate
+from engine.navigation.odds import (
     MAX_PROBABILITY,
     agreement_log_odds,
     log_odds,
@@ -18,7 +19,6 @@ from engine.navigation.evidence import (
     new_ground_share,
     repeated_log_odds,
 )
-from engine.navigation.motion import PositionEstimate
 
 IMAGE = np.zeros((8, 8), np.uint8)
 SECOND = 1_000_000_000
