@@ -228,7 +228,8 @@ def run_mavlink_bridge(
     if supervise:
         check_supervision(matcher.device)
         become_worker(progress)
-    start = _resumed(last_fix.prior(settings.live_options().max_speed_mps), start, site, progress)
+    resumed = _resumed(last_fix.prior(settings.live_options().max_speed_mps), site, progress)
+    start = resumed or start
 
     # Before the link: a bench autopilot takes off as soon as the bridge listens.
     pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))
@@ -237,8 +238,9 @@ def run_mavlink_bridge(
             bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
                 origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
-                check_gnss=link.check_gnss, system_id=link.system_id, component_id=link.component_id, key=key,
-                watch=watcher, on_sent=last_fix.keep, gimbal_mount=camera.mount if files.gimbal else None,
+                check_gnss=link.check_gnss, resumed=resumed is not None, system_id=link.system_id,
+                component_id=link.component_id, key=key, watch=watcher, on_sent=last_fix.keep,
+                gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
@@ -254,14 +256,14 @@ def run_mavlink_bridge(
             return bridge.status
 
 
-def _resumed(last: Prior | None, start: Prior | None, site: OrthoMap, progress: Progress) -> Prior | None:
-    """The last fix of the previous bridge or worker, unless it is too old."""
+def _resumed(last: Prior | None, site: OrthoMap, progress: Progress) -> Prior | None:
+    """The last fix of the previous bridge or worker, unless there is none or the map file has changed."""
     if last is None:
-        return start
+        return None
     try:
         check_position("last fix", last, site, OptionError)
-    except OptionError:  # the map file has changed
-        return start
+    except OptionError:
+        return None
     progress.message(f"continues from the last fix, whose uncertainty has grown by {last.sigma_m:.0f} m")
     return last
 
