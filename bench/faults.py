@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from bench import RESULTS
 from bench.inputs.faults import Fault, FlightInputs, faults, load
-from bench.pages.text import rewrite, table
+from bench.pages.text import rewrite, shown, table
 from engine import Fix, Navigator, Prior, SceneMatcher
 from engine.navigation.telemetry_errors import Calibration
 from engine.runtime.threads import set_threads
@@ -145,11 +145,6 @@ def diagnosed(inputs: FlightInputs, fault: Fault) -> tuple[str, str]:
     return verdict, "; ".join(f"{finding.cause}: {finding.text}" for finding in found)
 
 
-def shown(value: float | None, digits: int = 2) -> str:
-    """A figure, or a dash."""
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
 def _row(found: Cell) -> str:
     return (
         f"{found.flight:18s} {found.fault:38s} {found.method:5s} {found.fixed:3d} of {found.frames:3d}  "
@@ -186,7 +181,9 @@ def lines_of(cells: list[Cell]) -> list[str]:
             far = max(
                 (found.largest_m for found in of_fault.values() if found.largest_m is not None), default=None
             )
-            rows.append([name, *counts, shown(far, 1), shown(nees, 1), next(iter(of_fault.values())).named])
+            rows.append(
+                [name, *counts, shown(far, ".1f"), shown(nees, ".1f"), next(iter(of_fault.values())).named]
+            )
         frames = max(found.frames for found in of_flight)
         columns = [f"`{flight}`, {frames} frames: fixed, false", *methods, "largest m", "NEES", "named"]
         lines += table(columns, rows)

@@ -43,15 +43,8 @@ class Row:
     def cells(self) -> list[str]:
         p50, p99 = np.percentile(self.times_ms, [50.0, 99.0])
         rate = 1e3 * self.batch / float(np.mean(self.times_ms))
-        return [
-            self.task,
-            f"{p50:.3f}",
-            f"{p99:.3f}",
-            f"{rate:.0f}",
-            f"{self.batch}",
-            self.apart,
-            *map(str, self.copies),
-        ]
+        figures = [f"{p50:.3f}", f"{p99:.3f}", f"{rate:.0f}", f"{self.batch}"]
+        return [self.task, *figures, self.apart, *map(str, self.copies)]
 
 
 def timed(call: Callable[[], Any], device: torch.device, rounds: int) -> list[float]:

@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.faults import Flown, fly, shown, stamps_of, start_of
+from bench.faults import Flown, fly, stamps_of, start_of
 from bench.inputs.faults import FlightInputs, late, lens, load, mounted, raised, turned
+from bench.pages.text import shown
 from engine.navigation.telemetry_errors import Calibration
 from engine.runtime.threads import set_threads
 from scenematch.check import Finding, diagnose

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bench.pages.text import machine, paragraph, table
+from bench.pages.text import machine, paragraph, table_of
 
 TITLES = {
     "gazebo-a1": "town A1, drawn by Gazebo",
@@ -90,37 +90,11 @@ def write(docs: Path, runs: list[Run], variants: list[Run]) -> None:
 
 
 def _table(runs: list[Run], first: str) -> list[str]:
-    columns = [
-        first,
-        "fixes",
-        "RMS m",
-        "median m",
-        "wrong",
-        "false",
-        "agreeing",
-        "height RMS m",
-        "attitude RMS deg",
-    ]
-    return table([*columns, "median ms"], [_cells(run) for run in runs])
-
-
-def _cells(run: Run) -> list[str]:
-    def shown(value: float | None, form: str = ".2f") -> str:
-        return "-" if value is None or not np.isfinite(value) else format(value, form)
-
-    got = run.summary
-    return [
-        run.who,
-        str(got["fixes"]),
-        shown(got["rms_m"]),
-        shown(got["median_m"]),
-        str(got["wrong_over_10m"]),
-        str(got["false_fixes"]),
-        shown(run.inlier_share),
-        shown(got["height_rms_m"]),
-        shown(run.attitude_rms_deg),
-        shown(got["latency_ms"]["p50"], ".1f"),
-    ]
+    rows = [{**run.summary, **asdict(run), "p50_ms": run.summary["latency_ms"]["p50"]} for run in runs]
+    found = (("fixes", "fixes", "d"), ("RMS m", "rms_m", ".2f"), ("median m", "median_m", ".2f"))
+    wrong = (("wrong", "wrong_over_10m", "d"), ("false", "false_fixes", "d"), ("agreeing", "inlier_share", ".2f"))
+    more = (("height RMS m", "height_rms_m", ".2f"), ("attitude RMS deg", "attitude_rms_deg", ".2f"))
+    return table_of(rows, (first, "who", "s"), *found, *wrong, *more, ("median ms", "p50_ms", ".1f"))
 
 
 def _chart(runs: list[Run]) -> Figure:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,10 @@ from matplotlib.figure import Figure
 from bench.live.embedded import PRIOR_SIGMA_M
 from bench.live.endless import GRACE_MS
 from bench.live.startup import PARTS
-from bench.pages.text import machine, table
+from bench.pages.text import machine, paragraph, table_of
 
 Row = dict[str, Any]
 COLOURS = {"ncc": "#0072b2", "sift": "#d55e00", "auto": "#009e73"}
-PART_COLOURS = ("#999999", "#0072b2", "#56b4e9", "#d55e00", "#009e73")
 INTRO = (
     "Made by `make bench-latency`, one run of it, on {machine}; one thread where nothing else is said. The "
     "built-in flight is drawn once and flown forth and back with rising stamps, between 110 and 150 m high, so "
@@ -81,44 +79,34 @@ def write(docs: Path, results: dict[str, Any]) -> None:
         "budgets": _load_chart(results),
         "soak": _soak_chart(soaked),
         "tradeoff": _tradeoff_chart(results["tradeoff"]["curve"]),
-        "startup": _startup_chart(results["startup"]),
     }
     for name, figure in pictures.items():
         figure.savefig(docs / "img" / f"latency-{name}.png", dpi=130, facecolor="white")
-    lines = ["# Latency, measured", "", *_wrapped(INTRO.format(machine=machine()))]
+    lines = ["# Latency, measured", "", *paragraph(INTRO.format(machine=machine()))]
     lines += [
         "## On time, alone on the machine",
         "",
-        *_wrapped(BUDGETS),
+        *paragraph(BUDGETS),
         *_latency_table(results["budgets"]["rows"]),
     ]
     lines += ["![latency against budget, by load](img/latency-budgets.png)", ""]
     lines += [f"A frame is on time below the top of its bar, {GRACE_MS:g} ms above its budget.", ""]
-    lines += ["## On time, beside busy processes", "", *_wrapped(HOGS), *_latency_table(results["hogs"])]
+    lines += ["## On time, beside busy processes", "", *paragraph(HOGS), *_latency_table(results["hogs"])]
     lines += _embedded(results.get("embedded", []))
-    lines += ["## On time, on a share of a core", "", *_wrapped(SLOW), *_slow_table(results["slow"])]
+    lines += ["## On time, on a share of a core", "", *paragraph(SLOW), *_slow_table(results["slow"])]
     lines += ["## More frames than time", "", *_queue(results["queue"])]
-    lines += ["## A long flight", "", *_wrapped(SOAK), *_soak_table(soaked)]
+    lines += ["## A long flight", "", *paragraph(SOAK), *_soak_table(soaked)]
     lines += ["![growth of the resident memory](img/latency-soak.png)", ""]
-    lines += ["## What a budget buys", "", *_wrapped(CURVE)]
+    lines += ["## What a budget buys", "", *paragraph(CURVE)]
     lines += ["![accuracy, availability and latency against budget](img/latency-tradeoff.png)", ""]
-    lines += [*_curve_table(results["tradeoff"]["curve"]), "## Table I with its tails", "", *_wrapped(TABLE_ONE)]
+    lines += [*_curve_table(results["tradeoff"]["curve"]), "## Table I with its tails", "", *paragraph(TABLE_ONE)]
     lines += [*_table_one(results["tradeoff"]["table"]), "## From start to first fix", ""]
-    lines += [*_startup(results["startup"]), "![seconds by part](img/latency-startup.png)", ""]
+    lines += _startup(results["startup"])
     lines += ["## Before the first fix is asked for", "", *_entries(results["entries"])]
     (docs / "latency.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
 
 # ----------------------------------------------------------------------------------------------------- tables
-
-
-def _wrapped(text: str) -> list[str]:
-    return [*textwrap.wrap(text, 115), ""]
-
-
-def shown(value: float | None, form: str = ".2f") -> str:
-    """A number, or a dash where there is none."""
-    return "-" if value is None else format(value, form)
 
 
 def share(value: float | None) -> str:
@@ -133,179 +121,79 @@ def listed(counts: dict[str, int]) -> str:
     return ", ".join(f"{name} {count:,}" for name, count in counts.items() if count) or "none"
 
 
+_BUDGET, _FRAMES = ("budget ms", "budget_ms", "g"), ("frames", "frames", ",")
+_ON_TIME, _CAUSES = ("on time", "within", share), ("misses by cause", "causes", listed)
+_FIXED, _RMS = ("fixed", "availability", share), ("RMS m", "rms_m", ".2f")
+_FALSE, _STALE, _STAGES = ("false", "wrong", "d"), ("stale", "stale", "d"), ("stages", "stages", listed)
+_TIMES = (("p50 ms", "p50", ".1f"), ("p99 ms", "p99", ".1f"), ("max ms", "max", ".1f"))
+
+
 def _latency_table(rows: list[Row]) -> list[str]:
-    columns = ["who", "budget ms", "frames", "on time", "misses by cause", "p50 ms", "p99 ms", "max ms"]
-    columns += ["fixed", "RMS m", "false", "stale", "stages"]
-    cells = [
-        [
-            row["who"],
-            shown(row["budget_ms"], "g"),
-            f"{row['frames']:,}",
-            share(row["within"]),
-            listed(row["causes"]),
-            *(shown(row[name], ".1f") for name in ("p50", "p99", "max")),
-            share(row["availability"]),
-            shown(row["rms_m"]),
-            str(row["wrong"]),
-            str(row["stale"]),
-            listed(row["stages"]),
-        ]
-        for row in rows
-    ]
-    return table(columns, cells)
+    which = (("who", "who", "s"), _BUDGET, _FRAMES, _ON_TIME, _CAUSES)
+    return table_of(rows, *which, *_TIMES, _FIXED, _RMS, _FALSE, _STALE, _STAGES)
 
 
 def _embedded(rows: list[Row]) -> list[str]:
     if not rows:  # the flight was not there
         return []
-    columns = ["who", "budget ms", "frames", "on time", "within the budget", "p50 ms", "p99 ms", "max ms", "fixed"]
-    cells = [
-        [
-            row["who"],
-            shown(row["budget_ms"], "g"),
-            f"{row['frames']:,}",
-            share(row["within"]),
-            share(row["within_budget"]),
-            *(shown(row[name], ".1f") for name in ("p50", "p99", "max")),
-            share(row["availability"]),
-            shown(row["rms_m"]),
-            str(row["wrong"]),
-            listed(row["stages"]),
-        ]
-        for row in rows
-    ]
-    text = EMBEDDED.format(sigma=PRIOR_SIGMA_M, grace=GRACE_MS)
-    return [*_wrapped(text), *table([*columns, "RMS m", "> 10 m off", "stages"], cells)]
+    which = (("who", "who", "s"), _BUDGET, _FRAMES, _ON_TIME, ("within the budget", "within_budget", share))
+    columns = (*which, *_TIMES, _FIXED, _RMS, ("> 10 m off", "wrong", "d"), _STAGES)
+    return [*paragraph(EMBEDDED.format(sigma=PRIOR_SIGMA_M, grace=GRACE_MS)), *table_of(rows, *columns)]
 
 
 def _slow_table(rows: list[Row]) -> list[str]:
-    columns = ["share of a core", "share got", "budget ms", "frames", "on time", "but for a stop", "on core"]
-    columns += ["misses by cause", "p50 ms", "p99 ms", "max ms", "fixed", "RMS m", "false", "stale"]
-    cells = [
-        [
-            shown(row["share"], "g"),
-            shown(row["share_got"]),
-            shown(row["budget_ms"], "g"),
-            f"{row['frames']:,}",
-            share(row["within"]),
-            share(row["within_but_a_stop"]),
-            share(row["within_on_core"]),
-            listed(row["causes"]),
-            *(shown(row[name], ".1f") for name in ("p50", "p99", "max")),
-            share(row["availability"]),
-            shown(row["rms_m"]),
-            str(row["wrong"]),
-            str(row["stale"]),
-        ]
-        for row in rows
-    ]
-    return table(columns, cells)
+    which = (("share of a core", "share", "g"), ("share got", "share_got", ".2f"), _BUDGET, _FRAMES, _ON_TIME)
+    kept = (("but for a stop", "within_but_a_stop", share), ("on core", "within_on_core", share), _CAUSES)
+    return table_of(rows, *which, *kept, *_TIMES, _FIXED, _RMS, _FALSE, _STALE)
 
 
 def _queue(rows: list[Row]) -> list[str]:
-    columns = ["fed", "fed Hz", "submitted", "answered", "dropped", "late", "fixes", "age p50 ms", "p99", "max"]
-    columns += ["allowed ms", "stale", "RSS MB before", "after"]
-    cells = [
-        [
-            f"{row['factor']} x",
-            f"{row['fed_hz']:.0f}",
-            *(f"{row[name]:,}" for name in ("submitted", "answered", "dropped", "late", "fixes")),
-            *(shown(row[name], ".1f") for name in ("p50", "p99", "max")),
-            shown(row["deadline_ms"] + row["frame_ms"], ".1f"),
-            str(row["stale"]),
-            *(f"{row[name]:.0f}" for name in ("rss_before_mb", "rss_after_mb")),
-        ]
-        for row in rows
-    ]
+    counts = ((name, name, ",") for name in ("submitted", "answered", "dropped", "late", "fixes"))
+    ages = (("age p50 ms", "p50", ".1f"), ("p99", "p99", ".1f"), ("max", "max", ".1f"))
+    memory = (("RSS MB before", "rss_before_mb", ".0f"), ("after", "rss_after_mb", ".0f"))
+    allowed = [{"allowed_ms": row["deadline_ms"] + row["frame_ms"], **row} for row in rows]
+    columns = (("fed", "factor", "{} x".format), ("fed Hz", "fed_hz", ".0f"), *counts, *ages)
     text = QUEUE.format(deadline=rows[0]["deadline_ms"], frame=rows[0]["frame_ms"])
-    return [*_wrapped(text), *table(columns, cells)]
+    return [*paragraph(text), *table_of(allowed, *columns, ("allowed ms", "allowed_ms", ".1f"), _STALE, *memory)]
+
+
+def _from_to(counts: list[float]) -> str:
+    return " to ".join(f"{count:.0f}" for count in counts)
 
 
 def _soak_table(rows: list[Row]) -> list[str]:
-    columns = ["method", "frames", "window sizes", "growth MB per 10,000 frames", "open files", "threads"]
-    columns += ["cache growth", "p99 ms, first tenth", "last tenth", "max ms", "fixed", "false"]
-    cells = [
-        [
-            row["who"],
-            f"{row['frames']:,}",
-            str(row["windows"]),
-            shown(row["rss_slope_mb"]),
-            *(" to ".join(f"{count:.0f}" for count in row[name]) for name in ("open_files", "threads")),
-            listed(row["cache_growth"]),
-            *(shown(row[name], ".1f") for name in ("p99_first", "p99_last", "max")),
-            share(row["availability"]),
-            str(row["wrong"]),
-        ]
-        for row in rows
-    ]
-    return table(columns, cells)
+    grown = (("growth MB per 10,000 frames", "rss_slope_mb", ".2f"), ("open files", "open_files", _from_to))
+    times = (("p99 ms, first tenth", "p99_first", ".1f"), ("last tenth", "p99_last", ".1f"), _TIMES[2])
+    which = (("method", "who", "s"), _FRAMES, ("window sizes", "windows", "d"))
+    caches = ("cache growth", "cache_growth", listed)
+    return table_of(rows, *which, *grown, ("threads", "threads", _from_to), caches, *times, _FIXED, _FALSE)
 
 
 def _curve_table(rows: list[Row]) -> list[str]:
-    columns = ["method", "budget ms", "RMS m", "fixed", "false", "p50 ms", "p99 ms", "on time", "stages"]
-    cells = [
-        [
-            row["who"],
-            shown(row["budget_ms"], "g"),
-            shown(row["rms_m"]),
-            share(row["availability"]),
-            str(row["wrong"]),
-            *(shown(row[name], ".1f") for name in ("p50", "p99")),
-            share(row["within"]),
-            listed(row["stages"]),
-        ]
-        for row in rows
-    ]
-    return table(columns, cells)
+    return table_of(rows, ("method", "who", "s"), _BUDGET, _RMS, _FIXED, _FALSE, *_TIMES[:2], _ON_TIME, _STAGES)
 
 
 def _table_one(rows: list[Row]) -> list[str]:
-    columns = [
-        "Table I",
-        "threads",
-        "frames",
-        "RMS m",
-        "mean ms",
-        "p50",
-        "p95",
-        "p99",
-        "p99.9",
-        "max",
-        "jitter",
-        "fixed",
-    ]
-    cells = []
-    for row in rows:
-        times = [shown(row.get(name), ".1f") for name in ("mean", "p50", "p95", "p99", "p999", "max")]
-        jitter = shown(row["p99"] - row["p50"], ".1f") if "p99" in row else "-"
-        counts = [str(row.get(name, "-")) for name in ("threads", "frames")]
-        cells.append([row["who"], *counts, shown(row["rms_m"]), *times, jitter, share(row.get("availability"))])
-    return table(columns, cells)
+    titles = {"mean": "mean ms", "p50": "p50", "p95": "p95", "p99": "p99", "p999": "p99.9", "max": "max"}
+    spread = [{"jitter": row["p99"] - row["p50"], **row} if "p99" in row else row for row in rows]
+    spread = [{"availability": None, **row} for row in spread]
+    which = (("Table I", "who", "s"), ("threads", "threads", "d"), ("frames", "frames", "d"), _RMS)
+    times = ((title, key, ".1f") for key, title in titles.items())
+    return table_of(spread, *which, *times, ("jitter", "jitter", ".1f"), _FIXED)
 
 
 def _startup(rows: list[Row]) -> list[str]:
-    cells = [
-        [
-            row["method"],
-            row["kept"],
-            *(shown(row["parts_s"][part]) for part in PARTS),
-            shown(row["total_s"]),
-            max(PARTS, key=row["parts_s"].__getitem__),
-            shown(row.get("resident_mb"), ".0f"),
-            "yes" if row["fixed"] else "no",
-        ]
-        for row in rows
-    ]
-    columns = ["method", "caches", *(f"{part} s" for part in PARTS), "total s", "most of it", "memory MB", "fix"]
-    return [*_wrapped(STARTUP), *table(columns, cells)]
+    told = [{**row["parts_s"], **row, "most": max(PARTS, key=row["parts_s"].__getitem__)} for row in rows]
+    parts = ((f"{part} s", part, ".2f") for part in PARTS)
+    total = (("total s", "total_s", ".2f"), ("most of it", "most", "s"), ("memory MB", "resident_mb", ".0f"))
+    fixed = ("fix", "fixed", lambda is_fixed: "yes" if is_fixed else "no")
+    columns = (("method", "method", "s"), ("caches", "kept", "s"), *parts, *total, fixed)
+    return [*paragraph(STARTUP), *table_of(told, *columns)]
 
 
 def _entries(rows: list[Row]) -> list[str]:
-    cells = [
-        [f"`{row['what']}`", shown(row["seconds"]), shown(row["core_s"]), shown(row["resident_mb"], ".0f")]
-        for row in rows
-    ]
-    return [*_wrapped(ENTRIES), *table(["what", "seconds", "on a core s", "memory MB"], cells)]
+    spent = (("seconds", "seconds", ".2f"), ("on a core s", "core_s", ".2f"), ("memory MB", "resident_mb", ".0f"))
+    return [*paragraph(ENTRIES), *table_of(rows, ("what", "what", "`{}`".format), *spent)]
 
 
 # ---------------------------------------------------------------------------------------------------- pictures
@@ -382,20 +270,4 @@ def _tradeoff_chart(rows: list[Row]) -> Figure:
         ax.set_title(title, fontsize=10)
         ax.grid(which="both", alpha=0.2)
     figure.legend(loc="outside upper center", ncols=3, frameon=False)
-    return figure
-
-
-def _startup_chart(rows: list[Row]) -> Figure:
-    """Seconds of each part, one bar a start."""
-    figure = Figure(figsize=(8.5, 0.45 * len(rows) + 1.4), layout="constrained")
-    ax = figure.subplots()
-    names = [f"{row['method']}, {row['kept']}" for row in rows]
-    left = np.zeros(len(rows))
-    for part, colour in zip(PARTS, PART_COLOURS, strict=True):
-        spent = np.array([row["parts_s"][part] for row in rows])
-        ax.barh(names, spent, left=left, color=colour, label=part)
-        left += spent
-    ax.invert_yaxis()
-    ax.set_xlabel("seconds from the start of the process")
-    figure.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     return figure

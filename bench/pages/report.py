@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from matplotlib.figure import Figure
 
 from bench import RESULTS
 from bench.pages import sift
-from bench.pages.text import machine, table
+from bench.pages.text import machine, paragraph, table_of
 from bench.speed import stages
 from engine.runtime.threads import set_threads
 
@@ -46,7 +45,7 @@ def main() -> None:
     (options.docs / "img").mkdir(parents=True, exist_ok=True)
     for name, figure in charts.items():
         figure.savefig(options.docs / "img" / name, dpi=130, facecolor="white")
-    page = ["# Benchmarks", "", *textwrap.wrap(INTRO.format(machine=machine()), 115), ""]
+    page = ["# Benchmarks", "", *paragraph(INTRO.format(machine=machine()))]
     page += _stages_section(flown) + _peak_section(rows) + _step_section(rows)
     page += _hypotheses_section(rows) + sift.sections(rows)
     (options.docs / "benchmarks.md").write_text("\n".join(page).rstrip() + "\n", encoding="utf-8")
@@ -61,29 +60,32 @@ def _row(entry: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _baseline(rows: list[dict[str, Any]], row: dict[str, Any]) -> float:
-    peer = BASELINE[row["task"]]
-    return next(r["median_ms"] for r in rows if r["group"] == row["group"] and r["peer"] == peer)
+def _of_task(rows: list[dict[str, Any]], task: str) -> list[dict[str, Any]]:
+    """Its rows, each with its ratio to the peer in its group."""
+    own = [row for row in rows if row["task"] == task]
+    base_ms = {row["group"]: row["median_ms"] for row in own if row["peer"] == BASELINE[task]}
+    return [{**row, "ratio": base_ms[row["group"]] / row["median_ms"]} for row in own]
 
 
 def _stages_section(flown: list[dict[str, Any]]) -> list[str]:
     """A tracked flight by the engine, in turns with OpenCV's step."""
-    cells = [
-        [
-            f"{row['flight']}, {row['method']}",
-            f"{row['p50_ms']:.2f}",
-            f"{row['p99_ms']:.2f}",
-            f"{row['opencv_p50_ms']:.2f}",
-            f"{row['opencv_p50_ms'] / row['p50_ms']:.2f}",
-            f"{row['fixed']} of {row['frames']}",
-            f"{row['rms_m']:.3f}",
-            f"{row['nees']:.2f}",
-        ]
-        for row in flown
-    ]
     if not flown:
         return []
-    columns = ["flight, method", "p50 ms", "p99 ms", "OpenCV's step ms", "ratio to it", "fixed", "RMS m", "NEES"]
+    rows = [
+        {
+            **row,
+            "who": f"{row['flight']}, {row['method']}",
+            "ratio": row["opencv_p50_ms"] / row["p50_ms"],
+            "fixes": f"{row['fixed']} of {row['frames']}",
+        }
+        for row in flown
+    ]
+    times = (
+        ("p50 ms", "p50_ms", ".2f"),
+        ("p99 ms", "p99_ms", ".2f"),
+        ("OpenCV's step ms", "opencv_p50_ms", ".2f"),
+    )
+    found = (("fixed", "fixes", "s"), ("RMS m", "rms_m", ".3f"), ("NEES", "nees", ".2f"))
     text = (
         "`SceneMatcher.locate` of a tracked flight, one thread: a refined and verified pose with its covariance. "
         "OpenCV's step (grey, enhance, warp, match; no check and no refinement, 1.1 to 1.3 m off) has the same "
@@ -93,11 +95,10 @@ def _stages_section(flown: list[dict[str, Any]]) -> list[str]:
     return [
         "## A frame of a tracked flight",
         "",
-        *textwrap.wrap(text, 115),
-        "",
+        *paragraph(text),
         "![stages of a frame](img/frame-stages.png)",
         "",
-        *table(columns, cells),
+        *table_of(rows, ("flight, method", "who", "s"), *times, ("ratio to it", "ratio", ".2f"), *found),
     ]
 
 
@@ -119,35 +120,13 @@ def _stages_chart(flown: list[dict[str, Any]]) -> Figure:
     return figure
 
 
-def _memory(row: dict[str, Any]) -> str:
-    return "-" if row.get("peak_memory_mb") is None else f"{row['peak_memory_mb']:.0f}"
+_WHO, _MEMORY = (("who", "peer", "s"), ("threads", "threads", "d")), ("peak MB", "peak_memory_mb", ".0f")
+_TIMES = (("median ms", "median_ms", ".2f"), ("p95 ms", "p95_ms", ".2f"), ("ratio to OpenCV", "ratio", ".2f"))
 
 
 def _peak_section(rows: list[dict[str, Any]]) -> list[str]:
-    cells = [
-        [
-            f"{r['template_px']} in {r['window_px']}",
-            str(r["threads"]),
-            r["peer"],
-            f"{r['median_ms']:.2f}",
-            f"{r['p95_ms']:.2f}",
-            f"{_baseline(rows, r) / r['median_ms']:.2f}",
-            f"{r['error']:.0e}",
-            _memory(r),
-        ]
-        for r in rows
-        if r["task"] == "peak"
-    ]
-    columns = [
-        "size, float32",
-        "threads",
-        "who",
-        "median ms",
-        "p95 ms",
-        "ratio to OpenCV",
-        "score error",
-        "peak MB",
-    ]
+    peaks = [{**row, "size": f"{row['template_px']} in {row['window_px']}"} for row in _of_task(rows, "peak")]
+    found = (("score error", "error", ".0e"), _MEMORY)
     return [
         "## Window and template in, peak out",
         "",
@@ -156,23 +135,11 @@ def _peak_section(rows: list[dict[str, Any]]) -> list[str]:
         "scores every place at full resolution; `ncc()` prepares nothing and returns the whole surface. On the",
         "smallest windows the fixed cost of a call exceeds OpenCV's whole work.",
         "",
-        *table(columns, cells),
+        *table_of(peaks, ("size, float32", "size", "s"), *_WHO[::-1], *_TIMES, *found),
     ]
 
 
 def _step_section(rows: list[dict[str, Any]]) -> list[str]:
-    cells = [
-        [
-            r["peer"],
-            str(r["threads"]),
-            f"{r['median_ms']:.2f}",
-            f"{r['p95_ms']:.2f}",
-            f"{_baseline(rows, r) / r['median_ms']:.2f}",
-            f"{r['rms_m']:.2f}",
-        ]
-        for r in rows
-        if r["task"] == "step"
-    ]
     return [
         "## The whole step: a 300 x 300 colour frame in, position out",
         "",
@@ -180,30 +147,19 @@ def _step_section(rows: list[dict[str, Any]]) -> list[str]:
         "judges the peak and states a covariance. `OpenCV` enhances the window in every frame; with `map",
         "prepared` it keeps the enhanced map.",
         "",
-        *table(["who", "threads", "median ms", "p95 ms", "ratio to OpenCV", "RMS m"], cells),
+        *table_of(_of_task(rows, "step"), *_WHO, *_TIMES, ("RMS m", "rms_m", ".2f")),
     ]
 
 
 def _hypotheses_section(rows: list[dict[str, Any]]) -> list[str]:
-    cells = [
-        [
-            r["peer"],
-            str(r["threads"]),
-            f"{r['median_ms']:.0f}",
-            f"{_baseline(rows, r) / r['median_ms']:.1f}",
-            f"{r['error_m']:.1f}",
-            _memory(r),
-        ]
-        for r in rows
-        if r["task"] == "hypotheses"
-    ]
+    figures = (("median ms", "median_ms", ".0f"), ("ratio", "ratio", ".1f"), ("error m", "error_m", ".1f"))
     return [
         "## Heading unknown, height within 10 %, the whole map of the paper",
         "",
         "OpenCV loops over 36 headings x 5 scales and names the best of them. The engine also refines heading and",
         "height below the step.",
         "",
-        *table(["who", "threads", "median ms", "ratio", "error m", "peak MB"], cells),
+        *table_of(_of_task(rows, "hypotheses"), *_WHO, *figures, _MEMORY),
     ]
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from bench.pages.text import bullets, paragraph, table
+from bench.pages.text import bullets, paragraph, shown, table, table_of
 
 Row = dict[str, Any]
 
@@ -100,13 +99,9 @@ def _figures(rows: list[Row], peer: str, size: tuple[int, int]) -> Row:
     return next(row for row in rows if row["peer"] == peer and tuple(row["size"]) == size)
 
 
-def _shown(value: float, form: str) -> str:
-    return "-" if not np.isfinite(value) else format(value, form)
-
-
 def _both(row: Row, name: str, form: str) -> str:
     """A figure of the warped pairs / of the frames on their map."""
-    return " / ".join("-" if row[kind] is None else _shown(row[kind][name], form) for kind in ("warped", "on_map"))
+    return " / ".join("-" if row[kind] is None else shown(row[kind][name], form) for kind in ("warped", "on_map"))
 
 
 def _features_section(rows: list[Row]) -> list[str]:
@@ -130,11 +125,11 @@ def _feature_cells(rows: list[Row], peer: str, size: tuple[int, int], batch: int
         kind: None if row[kind] is None else {name: 100.0 * value for name, value in row[kind].items()}
         for kind in ("warped", "on_map")
     }
-    times = [_shown(_time_ms(rows, peer, size, b, t), ".1f") for b, t in ((1, 1), (1, 2), (batch, 1), (batch, 2))]
+    times = [shown(_time_ms(rows, peer, size, b, t), ".1f") for b, t in ((1, 1), (1, 2), (batch, 1), (batch, 2))]
     return [
         peer,
         *times,
-        _shown(_ratio(rows, peer, size), ".2f"),
+        shown(_ratio(rows, peer, size), ".2f"),
         _both(row, "keypoints", ".0f"),
         *(_both(percent, name, ".0f") for name in ("repeatability", "matching_score", "inlier_ratio")),
         _both(row, "correct", ".0f"),
@@ -173,26 +168,26 @@ def _quality_chart(rows: list[Row]) -> Figure:
 
 def _step_section(rows: list[Row]) -> list[str]:
     time_ms = {(row["peer"], row["threads"]): row["median_ms"] for row in rows}
-    cells = [
-        [
-            row["peer"],
-            str(row["threads"]),
-            f"{row['median_ms']:.2f}",
-            f"{row['p95_ms']:.2f}",
-            f"{time_ms[PAPER_SIFT, row['threads']] / row['median_ms']:.2f}",
-            f"{row['fixes']} of {row['frames']}",
-            f"{row['rms_m']:.2f}",
-            "-" if row["height_rms_m"] is None else f"{row['height_rms_m']:.2f}",
-        ]
+    told = [
+        {
+            **row,
+            "times": time_ms[PAPER_SIFT, row["threads"]] / row["median_ms"],
+            "found": f"{row['fixes']} of {row['frames']}",
+        }
         for row in rows
     ]
-    columns = ["who", "threads", "median ms", "p95 ms", "times the paper's SIFT", "fixes", "RMS m", "height RMS m"]
+    times = (
+        ("median ms", "median_ms", ".2f"),
+        ("p95 ms", "p95_ms", ".2f"),
+        ("times the paper's SIFT", "times", ".2f"),
+    )
+    found = (("fixes", "found", "s"), ("RMS m", "rms_m", ".2f"), ("height RMS m", "height_rms_m", ".2f"))
     return [
         "## The whole SIFT step: a 300 x 300 colour frame in, pose out",
         "",
         *paragraph(STEP),
         *table(["threads", "paper, published", "paper's recipe, here", "scenematch"], _step_ratios(time_ms)),
-        *table(columns, cells),
+        *table_of(told, ("who", "peer", "s"), ("threads", "threads", "d"), *times, *found),
     ]
 
 

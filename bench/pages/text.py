@@ -6,8 +6,10 @@ import os
 import platform
 import subprocess
 import textwrap
+from collections.abc import Callable
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import cv2
 import torch
@@ -19,6 +21,20 @@ def table(columns: list[str], rows: list[list[str]]) -> list[str]:
     """Lines of a Markdown table, an empty one after it."""
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     return [*lines, *("| " + " | ".join(row) + " |" for row in rows), ""]
+
+
+def shown(value: Any, form: str = ".2f") -> str:
+    """A value in a format, or a dash where there is none."""
+    return "-" if value is None or value != value else format(value, form)
+
+
+def table_of(rows: list[dict[str, Any]], *columns: tuple[str, str, str | Callable[[Any], str]]) -> list[str]:
+    """Lines of a table of rows; a column is its title, its key in a row, and its format or what writes it."""
+    cells = [
+        [shown(row.get(key), form) if isinstance(form, str) else form(row[key]) for _, key, form in columns]
+        for row in rows
+    ]
+    return table([title for title, _, _ in columns], cells)
 
 
 def paragraph(text: str) -> list[str]:

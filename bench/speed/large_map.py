@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from bench import RESULTS
 from bench.inputs.scenes import mosaic
-from bench.pages.text import machine, paragraph, rewrite, table
+from bench.pages.text import machine, paragraph, rewrite, table_of
 
 BEGIN, END = "<!-- bench.speed.large_map -->", "<!-- end of bench.speed.large_map -->"
 AT = (0.61234, 0.38765)
@@ -190,25 +190,20 @@ def _rss_mb(pid: int) -> float:
 
 def section(runs: list[Run], side: int) -> str:
     """What stands between the markers."""
-    cells = [
-        [
-            run.name,
-            run.method,
-            f"{run.summary['fixes']} of {run.summary['frames']}",
-            f"{run.summary['rms_m']:.3f}",
-            str(run.summary["false_fixes"]),
-            f"{run.summary['latency_ms']['p50']:.1f}",
-            f"{run.summary['latency_ms']['p95']:.1f}",
-            f"{run.summary['latency_ms']['max']:.0f}",
-            f"{run.first_ms:.0f}",
-            f"{run.start_s:.1f}",
-            f"{run.rss_mb:.0f}",
-            f"{run.growth_mb:+.0f}",
-        ]
+    rows = [
+        {
+            **run.summary,
+            **run.summary["latency_ms"],
+            "found": "{fixes} of {frames}".format(**run.summary),
+            **asdict(run),
+        }
         for run in runs
     ]
-    heads = ["map", "method", "fixes", "RMS m", "false", "p50 ms", "p95 ms", "max ms", "first frame ms"]
-    lines = table([*heads, "to the first frame s", "RSS MB", "growth MB"], cells)
+    which = (("map", "name", "s"), ("method", "method", "s"), ("fixes", "found", "s"), ("RMS m", "rms_m", ".3f"))
+    times = (("p50 ms", "p50", ".1f"), ("p95 ms", "p95", ".1f"), ("max ms", "max", ".0f"))
+    first = (("first frame ms", "first_ms", ".0f"), ("to the first frame s", "start_s", ".1f"))
+    memory = (("RSS MB", "rss_mb", ".0f"), ("growth MB", "growth_mb", "+.0f"))
+    lines = table_of(rows, *which, ("false", "false_fixes", "d"), *times, *first, *memory)
     lines += paragraph(f"Measured on {machine()}, one thread; the large map is {side:,} x {side:,} px.")
     return lines
 

@@ -95,7 +95,9 @@ class SceneMatcher:
         # The camera of undistorted pictures; the mount stays.
         self._pinhole = replace(camera, distortion_model="plumb_bob", distortion=np.zeros(5))
 
-    def warmup(self, report: Callable[[int, int], None] = lambda done, total: None) -> None:
+    def warmup(
+        self, report: Callable[[int, int], None] = lambda done, total: None, *, brief: bool = False
+    ) -> None:
         """Do all one-time work before take-off: compile, find the map's features, plan, and measure step costs.
 
         Features are found on every level of at most :data:`engine.maps.landmarks.PREPARED_PX` pixels; those of a
@@ -103,16 +105,20 @@ class SceneMatcher:
 
         Args:
             report: called with the number of loops compiled (or loaded from an earlier cache) and the total.
+            brief: for a start in the air: run each step of a frame with a prior once, and no search. Costs are
+                then learned from the first frames, of which some may be late.
         """
         prepare_loops(self._method.loops, report)
         self._method.prepare()
-        for share in _WARMUP_SHARES:
+        shares, rounds = (_WARMUP_SHARES[:1], 1) if brief else (_WARMUP_SHARES, self._method.warmup_rounds)
+        for share in shares:
             frame, prior = self._synthetic_frame(share)
-            for _ in range(self._method.warmup_rounds):
+            for _ in range(rounds):
                 self.locate(frame, prior)
                 self._method.warmup(self._query(frame, prior, Deadline(Budget())))
-            self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
-        if self.site.is_searchable:
+            if not brief:
+                self._method.warmup_search(self._query(frame, prior, Deadline(Budget())))
+        if self.site.is_searchable and not brief:
             for _ in range(2):  # a step that ran once has no cost yet and would always start
                 self._method.warmup_search(self._query(frame, None, Deadline(Budget())))
         _give_back_memory()

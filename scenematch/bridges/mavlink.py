@@ -79,6 +79,8 @@ class MavlinkBridge:
         use_velocity: whether to use the autopilot's velocity for dead reckoning between fixes.
         site: the map; None checks the first fixes against neither the start nor a receiver.
         check_gnss: whether to check the first fixes against the autopilot's GNSS receiver, if it has a fix.
+        resumed: whether ``start`` is the last fix sent to this autopilot, by an earlier bridge: the next one must
+            agree with it, and does not wait for the autopilot's report on its receiver.
         gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None for a fixed camera.
         system_id: MAVLink system id of the vehicle; messages of other systems are ignored.
         component_id: component id of the bridge on the vehicle.
@@ -102,6 +104,7 @@ class MavlinkBridge:
         use_velocity: bool = True,
         site: OrthoMap | None = None,
         check_gnss: bool = True,
+        resumed: bool = False,
         gimbal_mount: NDArray[np.float64] | None = None,
         system_id: int = 1,
         component_id: int = BRIDGE_COMPONENT,
@@ -115,7 +118,7 @@ class MavlinkBridge:
         self._connection, self._options, self._origin = connection, options, origin
         self._make_navigator, self._use_velocity = make_navigator, use_velocity
         self._system_id, self._component_id, self._key = system_id, component_id, key
-        self._site, self._check_gnss = site, check_gnss
+        self._site, self._check_gnss, self._resumed = site, check_gnss, resumed
         self._guard = TrackGuard(None if start is None or site is None else position_of(start, site))
         self._notices = PilotNotices()
         self._encoder = PacketEncoder(system_id, key, component_id)
@@ -250,7 +253,8 @@ class MavlinkBridge:
 
     def _awaits_receiver(self) -> bool:
         """Whether the first fix must wait for the autopilot's report on its receiver, which is requested."""
-        checked = self._site is not None and self._check_gnss and not self._guard.has_fix
+        is_first = not (self._guard.has_fix or self._resumed)
+        checked = self._site is not None and self._check_gnss and is_first
         recent = time.monotonic_ns() - self._connected_ns < _GNSS_STALE_NS
         return checked and recent and self.telemetry.has_receiver is None
 

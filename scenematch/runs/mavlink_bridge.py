@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
@@ -213,22 +214,20 @@ def run_mavlink_bridge(
     outgoing = link.outgoing()
     start = parse_position("start", settings.start)
     key = None if link.key is None else read_key(Path(link.key))
-    site = files.map.open(progress)
-    camera = files.load_camera(progress)
-    check_position("start", start, site, OptionError)
-    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher)
-    with progress.task("compiling") as report_compiled:
-        matcher.warmup(report_compiled)
     # With a camera the bridge may start in the air; a replayed flight begins at its start.
     resumes = files.camera_source is not None
     last_fix = LastFix(
         last_fix_file(link.connect, link.system_id, Path(files.map.map).absolute()) if resumes else None
     )
+    max_speed_mps = settings.live_options().max_speed_mps
+    matcher = _loaded(files, settings, start, progress, brief=last_fix.prior(max_speed_mps) is not None)
+    site, camera = matcher.site, matcher.camera
     end_on_sigterm()  # before the fork, so that the worker has it from its first instruction
     if supervise:
         check_supervision(matcher.device)
         become_worker(progress)
-    start = _resumed(last_fix.prior(settings.live_options().max_speed_mps), start, site, progress)
+    resumed = _resumed(last_fix.prior(max_speed_mps), site, progress)
+    start = resumed or start
 
     # Before the link: a bench autopilot takes off as soon as the bridge listens.
     pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))
@@ -237,8 +236,9 @@ def run_mavlink_bridge(
             bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
                 origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
-                check_gnss=link.check_gnss, system_id=link.system_id, component_id=link.component_id, key=key,
-                watch=watcher, on_sent=last_fix.keep, gimbal_mount=camera.mount if files.gimbal else None,
+                check_gnss=link.check_gnss, resumed=resumed is not None, system_id=link.system_id,
+                component_id=link.component_id, key=key, watch=watcher, on_sent=last_fix.keep,
+                gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
@@ -254,14 +254,33 @@ def run_mavlink_bridge(
             return bridge.status
 
 
-def _resumed(last: Prior | None, start: Prior | None, site: OrthoMap, progress: Progress) -> Prior | None:
-    """The last fix of the previous bridge or worker, unless it is too old."""
+def _loaded(
+    files: BridgeFiles, settings: BridgeSettings, start: Prior | None, progress: Progress, *, brief: bool
+) -> SceneMatcher:
+    """The warm matcher of the map and the camera; ``brief`` if the vehicle may be waiting in the air."""
+    is_collecting = gc.isenabled()
+    gc.disable()  # what is imported and loaded stays: looking for garbage in it takes a seventh of the time
+    try:
+        site = files.map.open(progress)
+        camera = files.load_camera(progress)
+        check_position("start", start, site, OptionError)
+        matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher)
+        with progress.task("compiling") as report_compiled:
+            matcher.warmup(report_compiled, brief=brief)
+    finally:
+        if is_collecting:
+            gc.enable()
+    return matcher
+
+
+def _resumed(last: Prior | None, site: OrthoMap, progress: Progress) -> Prior | None:
+    """The last fix of the previous bridge or worker, unless there is none or the map file has changed."""
     if last is None:
-        return start
+        return None
     try:
         check_position("last fix", last, site, OptionError)
-    except OptionError:  # the map file has changed
-        return start
+    except OptionError:
+        return None
     progress.message(f"continues from the last fix, whose uncertainty has grown by {last.sigma_m:.0f} m")
     return last
 

@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
 
+from bench.live.flights.video_camera import SIZE, Footage, ground_from_pixel, recorded_from_shown
 from bench.live.standin import State
-from bench.live.video_camera import SIZE, Footage, ground_from_pixel, recorded_from_shown
-from tests.bench.test_fly_standin import CUE
+from tests.bench.test_recorded_flights import CUE
 
 FRAME, FOCAL_PX = (852, 480), 680.0
 TAKEN = State(10.0, -20.0, 170.0, 0.0, 0.0, 104.0, 0.0, 0.0)

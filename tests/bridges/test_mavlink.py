@@ -26,7 +26,7 @@ from pymavlink.quaternion import Quaternion
 from engine.camera import mount_rotation
 from engine.errors import OptionError, TelemetryError
 from engine.geo import LocalFrame
-from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
+from engine.values import Attitude, Fix, NoFix, Prior, Reason, Timings, Window
 from scenematch.bridges import mavlink_requests
 from scenematch.bridges.delay_memory import remember_delay
 from scenematch.bridges.fix_velocity import GroundVelocity, VelocityFromFixes
@@ -1249,6 +1249,23 @@ def test_the_first_fixes_are_held_against_the_receiver(bridge_to):
         fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
         made.navigator.result = fix(east_m=1.0)
         fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_only_a_first_fix_waits_for_the_autopilots_word_on_its_receiver(bridge_to, resumed, monkeypatch):
+    """The stand-in says nothing of a receiver; a bridge that goes on from its last fix asks for none."""
+    monkeypatch.setattr("scenematch.bridges.mavlink._GNSS_STALE_NS", 10**15)
+    start = Prior(lat_deg=33.64, lon_deg=72.99, sigma_m=20.0)
+    made = bridge_to(site=SimpleNamespace(frame=LocalFrame(33.64, 72.99)), start=start, resumed=resumed)
+    made.navigator.result = fix(east_m=400.0)
+    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+        fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
+        made.navigator.result = fix(east_m=1.0)
+        if resumed:
+            fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
+        else:
+            fly(made.bridge, lambda: made.bridge.status.withheld.get("receiver not heard yet", 0) > 5)
+            assert not pilot.of("VISION_POSITION_ESTIMATE")
 
 
 def test_reset_counter_steps_once_per_relocalisation(bridge_to):

@@ -221,9 +221,25 @@ def test_a_distorted_frame_finds_the_place_of_the_ideal_one(ground, frame, prior
 
 
 def test_warmup_leaves_no_trace(ground, camera, frame, prior):
-    cold, warm = (SceneMatcher(ground.site, camera, "ncc", "cpu") for _ in range(2))
+    cold, brief, warm = (SceneMatcher(ground.site, camera, "ncc", "cpu") for _ in range(3))
+    brief.warmup(brief=True)
     warm.warmup()
-    assert values(cold.locate(frame, prior)) == values(warm.locate(frame, prior))
+    expected = values(cold.locate(frame, prior))
+    assert values(brief.locate(frame, prior)) == expected
+    assert values(warm.locate(frame, prior)) == expected
+
+
+def test_a_brief_warmup_matches_without_searches(ground, camera, monkeypatch):
+    searched, located = [], []
+    brief, warm = (SceneMatcher(ground.site, camera, "ncc", "cpu") for _ in range(2))
+    for matcher in (brief, warm):
+        locate = matcher.locate
+        monkeypatch.setattr(matcher._method, "warmup_search", lambda query, of=matcher: searched.append(of))
+        monkeypatch.setattr(matcher, "locate", lambda *a, of=matcher, run=locate: located.append(of) or run(*a))
+    brief.warmup(brief=True)
+    warm.warmup()
+    assert (brief in searched, warm in searched) == (False, True)
+    assert located.count(brief) == 2 < located.count(warm)
 
 
 def test_auto_is_ncc_where_it_can_be_and_sift_where_it_must(matchers, ground, camera, frame, prior):

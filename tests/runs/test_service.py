@@ -1,6 +1,7 @@
 """What systemd hears of a bridge, over a socket like its own, and what it says of the unit."""
 
 import configparser
+import gc
 import os
 import re
 import shutil
@@ -25,6 +26,7 @@ from scenematch.bridges.ros import RosStatus, RosTopics
 from scenematch.files.ros.messages import MessageFactory
 from scenematch.runs import mavlink_bridge, service
 from scenematch.runs.bridge_files import BridgeFiles
+from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
 from scenematch.runs.progress import Progress
 from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
@@ -162,6 +164,29 @@ def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog
     assert beats == ["WATCHDOG=1"] * len(beats)
     assert len(beats) >= 2  # while it waits for the autopilot, too
     assert "STATUS=no autopilot; sent 0" in "".join(stated)
+
+
+def test_a_bridge_that_starts_again_in_the_air_warms_up_briefly(tmp_path, monkeypatch):
+    class WarmError(Exception):
+        pass
+
+    def warmup(_, report, *, brief):
+        briefly.append((brief, gc.isenabled()))
+        raise WarmError
+
+    briefly = []
+    monkeypatch.setattr(mavlink_bridge.SceneMatcher, "warmup", warmup)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    flight = write_flight(tmp_path / "flight", plan_flight(town=drawn_town(), frames=1))
+    link = MavlinkSettings(connect="udpout:127.0.0.1:9")
+    last = SimpleNamespace(lat_deg=48.0, lon_deg=16.0, sigma_m=1.0)
+    for frames, source in ((None, "0"), (None, "0"), (flight.frames, None)):
+        files = BridgeFiles(map=flight.map, camera=flight.camera, frames=frames, camera_source=source)
+        with pytest.raises(WarmError):
+            run_mavlink_bridge(files, link, BridgeSettings(method="ncc"))
+        assert gc.isenabled()
+        LastFix(last_fix_file(link.connect, link.system_id, flight.map.map.absolute())).keep(last)
+    assert briefly == [(False, False), (True, False), (False, False)]  # a recorded flight starts on the ground
 
 
 class Shown(Progress):

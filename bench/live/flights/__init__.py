@@ -1,1 +1,1 @@
-"""Flights with faults: run the bridge as a separate process beside the stand-in, with a camera that can fail."""
+"""Flights of the bridge: a separate process beside the stand-in or SITL, with a camera that can fail."""

@@ -1,18 +1,13 @@
-"""A stand-in autopilot that flies a flight folder in real time, for a bridge beside it on the bench.
+"""Where the vehicle of a recorded flight was, and how far from there a fix is.
 
-``python -m bench.live.fly_standin FLIGHT [--port N] [--firmware ardupilot|px4] [--seconds S]``, before or after
-the bridge: it takes off when a bridge listens, where the first picture was taken. FLIGHT is a folder with a
-``telemetry.csv`` and a ``truth.csv`` with attitude, as ``scenematch simulate`` writes them, or a video with DJI's
-``.SRT`` beside it: it then flies the positions, the heights and the gimbal's angles of the subtitles. Where truth
-has no heights above ground it flies those of the telemetry.
+A flight is a folder with ``telemetry.csv`` and a ``truth.csv`` with attitude, as ``scenematch simulate`` writes
+them, or a video with DJI's ``.SRT`` beside it, whose positions, heights and gimbal angles count. If truth has no
+heights above ground, those of the telemetry count.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import socket
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,18 +15,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from bench.live.standin import MS, Agenda, RealClock, S, Standin, State
-from engine.errors import EngineError, TelemetryError
+from bench.live.standin import Standin, State
+from engine.errors import TelemetryError
 from engine.geo import LocalFrame
 from scenematch.files.flight import open_flight
 from scenematch.files.telemetry import TelemetryRow, read_telemetry
 from scenematch.files.truth import Truth, read_truth
-
-FIRMWARES = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
-_REPORT_S = 5.0
-_LAST_ANSWER_S = 1.0  # the answer to the last picture comes after the flight
 
 
 def recorded(flight: Path) -> tuple[Callable[[float], State], LocalFrame, float]:
@@ -89,57 +79,16 @@ def _velocity(time_s: NDArray[np.float64], east_north: NDArray[np.float64]) -> N
     return np.column_stack(moved) / (after_s - before_s)[:, None]
 
 
-def wait_for_bridge(port: int, is_running: Callable[[], bool] = lambda: True) -> None:
-    """Until somebody listens on a UDP port of loopback: what is sent to one that nobody has comes back refused.
-
-    Raises:
-        SystemExit: the bridge has ended.
-    """
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect(("127.0.0.1", port))
-        while is_running():
-            try:
-                probe.send(b"")
-                time.sleep(0.01)
-                probe.send(b"")
-                return
-            except ConnectionRefusedError:
-                time.sleep(0.02)
-    raise SystemExit("the bridge has ended before it listened")
-
-
-def fly(flight: Path, port: int, firmware: str, seconds: float | None = None) -> dict[str, Any]:
-    """Fly until the flight or the time is over; returns how many fixes came, and how far off half of them were."""
-    motion, place, duration_s = recorded(flight)
-    wait_for_bridge(port)
-    clock = RealClock()
-    begin_ns, errors = clock(), []
-
-    def now(time_s: float) -> State:
-        return motion(time_s - begin_ns * 1e-9)
-
-    def on_fix(message: Any, arrived_ns: int) -> None:
-        errors.append(off_m(message, now, pilot))
-
-    agenda = Agenda(clock)
-    pilot = Standin(agenda, port, now, place, on_fix, firmware=FIRMWARES[firmware])
-    agenda.every(2 * MS, pilot.poll, clock())
-    agenda.every(round(_REPORT_S * S), lambda: print(summary(errors), flush=True), clock() + round(_REPORT_S * S))
-    try:
-        end_s = duration_s + _LAST_ANSWER_S
-        agenda.run(begin_ns + round((end_s if seconds is None else min(end_s, seconds)) * S))
-    finally:
-        pilot.close()
-    return {"fixes": len(errors), "median_m": float(np.median(errors)) if errors else None}
+def captured_s(message: Any) -> float:
+    """When the picture of a fix was taken, on the machine's clock."""
+    kind = message.get_type()
+    captured_us = message.usec if kind == "VISION_POSITION_ESTIMATE" else message.time_usec
+    return (captured_us - (message.processing_time if kind == "GLOBAL_POSITION_SENSOR" else 0)) * 1e-6
 
 
 def off_m(message: Any, motion: Callable[[float], State], pilot: Standin) -> float:
     """How far a fix is from where the vehicle was when its picture was taken."""
-    kind = message.get_type()
-    captured_us = message.usec if kind == "VISION_POSITION_ESTIMATE" else message.time_usec
-    if kind == "GLOBAL_POSITION_SENSOR":
-        captured_us -= message.processing_time
-    if kind in ("GPS_INPUT", "GLOBAL_POSITION_SENSOR"):
+    if message.get_type() in ("GPS_INPUT", "GLOBAL_POSITION_SENSOR"):
         east, north = pilot.place.enu_from_geodetic(message.lat * 1e-7, message.lon * 1e-7)[:2]
     else:  # about the autopilot's origin, which after a restart is the one that the bridge has set
         about = pilot.place
@@ -147,30 +96,5 @@ def off_m(message: Any, motion: Callable[[float], State], pilot: Standin) -> flo
             about = LocalFrame(pilot.origin[0] * 1e-7, pilot.origin[1] * 1e-7)
         lat_deg, lon_deg = about.geodetic_from_enu(message.y, message.x)
         east, north = pilot.place.enu_from_geodetic(lat_deg, lon_deg)[:2]
-    was = motion(captured_us * 1e-6)
+    was = motion(captured_s(message))
     return math.hypot(east - was.east_m, north - was.north_m)
-
-
-def summary(errors: list[float]) -> str:
-    """One line."""
-    return f"{len(errors)} fixes" + (f", half within {np.median(errors):.2f} m" if errors else "")
-
-
-def main() -> None:
-    """Fly, and print what came."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("flight", type=Path)
-    parser.add_argument("--port", type=int, default=14550)
-    parser.add_argument("--firmware", choices=FIRMWARES, default="ardupilot")
-    parser.add_argument("--seconds", type=float)
-    arguments = parser.parse_args()
-    print(f"waits for a bridge on UDP port {arguments.port} of this machine", flush=True)
-    try:
-        came = fly(arguments.flight, arguments.port, arguments.firmware, arguments.seconds)
-    except EngineError as error:
-        parser.error(str(error))
-    print(f"landed; {came['fixes']} fixes" + (f", half within {came['median_m']:.2f} m" if came["fixes"] else ""))
-
-
-if __name__ == "__main__":
-    main()

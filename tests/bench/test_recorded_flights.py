@@ -1,4 +1,4 @@
-"""A stand-in autopilot that flies what a video's subtitles say."""
+"""Where the vehicle of a recorded flight was: a video with its subtitles, and a folder."""
 
 import cv2
 import numpy as np
@@ -30,7 +30,7 @@ def video(folder, gimbal):
 
 
 def test_it_flies_the_positions_and_the_velocity_of_the_subtitles(tmp_path):
-    from bench.live.fly_standin import recorded
+    from bench.live.flights.recorded import recorded
 
     motion, place, duration_s = recorded(video(tmp_path, "[gb_yaw: 30.0 gb_pitch: -90.0 gb_roll: 0.0]"))
     assert (place.lat_deg, duration_s) == (pytest.approx(48.1), pytest.approx(74 / RATE_HZ))
@@ -42,7 +42,7 @@ def test_it_flies_the_positions_and_the_velocity_of_the_subtitles(tmp_path):
 
 
 def test_subtitles_without_a_heading_are_refused(tmp_path):
-    from bench.live.fly_standin import recorded
+    from bench.live.flights.recorded import recorded
 
     with pytest.raises(TelemetryError, match="expected subtitles beside it with position, rel_alt and gimbal"):
         recorded(video(tmp_path, ""))
@@ -63,7 +63,7 @@ def folder(path, truth, telemetry):
 
 
 def test_a_truth_without_heights_above_ground_is_flown_at_the_telemetrys(tmp_path):
-    from bench.live.fly_standin import recorded
+    from bench.live.flights.recorded import recorded
 
     heading, height, altitude = {"heading_deg": 30.0}, {"height_agl_m": 150.0}, {"alt_amsl_m": 200.0}
     motion, _, _ = recorded(folder(tmp_path, heading | altitude, height))

@@ -1,8 +1,8 @@
 """The camera of a simulated vehicle that shows a recorded video, from where the vehicle is.
 
-``python -m bench.live.video_camera VIDEO --hfov-deg DEG [--link udpin:127.0.0.1:14551]`` writes JPEG pictures to
-its standard output, for ``--camera-source exec:``. VIDEO has DJI's ``.SRT`` beside it. A simulator of ArduPilot's
-(SITL) sends SIM_STATE, its true state; each picture is the frame of the video that was taken nearest to
+``python -m bench.live.flights.video_camera VIDEO --hfov-deg DEG [--link udpin:127.0.0.1:14551]`` writes JPEG
+pictures to its standard output, for ``--camera-source exec:``. VIDEO has DJI's ``.SRT`` beside it. ArduPilot's
+simulator (SITL) sends SIM_STATE, its true state; each picture is the frame of the video that was taken nearest to
 there, moved, turned and scaled over level ground by what is left. The camera looks straight down whatever the
 vehicle does, as one on a gimbal. Only the middle of a frame is shown, so that it can be moved by the rest.
 """
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from bench.live.fly_standin import recorded
+from bench.live.flights.recorded import recorded
 from bench.live.standin import State
 from engine.geo import LocalFrame
 
@@ -58,31 +58,24 @@ class Footage:
         motion, self.place, _ = recorded(video)
         capture = cv2.VideoCapture(str(video))
         rate_hz, self._jpegs, self.states, index = capture.get(cv2.CAP_PROP_FPS), [], [], 0
-        while True:
-            read, image = capture.read()
-            if not read:
-                break
+        while capture.grab():
             if index % every == 0:
-                self.size = (image.shape[1], image.shape[0])
+                image = capture.retrieve()[1]
                 self._jpegs.append(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
                 self.states.append(motion(index / rate_hz))
             index += 1
+        self.size = (image.shape[1], image.shape[0])
         self.focal_px = self.size[0] / 2.0 / math.tan(math.radians(hfov_deg) / 2.0)
+        self.hfov_deg = math.degrees(2.0 * math.atan(SIZE[0] / 2.0 / self.focal_px))  # of the pictures shown
         self._noise = np.random.default_rng(1)  # a vehicle on the ground would else send one picture for ever
-        self._east_north = np.array([[state.east_m, state.north_m] for state in self.states])
-
-    @property
-    def hfov_deg(self) -> float:
-        """Horizontal field of view of the pictures that are shown."""
-        return math.degrees(2.0 * math.atan(SIZE[0] / 2.0 / self.focal_px))
 
     def picture(self, vehicle: State) -> NDArray[np.uint8]:
         """What the camera of a vehicle sees; black where the video did not look."""
-        nearest = int(np.argmin(np.hypot(*(self._east_north - [vehicle.east_m, vehicle.north_m]).T)))
+        away_m = [math.hypot(s.east_m - vehicle.east_m, s.north_m - vehicle.north_m) for s in self.states]
+        nearest = int(np.argmin(away_m))
         image = cv2.imdecode(self._jpegs[nearest], cv2.IMREAD_COLOR)
         warp = recorded_from_shown(self.states[nearest], self.size, vehicle, self.focal_px)
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        shown = cv2.warpAffine(image, warp, SIZE, flags=flags)
+        shown = cv2.warpAffine(image, warp, SIZE, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
         return cv2.add(shown, self._noise.integers(0, 3, shown.shape, np.uint8))
 
 

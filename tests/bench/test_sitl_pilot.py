@@ -10,13 +10,12 @@ pytest.importorskip("pymavlink", reason="pymavlink is not installed")
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from bench.live import fly_sitl
-from bench.live.fly_sitl import Pilot, fly_course, report
+from bench.live.flights import sitl
+from bench.live.flights.sitl import Pilot, follow, report
 from bench.live.standin import State
 from engine.geo import LocalFrame
 
 PLACE = LocalFrame(33.64, 72.99)
-COURSE = np.array([[float(k), 0.0] for k in range(101)])  # due east
 
 
 def message(kind, **fields):
@@ -28,8 +27,8 @@ def degrees_1e7(east_m, north_m):
     return round(float(lat_deg) * 1e7), round(float(lon_deg) * 1e7)
 
 
-def test_the_estimate_is_held_against_the_true_state_and_the_course():
-    pilot = Pilot(None, PLACE, COURSE)
+def test_the_estimate_is_held_against_the_true_state():
+    pilot = Pilot(None, PLACE)
     lat, lon = degrees_1e7(0.0, 0.0)
     pilot.take(message("GLOBAL_POSITION_INT", lat=0, lon=0, relative_alt=0))  # no position yet
     pilot.take(message("SIM_STATE", lat_int=lat, lon_int=lon))
@@ -41,8 +40,7 @@ def test_the_estimate_is_held_against_the_true_state_and_the_course():
     pilot.take(message("SIM_STATE", lat_int=lat, lon_int=lon))
     assert pilot.height_m == pytest.approx(170.0)
     assert pilot.errors_m["course"] == [pytest.approx(5.0, abs=0.02)]
-    assert pilot.off_course_m["course"] == [pytest.approx(5.0, abs=0.02)]
-    assert "course: 1 states, EKF to truth median 5.00" in report(pilot)
+    assert "| course | 1 | 5.00 | 5.00 |" in report(pilot)
 
 
 def test_targets_have_the_heading_and_the_velocity_of_the_course():
@@ -50,13 +48,14 @@ def test_targets_have_the_heading_and_the_velocity_of_the_course():
     mav = SimpleNamespace(set_position_target_global_int_send=lambda *fields: sent.append(fields))
     link = SimpleNamespace(mav=mav, recv_match=lambda **_: None)
     state = State(10.0, 20.0, 170.0, 0.0, 0.0, 90.0, 3.0, 4.0)
-    fly_course(Pilot(link, PLACE, COURSE), lambda _: state, 0.05)
-    fly_course(Pilot(link, PLACE, COURSE), lambda _: state, 0.05, still=True)
-    (moving, still) = (fields[5:] for fields in sent)
-    assert moving[:2] == degrees_1e7(10.0, 20.0)
-    assert (moving[3], moving[4]) == (4.0, 3.0)  # north, east
-    assert (still[3], still[4]) == (0.0, 0.0)
-    assert moving[9] == pytest.approx(np.pi / 2.0)
+    assert follow(Pilot(link, PLACE), lambda _: state, 0.05)
+    ((ignored, *target),) = (fields[4:] for fields in sent)
+    assert target[:2] == [*degrees_1e7(10.0, 20.0)]
+    assert (target[3], target[4]) == (4.0, 3.0)  # north, east
+    assert target[9] == pytest.approx(np.pi / 2.0)
+    accelerations = (mavlink.POSITION_TARGET_TYPEMASK_AX_IGNORE, mavlink.POSITION_TARGET_TYPEMASK_AY_IGNORE)
+    accelerations += (mavlink.POSITION_TARGET_TYPEMASK_AZ_IGNORE,)
+    assert ignored == sum(accelerations) + mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 
 
 ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -74,7 +73,7 @@ def heartbeat(mode, *, armed=True):
 @pytest.mark.parametrize(("mode", "name"), [(9, "LAND"), (6, "RTL")])
 def test_a_vehicle_that_lands_by_itself_is_steered_no_more_and_ends_the_flight(monkeypatch, mode, name):
     """A link that plays a failsafe early on, and a landing that takes a while."""
-    monkeypatch.setattr(fly_sitl, "take_off", lambda pilot, height_m: None)
+    monkeypatch.setattr(sitl, "take_off", lambda pilot, height_m: None)
     left = [heartbeat(4)] * 3 + [heartbeat(mode)] * 40 + [heartbeat(mode, armed=False)]
     waiting, commands, settings = [], [], []
 
@@ -87,9 +86,9 @@ def test_a_vehicle_that_lands_by_itself_is_steered_no_more_and_ends_the_flight(m
         command_long_send=lambda *fields: commands.append(fields[2]),
     )
     link = SimpleNamespace(mav=mav, recv_match=heard, param_set_send=lambda *fields: settings.append(fields))
-    pilot = Pilot(link, PLACE, COURSE)
+    pilot = Pilot(link, PLACE)
     pilot.texts.append("Scenematch: fixes begin")
-    fly_sitl.fly(pilot, lambda _: State(0.0, 0.0, 170.0, 0.0, 0.0, 0.0, 0.0, 0.0), 60.0, 30.0)
+    sitl.fly(pilot, lambda _: State(0.0, 0.0, 170.0, 0.0, 0.0, 0.0, 0.0, 0.0), 60.0, 30.0)
     assert (pilot.part, pilot.mode, pilot.armed, left) == (f"{name} by itself", name, False, [])
     assert len(waiting) == 1  # one target, before the failsafe was heard of
     assert mavlink.MAV_CMD_SET_EKF_SOURCE_SET not in commands
