@@ -26,7 +26,7 @@ from pymavlink.quaternion import Quaternion
 from engine.camera import mount_rotation
 from engine.errors import OptionError, TelemetryError
 from engine.geo import LocalFrame
-from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
+from engine.values import Attitude, NoFix, Reason
 from scenematch.bridges import mavlink_requests
 from scenematch.bridges.delay_memory import remember_delay
 from scenematch.bridges.fix_velocity import GroundVelocity, VelocityFromFixes
@@ -60,6 +60,7 @@ from scenematch.bridges.parameters import ParameterOptions, parameter_file
 from scenematch.bridges.pictures import replay
 from scenematch.bridges.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
 from scenematch.cli.app import run as main
+from tests.support.fixes import a_fix
 from tests.support.paths import ROOT
 
 GOLDEN = ROOT / "tests" / "golden" / "mavlink"
@@ -73,14 +74,9 @@ KEY = bytes(range(32))
 
 
 def fix(sigma_m=0.5, **changes):
-    values = {
-        "timestamp_ns": 1, "lat_deg": 33.6410000, "lon_deg": 72.9920000, "east_m": 0.0, "north_m": 0.0,
-        "up_m": None,
-        "covariance_m2": np.diag([sigma_m**2, (0.8 * sigma_m) ** 2, 1e6]), "attitude": None,
-        "score": 0.9, "method": "ncc",
-        "window": Window(0, 0, 1, 1), "timings": Timings(), "map_xy_px": (0.0, 0.0),
-    }  # fmt: skip
-    return Fix(**(values | changes))
+    covariance = np.diag([sigma_m**2, (0.8 * sigma_m) ** 2, 1e6])
+    place = {"timestamp_ns": 1, "lat_deg": 33.6410000, "lon_deg": 72.9920000, "covariance_m2": covariance}
+    return a_fix(**(place | changes))
 
 
 def sending(**changes):

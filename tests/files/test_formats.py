@@ -21,7 +21,7 @@ from engine.errors import (
     ShapeError,
     TelemetryError,
 )
-from engine.values import Fix, Frame, NoFix, Prior, Reason, Timings, Truth, Window
+from engine.values import Frame, NoFix, Prior, Reason, Truth, Window
 from scenematch.files.flight import open_flight, write_flight_folder
 from scenematch.files.frames import open_frames, read_image
 from scenematch.files.geotiff import write_geotiff
@@ -34,6 +34,7 @@ from scenematch.files.telemetry import (
 )
 from scenematch.files.track import COLUMNS, TrackRow, TrackWriter, read_track, track_row, write_track
 from scenematch.files.truth import interpolate_truth, read_truth, write_truth
+from tests.support.fixes import a_fix
 from tests.support.paths import SHARED
 from tests.support.photos import photograph
 from tests.support.videos import write_video
@@ -568,19 +569,15 @@ def test_geotiff_refuses_what_it_cannot_write(tmp_path):
 
 # ---------------------------------------------------------------------------------------------------- track
 
-FIX = Fix(
+FIX = a_fix(
     timestamp_ns=107_802_500_000,
     lat_deg=32.7931868031,
     lon_deg=34.9888531542,
     east_m=-12.34567,
     north_m=0.00004,
-    up_m=None,
     covariance_m2=np.array([[4.0, -0.5, 0.0], [-0.5, 2.25, 0.0], [0.0, 0.0, 9.0]]),
-    attitude=None,
     score=0.87654321,
-    method="ncc",
     window=Window(3, 4, 420, 415),
-    timings=Timings(),
     map_xy_px=(1.0, 2.0),
 )
 REFUSAL = NoFix(reason=Reason.AMBIGUOUS, timestamp_ns=None, method="sift", score=-0.00001)

@@ -16,8 +16,9 @@ from engine.navigation.attitude_bias import AttitudeBias, Bias
 from engine.navigation.attitude_lag import AttitudeLag
 from engine.navigation.navigator import Navigator
 from engine.options import ACCEPT_ALL
-from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
+from engine.values import Attitude, Frame, NoFix, Prior, Reason
 from tests.support.fields import fields_of
+from tests.support.fixes import a_fix
 
 IMAGE = np.zeros((8, 8), np.uint8)
 _NUMBERS = itertools.count()
@@ -42,9 +43,7 @@ def frame_at(time_s, off=(0.0, 0.0, 0.0)):
 
 
 def fix_of(attitude, up_m=100.0):
-    return Fix(timestamp_ns=None, lat_deg=0.0, lon_deg=0.0, east_m=0.0, north_m=0.0, up_m=up_m,
-               covariance_m2=np.eye(3), attitude=Attitude(*attitude), score=0.9, method="ncc", stage="refined",
-               window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0))  # fmt: skip
+    return a_fix(up_m=up_m, attitude=Attitude(*attitude), stage="refined")
 
 
 def flown(off, *, seconds=10.0, noise_deg=0.0, up_m=100.0):

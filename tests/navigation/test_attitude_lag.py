@@ -12,8 +12,9 @@ from engine.errors import OptionError, TelemetryError
 from engine.matching.covariance import with_frame_accuracy
 from engine.navigation.attitude_lag import AttitudeLag
 from engine.options import ACCEPT_ALL, AssumedErrors, NavigatorOptions
-from engine.values import Attitude, Fix, Frame, Timings, Window
+from engine.values import Attitude, Frame
 from tests.support.fields import fields_of
+from tests.support.fixes import a_fix
 
 IMAGE = np.zeros((8, 8), np.uint8)
 INTERVAL_S = 0.1
@@ -31,9 +32,7 @@ def frame_at(time_s, lag_s=0.0, **changes):
 
 def fix_at(time_s, up_m=100.0):
     roll, pitch, heading = angles(time_s)
-    return Fix(timestamp_ns=None, lat_deg=0.0, lon_deg=0.0, east_m=0.0, north_m=0.0, up_m=up_m,
-               covariance_m2=np.eye(3), attitude=Attitude(roll, pitch, heading % 360.0), score=0.9, method="ncc",
-               window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0))  # fmt: skip
+    return a_fix(up_m=up_m, attitude=Attitude(roll, pitch, heading % 360.0))
 
 
 def flown(lag_s, *, frames=100, up_m=100.0, **changes):

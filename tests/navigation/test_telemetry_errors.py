@@ -11,8 +11,9 @@ import pytest
 from engine import Navigator, Prior, SceneMatcher
 from engine.navigation.telemetry_errors import TelemetryErrors
 from engine.options import NavigatorOptions
-from engine.values import Attitude, Fix, Frame, Timings, Window
+from engine.values import Attitude, Fix, Frame
 from scenematch.simulator import plan_flight
+from tests.support.fixes import a_fix
 from tests.support.towns import drawn_town
 
 IMAGE = np.zeros((4, 4), np.uint8)
@@ -20,9 +21,7 @@ GROUND_M, HEIGHT_M = 30.0, 150.0
 
 
 def fix_of(attitude, up_m=GROUND_M + HEIGHT_M):
-    return Fix(timestamp_ns=None, lat_deg=0.0, lon_deg=0.0, east_m=0.0, north_m=0.0, up_m=up_m,
-               covariance_m2=np.eye(3), attitude=attitude, score=0.9, method="ncc", stage="refined",
-               window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0))  # fmt: skip
+    return a_fix(up_m=up_m, attitude=attitude, stage="refined")
 
 
 def flown(off_deg=(0.0, 0.0, 0.0), off_m=0.0, frames=40, seed=1, ground_m=GROUND_M):

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from engine.navigation.velocity_check import VelocityCheck
-from engine.values import Fix, Frame, Timings, Window
+from engine.values import Frame
+from tests.support.fixes import a_fix
 
 IMAGE = np.zeros((4, 4), np.uint8)
 FAULTS = {
@@ -22,10 +23,7 @@ FAULTS = {
 
 
 def match_at(place_m, confidence=0.9999, sigma_m=0.3):
-    return Fix(timestamp_ns=None, lat_deg=0.0, lon_deg=0.0, east_m=float(place_m[0]), north_m=float(place_m[1]),
-               up_m=None, covariance_m2=sigma_m**2 * np.eye(3), attitude=None, score=0.9, method="ncc",
-               window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0),
-               confidence=confidence)  # fmt: skip
+    return a_fix(*map(float, place_m), sigma_m, confidence=confidence)
 
 
 def flown(stated=lambda v: v, *, seconds=60.0, rate_hz=5.0, speed_mps=7.0, seed=1, confidence=0.9999, check=None):
