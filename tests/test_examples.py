@@ -142,6 +142,7 @@ class CameraOfNoCamera:
         pass
 
 
+@pytest.mark.usefixtures("bare_runs")
 @pytest.mark.parametrize("name", ["opencv_camera", "jetson_camera", "picamera2_camera"])
 def test_a_camera_is_followed(name, flight, monkeypatch):
     camera, start = CameraOfNoCamera(flight), read_truth(flight / "truth.csv")[0]

@@ -141,7 +141,7 @@ def cells(number, low=-180.0, high=180.0):
     ),
     st.tuples(cells(9, -90, 90).filter(lambda v: v is not None), cells(9).filter(lambda v: v is not None)),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_telemetry_round_trip(tmp_path_factory, rows, place):
     path = tmp_path_factory.mktemp("t") / "telemetry.csv"
     rows.sort(key=lambda row: row.timestamp_ns)

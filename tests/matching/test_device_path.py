@@ -206,7 +206,7 @@ OPTIONS = {
 @pytest.mark.parametrize(
     "options",
     [
-        pytest.param(options, id=name, marks=[] if name in ("usual", "upright") else [pytest.mark.slow])
+        pytest.param(options, id=name, marks=[] if name == "usual" else [pytest.mark.slow])
         for name, options in OPTIONS.items()
     ],
 )
