@@ -19,6 +19,7 @@ from engine.orthomap import OrthoMap
 from engine.values import Window
 from scenematch.files.geotiff import write_geotiff
 from tests.support.paths import SHARED
+from tests.support.rasters import write_raster
 
 UTM = "EPSG:32636"
 STEP_M = 0.5
@@ -34,22 +35,8 @@ def noise(*shape, low=1, high=255, seed=0):
     return np.random.default_rng(seed).integers(low, high, shape).astype(np.uint8)
 
 
-def write(path, data, *, colorinterp=None, colormap=None, tags=None, **profile):
-    data = np.asarray(data)
-    data = data[None] if data.ndim == 2 else data
-    count, height, width = data.shape
-    settings = {"driver": "GTiff", "dtype": data.dtype, "crs": UTM, "transform": CORNER, **profile}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a picture without georeference is meant
-        with rasterio.open(path, "w", width=width, height=height, count=count, **settings) as dataset:
-            if colorinterp:
-                dataset.colorinterp = colorinterp
-            if colormap:
-                dataset.write_colormap(1, colormap)
-            if tags:
-                dataset.update_tags(**tags)
-            dataset.write(data)
-    return path
+def write(path, data, **profile):
+    return write_raster(path, data, **({"crs": UTM, "transform": CORNER} | profile))
 
 
 def whole(site, level=0):

@@ -5,9 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 from affine import Affine
-from rasterio.enums import Resampling
 from rasterio.shutil import copy
 
 from engine.errors import MapError
@@ -15,6 +13,7 @@ from engine.maps.raster_formats import vrt_of_folder
 from engine.maps.rasters import GEOREFERENCE_TAG
 from engine.orthomap import OrthoMap
 from engine.values import Window
+from tests.support.rasters import write_raster
 
 UTM, WEST, NORTH, STEP_M = "EPSG:32633", 607400.0, 5345369.0, 0.5
 SIDE, TILE = 300, 128
@@ -26,17 +25,8 @@ def transform_at(x=0.0, y=0.0, step=STEP_M):
     return Affine(step, 0.0, WEST + x * STEP_M, 0.0, -step, NORTH - y * STEP_M)
 
 
-def write(path, data, *, overviews=(), tags=None, **profile):
-    data = np.asarray(data)
-    data = data[None] if data.ndim == 2 else data
-    count, height, width = data.shape
-    settings = {"driver": "GTiff", "dtype": data.dtype, "crs": UTM, "transform": transform_at()} | profile
-    with rasterio.open(path, "w", width=width, height=height, count=count, **settings) as dataset:
-        dataset.write(data)
-        dataset.update_tags(**(tags or {}))
-        if overviews:
-            dataset.build_overviews(list(overviews), Resampling.average)
-    return path
+def write(path, data, **profile):
+    return write_raster(path, data, **({"crs": UTM, "transform": transform_at()} | profile))
 
 
 def tiles_of(folder, data, *, gap=GAP, **profile):

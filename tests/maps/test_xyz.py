@@ -8,7 +8,6 @@ from contextlib import closing
 import cv2
 import numpy as np
 import pytest
-import rasterio
 from affine import Affine
 from PIL import Image
 from rasterio.shutil import copy
@@ -18,6 +17,7 @@ from engine.errors import MapError
 from engine.maps.rasters import open_source, stored_levels
 from engine.maps.xyz_tiles import is_tile_cache
 from engine.values import Window
+from tests.support.rasters import write_raster
 
 ZOOM, TILE = 18, 64
 FIRST = (143_000, 90_500)  # column and row, from the north, of the first tile: near Vienna
@@ -69,10 +69,7 @@ def plain(tmp_path_factory, picture):
     half = 20037508.342789244
     at = Affine(STEP_M, 0.0, FIRST[0] * TILE * STEP_M - half, 0.0, -STEP_M, half - FIRST[1] * TILE * STEP_M)
     path = tmp_path_factory.mktemp("plain") / "map.tif"
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 3, "crs": "EPSG:3857", "transform": at}
-    with rasterio.open(path, "w", width=WHOLE.width_px, height=WHOLE.height_px, **profile) as dataset:
-        dataset.write(np.moveaxis(picture, -1, 0))
-    return path
+    return write_raster(path, np.moveaxis(picture, -1, 0), crs="EPSG:3857", transform=at)
 
 
 @pytest.fixture(scope="module")
