@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-import rasterio
 import torch
 from rasterio.transform import Affine
 from rasterio.warp import Resampling, calculate_default_transform, reproject
@@ -38,6 +37,7 @@ from engine.matching.query import Query
 from engine.options import AssumedErrors, NccOptions, SiftOptions
 from engine.values import GridPose
 from tests.support.ground import Ground
+from tests.support.rasters import write_raster
 
 METHODS = ("ncc", "sift")
 NADIR = np.array([315.0, 296.0])
@@ -637,11 +637,7 @@ def test_the_papers_profile_refuses_what_it_cannot_do(ground, camera, frame, pri
 
 
 def write_map(path, gray, crs, transform):
-    height, width = gray.shape
-    profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "nodata": 0, "crs": crs, "transform": transform}
-    with rasterio.open(path, "w", width=width, height=height, **profile) as file:
-        file.write(gray, 1)
-    return OrthoMap.open(path)
+    return OrthoMap.open(write_raster(path, gray, nodata=0, crs=crs, transform=transform))
 
 
 def projections(folder, gray, pixel_to_crs, epsg):
