@@ -73,15 +73,15 @@ def modes(flown, start_s=0.0, end_s=math.inf):
 
 @pytest.fixture(scope="module")
 def undisturbed():
-    return fly(30.0)
+    return fly(20.0)
 
 
 def test_it_flies_its_plan_by_fixes_alone(undisturbed):
     assert math.sqrt(np.mean(distance(undisturbed.plan_error_m) ** 2)) < 0.8
     assert np.abs(undisturbed.plan_error_m[50:, 2]).max() < 2.0  # the barometer's drift
-    assert len(undisturbed.record) == 300
-    assert len(undisturbed.answers) == 150
-    assert len(undisturbed.used) == 149  # the last is on its way
+    assert len(undisturbed.record) == 200
+    assert len(undisturbed.answers) == 100
+    assert len(undisturbed.used) == 99  # the last is on its way
     assert modes(undisturbed) == {Mode.FOLLOW}
     assert all(row.healthy for row in rows_between(undisturbed, 1.0, 99.0))
     assert undisturbed.resets == 0
