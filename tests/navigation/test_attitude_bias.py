@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine.navigation.attitude_bias import AttitudeBias, Bias
@@ -58,6 +58,7 @@ def flown(off, *, seconds=10.0, noise_deg=0.0, up_m=100.0):
     return bias, out
 
 
+@settings(max_examples=30)
 @given(
     off=st.tuples(st.floats(0.9, 3.0), st.floats(-3.0, -0.9), st.floats(-8.0, -2.1)),
     noise_deg=st.floats(0.0, 0.5),

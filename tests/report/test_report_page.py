@@ -29,8 +29,8 @@ from tests.support.browser import missing, open_browser
 from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
 
-FRAMES = 8
-DARK = 5  # a frame that shows nothing
+FRAMES = 6
+DARK = 4  # a frame that shows nothing
 HOSTILE = "<img src=x onerror=hacked=1>"
 
 
