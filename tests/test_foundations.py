@@ -300,16 +300,11 @@ def test_reasons_are_an_enum_of_their_own_names():
 @pytest.mark.parametrize(
     ("error", "base"),
     [
-        (ShapeError, ValueError),
-        (DtypeError, TypeError),
-        (OptionError, ValueError),
-        (DeviceError, Exception),
-        (MapError, Exception),
-        (CalibrationError, Exception),
-        (TelemetryError, Exception),
+        (ShapeError, ValueError), (DtypeError, TypeError), (OptionError, ValueError), (DeviceError, Exception),
+        (MapError, Exception), (CalibrationError, Exception), (TelemetryError, Exception),
         (BackendError, Exception),
     ],
-)
+)  # fmt: skip
 def test_every_error_is_an_engine_error(error, base):
     assert issubclass(error, EngineError)
     assert issubclass(error, base)
