@@ -165,14 +165,10 @@ def test_scores_stay_within_minus_one_and_one(seed, bright, flat, zero_mean):
         (torch.zeros(1, 8, 8, dtype=torch.complex64), torch.zeros(1, 1, 2, 2), DtypeError, "search"),
         (torch.full((1, 8, 8), torch.nan), torch.zeros(1, 1, 2, 2), OptionError, "search"),
         (torch.zeros(1, 8, 8), torch.full((1, 1, 2, 2), torch.inf), OptionError, "templates"),
-        (
-            torch.zeros(1, 8, 8),
-            torch.zeros(1, 1, 2, 2, dtype=torch.uint8, device="meta"),
-            OptionError,
-            "templates",
-        ),
+        (torch.zeros(1, 8, 8), torch.zeros(1, 1, 2, 2, dtype=torch.uint8, device="meta"), OptionError,
+         "templates"),
     ],
-)
+)  # fmt: skip
 def test_errors_name_the_argument_what_was_expected_and_what_came(search, templates, error, names):
     with pytest.raises(error, match=rf"^{names}: expected .+, got .+") as caught:
         ncc(search, templates)

@@ -1080,12 +1080,10 @@ def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
     [
         (["--ros", "2", "--map", "m"], ["--ros", "2", "--map", "m"]),
         (["/a:=/b", "--map", "m", "__name:=x"], ["--map", "m", "--", "/a:=/b", "__name:=x"]),
-        (
-            ["--map", "m", "--ros-args", "-r", "a:=b", "--params-file", "f", "--", "--method", "ncc"],
-            ["--map", "m", "--method", "ncc", "--", "--ros-args", "-r", "a:=b", "--params-file", "f", "--"],
-        ),
+        (["--map", "m", "--ros-args", "-r", "a:=b", "--params-file", "f", "--", "--method", "ncc"],
+         ["--map", "m", "--method", "ncc", "--", "--ros-args", "-r", "a:=b", "--params-file", "f", "--"]),
     ],
-)
+)  # fmt: skip
 def test_arguments_of_ros_are_told_apart(typed, moved):
     assert ros_arguments_last(typed) == moved
 

@@ -167,21 +167,15 @@ BAD_TELEMETRY = {
     "no rows": (HEADER, "expected one row per frame, got a header and no rows"),
     "missing column": ("timestamp_ns,height_agl_m\n1,5\n", "line 1: lacks the column frame"),
     "colons": ("timestamp_ns:frame\n1:a\n", "lacks the column timestamp_ns; its columns are 'timestamp_ns:frame'"),
-    "duplicate column": (
-        "timestamp_ns,frame,frame\n1,a,b\n",
-        "line 1, frame: expected the column once, got it 2 times",
-    ),
+    "duplicate column": ("timestamp_ns,frame,frame\n1,a,b\n",
+     "line 1, frame: expected the column once, got it 2 times"),
     "short row": (HEADER + "1,a.jpg,5\n", "line 2: expected 6 cells as in the header, got 3"),
     "long row": (HEADER + "1,a.jpg,5,1,2,3,4\n", "line 2: expected 6 cells as in the header, got 7"),
-    "out of order": (
-        HEADER + "5,a,,,,\n4,b,,,,\n",
-        "line 3, timestamp_ns: expected a stamp later than the row before (5), got '4'",
-    ),
+    "out of order": (HEADER + "5,a,,,,\n4,b,,,,\n",
+     "line 3, timestamp_ns: expected a stamp later than the row before (5), got '4'"),
     "repeated stamp": (HEADER + "5,a,,,,\n5,b,,,,\n", "line 3, timestamp_ns: expected a stamp later"),
-    "repeated frame": (
-        HEADER + "5,a,,,,\n6,a,,,,\n",
-        "line 3, frame: expected each frame once (it is also in line 2)",
-    ),
+    "repeated frame": (HEADER + "5,a,,,,\n6,a,,,,\n",
+     "line 3, frame: expected each frame once (it is also in line 2)"),
     "blank stamp": (HEADER + ",a,,,,\n", "line 2, timestamp_ns: expected whole nanoseconds, got ''"),
     "stamp in seconds": (HEADER + "1.5,a,,,,\n", "line 2, timestamp_ns: expected a whole number, got '1.5'"),
     "huge stamp": (HEADER + "9" * 19 + ",a,,,,\n", "line 2, timestamp_ns: expected a whole number"),
@@ -200,7 +194,7 @@ BAD_TELEMETRY = {
     "not UTF-8": (b"timestamp_ns,frame\n1,\xe9.jpg\n", "expected UTF-8 text, got the byte 0xe9"),
     "line in a cell": (HEADER + '1,a,"5\nx",,,\n', r"height_agl_m: expected a finite number above 0, got '5\nx'"),
     "long cell": (HEADER + "1,a," + "x" * 500 + ",,,\n", "got '" + "x" * 40 + "'..."),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BAD_TELEMETRY, ids=list(BAD_TELEMETRY))

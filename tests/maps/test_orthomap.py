@@ -711,9 +711,7 @@ def test_a_surface_is_above_the_sea_where_its_crs_says_so(tmp_path, crs, datum):
     write_geotiff(tmp_path / "map.tif", noise(40, 50), affine, 4326 if crs == "EPSG:4979" else 32633)
     corner = affine[:, 2] - 0.5 * (affine[:, 0] + affine[:, 1])
     transform = rasterio.Affine(*np.column_stack([affine[:, :2], corner]).ravel())
-    profile = {"driver": "GTiff", "height": 40, "width": 50, "count": 1, "dtype": "float32", "crs": crs}
-    with rasterio.open(tmp_path / "dsm.tif", "w", transform=transform, **profile) as file:
-        file.write(np.full((1, 40, 50), 150.0, np.float32))
+    write(tmp_path / "dsm.tif", np.full((40, 50), 150.0, np.float32), crs=crs, transform=transform)
     site = OrthoMap.open(tmp_path / "map.tif", surface=tmp_path / "dsm.tif", cache_dir=tmp_path / "cache")
     assert site.surface_datum == datum
     assert site.info()["surface_datum"] == datum

@@ -407,31 +407,19 @@ def test_known_rotation_and_scale_leave_out_contradictions():
     [
         (torch.zeros(9, 9), {}, ShapeError, "images: expected (B, 1, H, W), got (9, 9)"),
         (torch.zeros(1, 3, 9, 9), {}, ShapeError, "images: expected (B, 1, H, W), got (1, 3, 9, 9)"),
-        (
-            torch.zeros(1, 1, 9, 9, dtype=torch.uint8),
-            {},
-            DtypeError,
-            "images: expected floating point, got torch.uint8",
-        ),
+        (torch.zeros(1, 1, 9, 9, dtype=torch.uint8), {}, DtypeError,
+         "images: expected floating point, got torch.uint8"),
         (torch.zeros(1, 1, 9, 9), {"max_keypoints": 0}, OptionError, "max_keypoints: expected at least 1, got 0"),
         (torch.zeros(1, 1, 9, 9), {"upsample": 3}, OptionError, "upsample: expected 1 or 2, got 3"),
-        (
-            torch.zeros(1, 1, 9, 9),
-            {"backend": "opencv"},
-            OptionError,
-            "backend: expected one of auto, compiled, kornia, got 'opencv'",
-        ),
+        (torch.zeros(1, 1, 9, 9), {"backend": "opencv"}, OptionError,
+         "backend: expected one of auto, compiled, kornia, got 'opencv'"),
         (torch.zeros(1, 1, 9, 9), {"spread": 0}, OptionError, "spread: expected 1 to 1000, got 0"),
         (torch.zeros(1, 1, 9, 9), {"contrast_threshold": -1}, OptionError, "contrast_threshold"),
-        (
-            torch.zeros(1, 1, 9, 9),
-            {"mask": torch.ones(1, 1, 9, 8, dtype=torch.bool)},
-            ShapeError,
-            "mask: expected",
-        ),
+        (torch.zeros(1, 1, 9, 9), {"mask": torch.ones(1, 1, 9, 8, dtype=torch.bool)}, ShapeError,
+         "mask: expected"),
         (torch.zeros(1, 1, 9, 9), {"mask": torch.ones(1, 1, 9, 9)}, DtypeError, "mask: expected bool"),
     ],
-)
+)  # fmt: skip
 def test_wrong_arguments_are_named(images, options, error, text):
     with pytest.raises(error) as caught:
         sift(images, **options)

@@ -110,19 +110,14 @@ def test_prediction_carries_errors_as_differences_say():
 @pytest.mark.parametrize(
     ("fuse", "measured", "variance"),
     [
-        (
-            partial(fuse_height, suite=SUITE),
-            lambda b: b.position_m[2] + b.baro_drift_m,
-            SUITE.barometer.noise_m**2,
-        ),
-        (
-            partial(fuse_heading, suite=SUITE),
-            lambda b: math.degrees(math.atan2(*b.enu_from_body[:2, 0]) + b.compass_bias_rad),
-            SUITE.compass.noise_deg**2,
-        ),
+        (partial(fuse_height, suite=SUITE), lambda b: b.position_m[2] + b.baro_drift_m,
+         SUITE.barometer.noise_m**2),
+        (partial(fuse_heading, suite=SUITE),
+         lambda b: math.degrees(math.atan2(*b.enu_from_body[:2, 0]) + b.compass_bias_rad),
+         SUITE.compass.noise_deg**2),
     ],
     ids=["barometer", "compass"],
-)
+)  # fmt: skip
 def test_a_measurement_moves_the_belief_as_its_differences_say(fuse, measured, variance):
     estimate, step = some_belief(), 1e-6
     H = np.empty(STATES)
