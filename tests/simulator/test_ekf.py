@@ -231,10 +231,9 @@ def test_errors_are_as_large_as_the_covariance_says(flights):
 
 
 def test_the_covariance_stays_positive_definite_and_symmetric():
-    for rows in [fly(seed, 12.0) for seed in (210, 211)]:
-        for _, P, _ in rows:
-            np.testing.assert_array_equal(P, P.T)
-            assert np.linalg.eigvalsh(P)[0] > 0.0
+    for _, P, _ in fly(210, 12.0):
+        np.testing.assert_array_equal(P, P.T)
+        assert np.linalg.eigvalsh(P)[0] > 0.0
 
 
 @pytest.mark.slow

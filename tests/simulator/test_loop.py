@@ -125,7 +125,7 @@ def test_a_long_latency_costs_little_because_fixes_are_taken_in_where_they_belon
 
 
 def test_with_gps_the_engines_fixes_are_not_needed():
-    flown = fly(12.0, matcher=Scripted(blind=True), gps=True)
+    flown = fly(8.0, matcher=Scripted(blind=True), gps=True)
     assert flown.used == []
     assert distance(flown.estimate_error_m[50:]).max() < 3.0
     assert modes(flown) == {Mode.FOLLOW}
