@@ -42,6 +42,7 @@ from engine.budget import Deadline
 from engine.runtime.device import resolve, synchronise
 from engine.runtime.threads import set_threads
 from engine.values import Peak
+from tests.support.fixes import a_fix
 
 IMAGE = np.zeros((4, 6), np.uint8)
 
@@ -283,21 +284,7 @@ def test_timings_add_up():
 def test_the_sigma_of_a_fix_is_the_longer_axis_of_its_ellipse():
     turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
     covariance = turn @ np.diag([9.0, 4.0, 100.0]) @ turn.T
-    fix = Fix(
-        timestamp_ns=1,
-        lat_deg=0.0,
-        lon_deg=0.0,
-        east_m=0.0,
-        north_m=0.0,
-        up_m=None,
-        covariance_m2=covariance,
-        attitude=None,
-        score=1.0,
-        method="ncc",
-        window=Window(2, 3, 4, 5),
-        timings=Timings(),
-        map_xy_px=(0.0, 0.0),
-    )
+    fix = a_fix(timestamp_ns=1, covariance_m2=covariance, score=1.0, window=Window(2, 3, 4, 5))
     assert fix.sigma_m == pytest.approx(3.0)
     assert fix.window.area_px == 20
 
@@ -313,16 +300,11 @@ def test_reasons_are_an_enum_of_their_own_names():
 @pytest.mark.parametrize(
     ("error", "base"),
     [
-        (ShapeError, ValueError),
-        (DtypeError, TypeError),
-        (OptionError, ValueError),
-        (DeviceError, Exception),
-        (MapError, Exception),
-        (CalibrationError, Exception),
-        (TelemetryError, Exception),
+        (ShapeError, ValueError), (DtypeError, TypeError), (OptionError, ValueError), (DeviceError, Exception),
+        (MapError, Exception), (CalibrationError, Exception), (TelemetryError, Exception),
         (BackendError, Exception),
     ],
-)
+)  # fmt: skip
 def test_every_error_is_an_engine_error(error, base):
     assert issubclass(error, EngineError)
     assert issubclass(error, base)

@@ -59,32 +59,6 @@ def test_ncc_equals_opencv(size, model, dtype, zero_mean):
             np.testing.assert_allclose(scores[b, t].numpy(), expected, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("dtype", LEVELS)
-@pytest.mark.parametrize(("size", "model"), SIZES)
-def test_ncc_equals_scikit_image(size, model, dtype):
-    rng = np.random.default_rng(12)
-    search, template = draw(rng, dtype, size), draw(rng, dtype, model)
-    scores = ncc(torch.from_numpy(search)[None], torch.from_numpy(template)[None, None])[0, 0]
-    expected = match_template(search.astype(np.float64), template.astype(np.float64))
-    np.testing.assert_allclose(scores.numpy(), expected, rtol=0, atol=1e-5)
-
-
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    size=st.tuples(st.integers(4, 40), st.integers(4, 40)),
-    share=st.tuples(st.floats(0.1, 1.0), st.floats(0.1, 1.0)),
-    dtype=st.sampled_from(sorted(LEVELS)),
-    zero_mean=st.booleans(),
-)
-def test_ncc_equals_opencv_on_random_sizes(seed, size, share, dtype, zero_mean):
-    rng = np.random.default_rng(seed)
-    model = tuple(max(2, round(n * s)) for n, s in zip(size, share, strict=True))
-    search, template = draw(rng, dtype, size), draw(rng, dtype, model)
-    scores = ncc(torch.from_numpy(search)[None], torch.from_numpy(template)[None, None], zero_mean=zero_mean)
-    expected = cv2.matchTemplate(search.astype(np.float32), template.astype(np.float32), MODES[zero_mean])
-    np.testing.assert_allclose(scores[0, 0].numpy(), expected, rtol=0, atol=1e-5)
-
-
 def test_a_batch_is_its_members_one_by_one():
     rng = torch.Generator().manual_seed(2)
     search, templates = torch.rand(3, 40, 50, generator=rng), torch.rand(3, 4, 9, 14, generator=rng)
@@ -148,17 +122,10 @@ def test_flat_patches_and_templates_score_zero_and_never_nan(zero_mean):
 
 @pytest.mark.parametrize("level", [0.0, 0.1, 1 / 3, 255.0, 1e6])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_window_of_one_grey_level_scores_zero(level, dtype):
+def test_a_window_or_template_of_one_grey_level_scores_zero(level, dtype):
     """0.1 and 1/3 have no exact sum: what rounding leaves must not be taken for texture."""
-    template = torch.rand(1, 1, 7, 9, generator=torch.Generator().manual_seed(0), dtype=dtype)
-    scores = ncc(torch.full((1, 41, 37), level, dtype=dtype), template)
-    assert not scores.any()
-
-
-@pytest.mark.parametrize("level", [0.1, 1 / 3, 255.0, 1e6])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_template_of_one_grey_level_scores_zero(level, dtype):
     search = torch.rand(1, 41, 37, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    assert not ncc(torch.full_like(search, level), search[:, None, :7, :9]).any()
     scores = ncc(search, torch.full((1, 1, 7, 9), level, dtype=dtype))
     assert torch.isfinite(scores).all()
     assert float(scores.abs().max()) < 1e-6
@@ -198,14 +165,10 @@ def test_scores_stay_within_minus_one_and_one(seed, bright, flat, zero_mean):
         (torch.zeros(1, 8, 8, dtype=torch.complex64), torch.zeros(1, 1, 2, 2), DtypeError, "search"),
         (torch.full((1, 8, 8), torch.nan), torch.zeros(1, 1, 2, 2), OptionError, "search"),
         (torch.zeros(1, 8, 8), torch.full((1, 1, 2, 2), torch.inf), OptionError, "templates"),
-        (
-            torch.zeros(1, 8, 8),
-            torch.zeros(1, 1, 2, 2, dtype=torch.uint8, device="meta"),
-            OptionError,
-            "templates",
-        ),
+        (torch.zeros(1, 8, 8), torch.zeros(1, 1, 2, 2, dtype=torch.uint8, device="meta"), OptionError,
+         "templates"),
     ],
-)
+)  # fmt: skip
 def test_errors_name_the_argument_what_was_expected_and_what_came(search, templates, error, names):
     with pytest.raises(error, match=rf"^{names}: expected .+, got .+") as caught:
         ncc(search, templates)

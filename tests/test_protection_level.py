@@ -6,13 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, OptionError, Timings, Window
+from engine import OptionError
+from tests.support.fixes import a_fix
 
-FIX = Fix(
-    timestamp_ns=None, lat_deg=0.0, lon_deg=0.0, east_m=0.0, north_m=0.0, up_m=None, covariance_m2=np.eye(3),
-    attitude=None, score=0.5, method="sift", window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0),
-    confidence=0.99999,
-)  # fmt: skip
+FIX = a_fix(score=0.5, method="sift", confidence=0.99999)
 
 
 @pytest.mark.parametrize("risk", [1e-1, 1e-2, 1e-4])

@@ -16,95 +16,31 @@ import engine
 from tests.support.paths import ROOT
 
 PUBLIC = [
-    "Answer",
-    "AssumedErrors",
-    "Attitude",
-    "BackendError",
-    "Budget",
-    "CalibrationError",
-    "Camera",
-    "DeviceError",
-    "DtypeError",
-    "EngineError",
-    "Fix",
-    "Frame",
-    "LearnedOptions",
-    "Live",
-    "LiveOptions",
-    "MapError",
-    "MatcherOptions",
-    "MissingExtraError",
-    "Navigator",
-    "NavigatorOptions",
-    "NavigatorState",
-    "NccOptions",
-    "NoFix",
-    "OptionError",
-    "OrthoMap",
-    "PoseOptions",
-    "Prior",
-    "Realtime",
-    "Reason",
-    "SceneMatcher",
-    "ShapeError",
-    "SiftOptions",
-    "StateError",
-    "TelemetryError",
-    "Timings",
-    "Window",
-    "features",
-    "ncc_fft",
-    "set_realtime",
+    "Answer", "AssumedErrors", "Attitude", "BackendError", "Budget", "CalibrationError", "Camera", "DeviceError",
+    "DtypeError", "EngineError", "Fix", "Frame", "LearnedOptions", "Live", "LiveOptions", "MapError",
+    "MatcherOptions", "MissingExtraError", "Navigator", "NavigatorOptions", "NavigatorState", "NccOptions",
+    "NoFix", "OptionError", "OrthoMap", "PoseOptions", "Prior", "Realtime", "Reason", "SceneMatcher", "ShapeError",
+    "SiftOptions", "StateError", "TelemetryError", "Timings", "Window", "features", "ncc_fft", "set_realtime",
     "set_threads",
-]
+]  # fmt: skip
 MODULES = {
-    "scenematch.bridges.mavlink": "pymavlink",
-    "scenematch.bridges.pictures": None,
-    "scenematch.bridges.ros": None,
-    "scenematch.bridges.ros1": None,
-    "scenematch.bridges.ros2": None,
-    "scenematch.bridges.vehicle": None,
-    "scenematch.files.flight": None,
-    "scenematch.files.telemetry": None,
-    "scenematch.files.track": None,
-    "scenematch.files.truth": None,
-    "engine.learned": None,
-    "scenematch": None,
-    "scenematch.simulator": None,
-    "scenematch.simulator.loop": None,
-    "scenematch.simulator.pilot": None,
-    "scenematch.simulator.quadrotor": None,
-}
+    "scenematch.bridges.mavlink": "pymavlink", "scenematch.bridges.pictures": None, "scenematch.bridges.ros": None,
+    "scenematch.bridges.ros1": None, "scenematch.bridges.ros2": None, "scenematch.bridges.vehicle": None,
+    "scenematch.files.flight": None, "scenematch.files.telemetry": None, "scenematch.files.track": None,
+    "scenematch.files.truth": None, "engine.learned": None, "scenematch": None, "scenematch.simulator": None,
+    "scenematch.simulator.loop": None, "scenematch.simulator.pilot": None, "scenematch.simulator.quadrotor": None,
+}  # fmt: skip
 """Public modules besides the engine's, whose ``__all__`` counts, and the optional package that each needs."""
 PACKAGES = ("engine", "scenematch")
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "examples").rglob("*.py"))]
 UNUSED = (
-    "matplotlib",
-    "rasterio",
-    "kornia",
-    "pyproj",
-    "typer",
-    "triton",
-    "numba",
-    "rich",
-    "PIL",
-    "scipy",
-    "skimage",
-)
+    "matplotlib", "rasterio", "kornia", "pyproj", "typer", "triton", "numba", "rich", "PIL", "scipy", "skimage",
+)  # fmt: skip
 HEAVY = {"torch", "cv2", "numpy", *UNUSED}
 WITHOUT_TORCH = (
-    "AssumedErrors",
-    "Budget",
-    "Camera",
-    "EngineError",
-    "Fix",
-    "Frame",
-    "LiveOptions",
-    "MatcherOptions",
-    "NavigatorOptions",
-    "OrthoMap",
-    "Prior",
-)
+    "AssumedErrors", "Budget", "Camera", "EngineError", "Fix", "Frame", "LiveOptions", "MatcherOptions",
+    "NavigatorOptions", "OrthoMap", "Prior",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

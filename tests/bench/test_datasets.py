@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("bare_runs")
 
 @pytest.fixture(scope="module")
 def plan():
-    return plan_flight(town=drawn_town(), frames=12)
+    return plan_flight(town=drawn_town(), frames=7)
 
 
 @pytest.fixture(scope="module")

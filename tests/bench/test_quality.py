@@ -10,8 +10,9 @@ from bench.accuracy.quality import Keypoints, ViewPair, judge
 from bench.inputs.map_views import map_pairs
 from bench.inputs.views import by_homography, warped_pairs
 from bench.speed.detectors import detectors
-from engine import Camera, Fix
-from engine.values import Attitude, Timings, Truth
+from engine import Camera
+from engine.values import Attitude, Truth
+from tests.support.fixes import a_fix
 
 SIZE = 200
 TURN = np.array([[0.0, -1.0, SIZE - 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a quarter: (x, y) to (last - y, x)
@@ -143,21 +144,7 @@ def test_every_detector_finds_a_blob_where_it_is():
 
 
 def fix_with(attitude, up_m=100.0):
-    return Fix(
-        timestamp_ns=0,
-        lat_deg=0.0,
-        lon_deg=0.0,
-        east_m=5.0,
-        north_m=-3.0,
-        up_m=up_m,
-        covariance_m2=np.eye(3),
-        attitude=attitude,
-        score=1.0,
-        method="sift",
-        window=None,
-        timings=Timings(),
-        map_xy_px=(0.0, 0.0),
-    )
+    return a_fix(5.0, -3.0, timestamp_ns=0, up_m=up_m, attitude=attitude)
 
 
 def test_the_attitudes_error_is_the_angle_between_the_attitudes():

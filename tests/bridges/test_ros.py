@@ -21,7 +21,7 @@ from bench.inputs.bags import BagMessages
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.navigation.live import LiveOptions
-from engine.values import Attitude, Fix, NoFix, Reason, Timings, Window
+from engine.values import Attitude, NoFix, Reason, Window
 from scenematch.bridges.ros import OUTPUTS, RosBridge
 from scenematch.bridges.ros_in import RosTelemetry, RosTopics
 from scenematch.bridges.ros_out import FIRMWARES, RosOptions, diagnostics, pose, window_picture
@@ -40,6 +40,7 @@ from scenematch.files.ros.messages import (
     range_from_message,
     stamp_ns,
 )
+from tests.support.fixes import a_fix
 from tests.support.ground import body_axes
 from tests.support.odometries import odometry_message, twist_message
 from tests.support.towns import drawn_town
@@ -418,24 +419,23 @@ def test_a_twist_along_other_axes_is_refused(maker, frame):
 # ---------------------------------------------------------------------------------------------------- poses
 
 
-def a_fix(site, **changes):
+def fix_on(site, **changes):
     xy = np.array([site.width_px / 2 + 30.25, site.height_px / 2 - 20.5])
     east, north = site.enu_from_pixel(xy)
     lat, lon = site.geodetic_from_pixel(xy)
     values = {
         "timestamp_ns": NOW_NS, "lat_deg": float(lat), "lon_deg": float(lon), "east_m": float(east),
-        "north_m": float(north), "up_m": None, "attitude": None, "score": 0.9, "method": "ncc",
+        "north_m": float(north), "window": Window(10, 20, 200, 100), "map_xy_px": tuple(map(float, xy)),
         "covariance_m2": np.array([[0.5, 0.1, 0.02], [0.1, 0.25, 0.03], [0.02, 0.03, 4.0]]),
-        "window": Window(10, 20, 200, 100), "timings": Timings(), "map_xy_px": tuple(map(float, xy)),
     }  # fmt: skip
-    return Fix(**(values | changes))
+    return a_fix(**(values | changes))
 
 
 VEHICLE = VehicleState(roll_deg=2.0, pitch_deg=-3.0, heading_deg=200.0, height_agl_m=120.0, down_m=-118.0)
 
 
 def test_a_pose_is_the_fix_with_its_covariance(ros, maker, sim_site):
-    fix = a_fix(sim_site)
+    fix = fix_on(sim_site)
     message = wired(ros, pose(maker, fix, VEHICLE, NOW_NS, sim_site, RosOptions()))
     assert (stamp_ns(message), message.header.frame_id) == (NOW_NS, "map")
     at, turn = message.pose.pose.position, message.pose.pose.orientation
@@ -448,7 +448,7 @@ def test_a_pose_is_the_fix_with_its_covariance(ros, maker, sim_site):
 
 
 def test_a_measured_attitude_outranks_the_vehicles(maker, sim_site):
-    fix = a_fix(sim_site, attitude=Attitude(5.0, 6.0, 77.0), up_m=sim_site.ground_m + 80.0)
+    fix = fix_on(sim_site, attitude=Attitude(5.0, 6.0, 77.0), up_m=sim_site.ground_m + 80.0)
     message = pose(
         maker, fix, VehicleState(roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0), NOW_NS, sim_site, RosOptions()
     )
@@ -460,17 +460,17 @@ def test_a_measured_attitude_outranks_the_vehicles(maker, sim_site):
 def test_a_whole_pose_has_the_covariance_of_its_attitude_about_east_north_up(maker, sim_site):
     # Heading east: a roll is a turn about east, a pitch one about north.
     known = {"attitude": Attitude(0.0, 0.0, 90.0), "attitude_covariance_deg2": np.diag([4.0, 9.0, 16.0])}
-    message = pose(maker, a_fix(sim_site, **known), VEHICLE, NOW_NS, sim_site, RosOptions())
+    message = pose(maker, fix_on(sim_site, **known), VEHICLE, NOW_NS, sim_site, RosOptions())
     turns_deg2 = np.asarray(message.pose.covariance).reshape(6, 6)[3:, 3:] * math.degrees(1.0) ** 2
     assert turns_deg2 == pytest.approx(np.diag([5.0, 10.0, 17.0]))  # a degree is the mount's
     north = known | {"attitude": Attitude(0.0, 0.0, 0.0)}
-    message = pose(maker, a_fix(sim_site, **north), VEHICLE, NOW_NS, sim_site, RosOptions())
+    message = pose(maker, fix_on(sim_site, **north), VEHICLE, NOW_NS, sim_site, RosOptions())
     turns_deg2 = np.asarray(message.pose.covariance).reshape(6, 6)[3:, 3:] * math.degrees(1.0) ** 2
     assert turns_deg2 == pytest.approx(np.diag([10.0, 5.0, 17.0]))
 
 
 def test_what_is_unknown_is_as_uncertain_as_can_be(maker, sim_site):
-    message = pose(maker, a_fix(sim_site), VehicleState(), NOW_NS, sim_site, RosOptions())
+    message = pose(maker, fix_on(sim_site), VehicleState(), NOW_NS, sim_site, RosOptions())
     variances = np.diag(np.asarray(message.pose.covariance).reshape(6, 6))
     assert variances[2] >= 1e6
     assert (variances[3:] >= math.pi**2).all()
@@ -479,14 +479,14 @@ def test_what_is_unknown_is_as_uncertain_as_can_be(maker, sim_site):
 
 
 def test_the_origin_moves_the_pose(maker, sim_site):
-    fix = a_fix(sim_site)
+    fix = fix_on(sim_site)
     options = RosOptions(origin=NedOrigin(fix.lat_deg, fix.lon_deg, 0.0))
     at = pose(maker, fix, VEHICLE, NOW_NS, sim_site, options).pose.pose.position
     assert (at.x, at.y) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
 def test_ardupilot_finds_the_fix_again_and_the_height_drowns_nothing(maker, sim_site):
-    fix, origin = a_fix(sim_site), NedOrigin(sim_site.frame.lat_deg + 0.01, sim_site.frame.lon_deg - 0.01, 0.0)
+    fix, origin = fix_on(sim_site), NedOrigin(sim_site.frame.lat_deg + 0.01, sim_site.frame.lon_deg - 0.01, 0.0)
     message = pose(maker, fix, VEHICLE, NOW_NS, sim_site, RosOptions(firmware="ardupilot", origin=origin))
     at, scale = (
         message.pose.pose.position,
@@ -509,7 +509,7 @@ def test_firmwares_are_named():
 
 
 def test_the_window_is_shown_with_the_fix_in_it(sim_site):
-    fix = a_fix(sim_site)
+    fix = fix_on(sim_site)
     x, y = (round(v) for v in fix.map_xy_px)
     window = Window(x - 60, y - 40, 200, 100)
     shown = window_picture(sim_site, window, fix)
@@ -588,7 +588,7 @@ def an_image(maker, time_ns, shape=(4, 6)):
 
 def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, sim_site):
     node, captured_ns = StandIn(maker), NOW_NS - 50_000_000
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site, timestamp_ns=frame.timestamp_ns)) as (
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site, timestamp_ns=frame.timestamp_ns)) as (
         bridge,
         seen,
     ):
@@ -600,7 +600,7 @@ def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, sim_site):
         assert message.__msgtype__ == kind
         assert stamp_ns(message) == captured_ns
     assert seen.frames[0].heading_deg == pytest.approx(3.0)
-    fix, (place,) = a_fix(sim_site), node.of("fix")
+    fix, (place,) = fix_on(sim_site), node.of("fix")
     assert (place.latitude, place.longitude) == (fix.lat_deg, fix.lon_deg)
     assert np.array_equal(np.reshape(place.position_covariance, (3, 3)), fix.covariance_m2)
     values = {pair.key: pair.value for pair in node.of("diagnostics")[0].status[0].values}
@@ -611,7 +611,7 @@ def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, sim_site):
 def test_a_refusal_is_told_and_never_a_pose(maker, sim_site):
     node = StandIn(maker)
     refusals = [NoFix(reason=reason, detail="why") for reason in Reason]
-    broken = [a_fix(sim_site, east_m=math.nan), a_fix(sim_site, covariance_m2=np.full((3, 3), np.inf))]
+    broken = [fix_on(sim_site, east_m=math.nan), fix_on(sim_site, covariance_m2=np.full((3, 3), np.inf))]
     answers = iter([*refusals, *broken])
     with bridge_of(node, sim_site, lambda frame: next(answers)) as (bridge, _):
         for k in range(len(Reason) + 2):
@@ -628,7 +628,7 @@ def test_a_refusal_is_told_and_never_a_pose(maker, sim_site):
 
 def test_nobody_looks_at_the_window(maker, sim_site):
     node = StandIn(maker, wanted=False)
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, _):
         bridge.on_image(an_image(maker, NOW_NS))
         node.wait_for("diagnostics", 1)
     assert not node.of("window")
@@ -636,7 +636,7 @@ def test_nobody_looks_at_the_window(maker, sim_site):
 
 def test_pictures_that_cannot_be_read_are_told(maker, sim_site):
     node = StandIn(maker)
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, _):
         odd = an_image(maker, NOW_NS)
         odd.encoding = "32FC1"
         bridge.on_image(odd)
@@ -651,7 +651,7 @@ def test_pictures_that_cannot_be_read_are_told(maker, sim_site):
 
 def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, sim_site):
     node = StandIn(maker)
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, seen):
         for k, time_ns in enumerate((0, NOW_NS + 1, NOW_NS - 60_000_000_000)):
             node.time_ns = time_ns or NOW_NS
             bridge.on_image(an_image(maker, time_ns))
@@ -664,7 +664,7 @@ def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, si
 def test_an_odometry_along_other_axes_is_reported_with_every_frame(ros, maker, sim_site, caplog):
     node, level = StandIn(maker), (0.0, 0.0, 0.0)
     topics = RosTopics(odometry="/vio/twist", odometry_type="TwistWithCovarianceStamped")
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, seen):
         _, heard = bridge.handlers(topics)["/vio/twist"]
         bridge.on_imu(maker.imu(NOW_NS, "", *level))
         for k, frame in enumerate(("odom", "odom", "base_link")):
@@ -687,7 +687,7 @@ def a_compressed(maker, time_ns, picture):
 
 def test_compressed_pictures_are_live_too(ros, maker, sim_site):
     node, picture = StandIn(maker), np.random.default_rng(1).integers(0, 256, (5, 7), dtype=np.uint8)
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, seen):
         handlers = bridge.handlers(RosTopics(image="/camera/image_raw/compressed"))
         kind, handler = handlers["/camera/image_raw/compressed"]
         message = wired(ros, a_compressed(maker, NOW_NS, picture))
@@ -699,7 +699,7 @@ def test_compressed_pictures_are_live_too(ros, maker, sim_site):
 
 def test_a_picture_waits_for_the_attitude_of_its_capture(maker, sim_site):
     node, after_ns = StandIn(maker), NOW_NS + 40_000_000
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, seen):
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, seen):
         bridge.on_imu(maker.imu(NOW_NS - 60_000_000, "", 0.0, -6.0, 0.0))
         bridge.on_image(an_image(maker, NOW_NS))
         assert bridge.status.counts.submitted == 0
@@ -718,7 +718,7 @@ def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, sim_site):
 
     def slowly(frame):
         answers.wait(60.0)
-        return a_fix(sim_site)
+        return fix_on(sim_site)
 
     bridge = RosBridge(
         node, sim_site, lambda start: Answers(slowly), RosOptions(), None, LiveOptions(deadline_ms=50)
@@ -740,7 +740,7 @@ def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, sim_site):
 
 def test_silence_is_told(maker, sim_site, monkeypatch):
     node = StandIn(maker)
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, _):
         bridge.check_input()
         assert not node.of("diagnostics")
         later = time.monotonic() + 5.0
@@ -751,7 +751,7 @@ def test_silence_is_told(maker, sim_site, monkeypatch):
 
 def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
     node = StandIn(maker)
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, _):
         handlers = bridge.handlers(RosTopics(compass="", velocity=""))
         kinds = {topic: kind for topic, (kind, _) in handlers.items()}
         handlers[RosTopics().height][1](maker.float64(42.0))
@@ -883,7 +883,7 @@ def test_the_ros2_node_hears_and_publishes_until_its_context_ends(rclpy_with, si
     stated = node.wait_for(RosTopics().camera_info, "sensor_msgs/msg/CameraInfo", 5.0)
     assert np.array_equal(camera_from_message(stated).matrix, camera.matrix)
     assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site)) as (bridge, _):
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, _):
         node.spin(bridge.handlers(RosTopics()), bridge.check_input, None)
     assert {topic: len(sent) for topic, sent in rclpy.published.items()} == {
         "~/pose": 1, "~/fix": 1, "~/window": 1, "/diagnostics": 1,
@@ -1005,7 +1005,7 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
     assert rospy.arguments == ["/a:=/b"]
     assert ros1.os.environ["ROS_IP"] == "127.0.0.1"
     assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
-    with bridge_of(node, sim_site, lambda frame: a_fix(sim_site, timestamp_ns=frame.timestamp_ns)) as (bridge, _):
+    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site, timestamp_ns=frame.timestamp_ns)) as (bridge, _):
         node.spin(bridge.handlers(RosTopics()), bridge.check_input, 1.0)
     assert {topic: len(sent) for topic, sent in rospy.published.items()} == {
         "~pose": 1, "~fix": 1, "~window": 1, "/diagnostics": 1,
@@ -1080,12 +1080,10 @@ def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
     [
         (["--ros", "2", "--map", "m"], ["--ros", "2", "--map", "m"]),
         (["/a:=/b", "--map", "m", "__name:=x"], ["--map", "m", "--", "/a:=/b", "__name:=x"]),
-        (
-            ["--map", "m", "--ros-args", "-r", "a:=b", "--params-file", "f", "--", "--method", "ncc"],
-            ["--map", "m", "--method", "ncc", "--", "--ros-args", "-r", "a:=b", "--params-file", "f", "--"],
-        ),
+        (["--map", "m", "--ros-args", "-r", "a:=b", "--params-file", "f", "--", "--method", "ncc"],
+         ["--map", "m", "--method", "ncc", "--", "--ros-args", "-r", "a:=b", "--params-file", "f", "--"]),
     ],
-)
+)  # fmt: skip
 def test_arguments_of_ros_are_told_apart(typed, moved):
     assert ros_arguments_last(typed) == moved
 

@@ -211,10 +211,7 @@ def test_a_huge_map_is_audited_along_a_route(huge_path, route_file, tmp_path, ca
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (
-            [],
-            "--around: expected LAT,LON,RADIUS_M, or a --route to audit along: the map of 12 x 12 km is too",
-        ),
+        ([], "--around: expected LAT,LON,RADIUS_M, or a --route to audit along: the map of 12 x 12 km is too"),
         (["--around=40.6,-97.7"], "--around: expected LAT,LON,RADIUS_M in degrees and metres, got '40.6,-97.7'"),
         (["--around=north"], "--around: expected LAT,LON,RADIUS_M in degrees and metres, got 'north'"),
         (["--around=40.6,-97.7,0"], "--around: expected a place on the Earth and a radius above 0 m"),
@@ -222,7 +219,7 @@ def test_a_huge_map_is_audited_along_a_route(huge_path, route_file, tmp_path, ca
         (["--around=41.6,-97.7,10"], "--around: expected a place on the map huge.tif, got 41.6,-97.7"),
         (["--corridor-m=50"], "--corridor-m: expected a --route with it, got none"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_audited_is_one_line_and_no_folder(huge_path, tmp_path, capsys, more, words):
     assert run(command(huge_path, tmp_path / "out", *more)) == 2
     printed = capsys.readouterr()

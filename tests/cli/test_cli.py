@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 import torch
 from PIL import Image
 
@@ -60,13 +59,8 @@ def done(flight, tmp_path_factory):
 
 
 def track(folder, out, *more, **replaced):
-    files = {
-        "map": "map.tif",
-        "surface": "dsm.tif",
-        "camera": "camera.yaml",
-        "frames": "frames",
-        "telemetry": "telemetry.csv",
-    } | replaced
+    files = {"map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames"}
+    files |= {"telemetry": "telemetry.csv"} | replaced
     options = [f"--{name}={folder / file}" for name, file in files.items() if file is not None]
     return ["track", *options, "--method=ncc", f"--out={out}", *map(str, more)]
 
@@ -262,8 +256,9 @@ def test_locate_finds_a_picture_without_a_prior(flight, capsys):
 
 def test_a_map_that_lies_badly_makes_a_fix_doubtful(flight, capsys):
     """The built-in map says that it is exact; input.map_sigma_m counts more, and adds up with the rest."""
-    image = flight / "frames" / "000000.jpg"
-    base = ["locate", str(image), f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}", "--json"]
+    image, truth = flight / "frames" / "000000.jpg", cells(flight / "truth.csv")[0]
+    place = [f"--start={truth['lat_deg']},{truth['lon_deg']}", f"--camera={flight / 'camera.yaml'}"]
+    base = ["locate", str(image), f"--map={flight / 'map.tif'}", *place, "--json"]
     variances = []
     for option in ([], ["--settings=input.map_sigma_m=3"]):
         assert run([*base, *option]) == 0
@@ -316,34 +311,6 @@ def test_doctor_asks_for_what_the_installation_states(monkeypatch, capsys):
     assert [(name, value) for name, value in facts.items() if "extra" in name] == [("extra [pictures]", expected)]
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        [],
-        ["demo"],
-        ["track"],
-        ["locate"],
-        ["evaluate"],
-        ["export"],
-        ["map"],
-        ["map", "info"],
-        ["map", "audit"],
-        ["bridge"],
-        ["bridge", "mavlink"],
-        ["bridge", "ros"],
-        ["simulate"],
-        ["compare"],
-        ["doctor"],
-    ],
-)
-def test_help_fits_80_columns_and_is_not_cut_off(command, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    assert run([*command, "--help"]) == 0
-    printed = capsys.readouterr().out
-    assert max(map(len, printed.splitlines())) <= 80
-    assert "..." not in printed.replace("[ARGS]...", "").replace("[NAME:=VALUE]...", "").replace("{DIR}...", "")
-
-
 def test_no_command_at_all_shows_help(capsys):
     assert run([]) == 2
     assert "Commands:" in capsys.readouterr().out
@@ -364,7 +331,6 @@ def test_version(capsys):
         (["map", "audit"], ["MAP"]),
         (["--bogus"], ["--bogus"]),
         (["track", "--bogus"], ["--bogus", "scenematch track --help"]),
-        (["track"], ["--map"]),
         (["locate"], ["IMAGE"]),
         (["map"], ["scenematch map --help"]),
         (["demo", "--frames=1"], ["--frames"]),
@@ -383,22 +349,10 @@ def test_wrong_usage(arguments, words, capsys):
 
 @pytest.mark.parametrize(
     "option",
-    [
-        "--method=orb",
-        "--profile=fast",
-        "--start=here",
-        "--start=33",
-        "--start=33,35,1,2",
-        "--start=nan,35",
-        "--start=95,35",
-        "--start=33,35,-1",
-        "--start=10,10",
-        "--budget-ms=0",
-        "--budget-ms=-5",
-        "--budget-ms=nan",
-        "--budget-ms=soon",
-    ],
-)
+    ["--method=orb", "--profile=fast", "--start=here", "--start=33", "--start=33,35,1,2", "--start=nan,35",
+     "--start=95,35", "--start=33,35,-1", "--start=10,10", "--budget-ms=0", "--budget-ms=-5", "--budget-ms=nan",
+     "--budget-ms=soon"],
+)  # fmt: skip
 def test_wrong_options_of_track_are_named(option, flight, tmp_path, capsys):
     refused(capsys, flight, tmp_path / "out", 2, option.split("=")[0], more=[option])
 
@@ -451,54 +405,29 @@ def test_a_picture_is_no_map(copy, tmp_path, capsys):
     refused(capsys, copy, tmp_path / "out", 1, copy / "map.png", "georeference", map="map.png")
 
 
-@pytest.mark.parametrize("kind", ["no crs", "nan transform", "vrt", "text", "truncated", "empty"])
-def test_broken_maps(kind, copy, tmp_path, capsys):
-    path = copy / "broken.tif"
-    gray = np.full((64, 64), 9, np.uint8)
-    if kind in ("no crs", "nan transform"):
-        origin = np.nan if kind == "nan transform" else 600000.0
-        transform = rasterio.Affine(0.5, 0, origin, 0, -0.5, 3600000.0)
-        crs = None if kind == "no crs" else "EPSG:32636"
-        with rasterio.open(
-            path, "w", driver="GTiff", width=64, height=64, count=1, dtype="uint8", crs=crs, transform=transform
-        ) as file:
-            file.write(gray, 1)
-    elif kind == "vrt":
-        path.write_text('<VRTDataset rasterXSize="64" rasterYSize="64"></VRTDataset>', encoding="utf-8")
-    elif kind == "text":
-        path.write_text("not a raster", encoding="utf-8")
-    elif kind == "truncated":
-        path.write_bytes((copy / "map.tif").read_bytes()[:20000])
-    else:
-        path.touch()
-    refused(capsys, copy, tmp_path / "out", 1, path, map="broken.tif")
-
-
 def test_a_surface_of_another_place(copy, tmp_path, capsys):
     affine = [[0.5, 0, 400000.0], [0, -0.5, 5000000.0]]
     write_geotiff(copy / "far.tif", np.zeros((64, 64), np.float32), affine, 32633)
     refused(capsys, copy, tmp_path / "out", 1, "surface", "far.tif", surface="far.tif")
 
 
-@pytest.mark.parametrize(("kind", "index"), [("empty", 0), ("truncated", 3), ("text", 0), ("other size", 3)])
+@pytest.mark.parametrize(
+    ("kind", "index"), [("empty", 0), ("truncated", 3), ("truncated png", 4), ("text", 0), ("other size", 3)]
+)
 def test_broken_pictures_are_found_before_the_run(kind, index, copy, tmp_path, capsys):
     path = copy / "frames" / f"{index:06d}.jpg"
     if kind == "other size":
         Image.new("RGB", (64, 48)).save(path)
+    elif kind == "truncated png":
+        with Image.open(path) as picture:
+            picture.save(path.with_suffix(".png"))
+        path.unlink()
+        path = path.with_suffix(".png")
+        path.write_bytes(path.read_bytes()[:-2000])
+        edit(copy / "telemetry.csv", "000004.jpg", "000004.png")
     else:
         content = {"empty": b"", "truncated": path.read_bytes()[:-3000], "text": b"not a picture"}[kind]
         path.write_bytes(content)
-    refused(capsys, copy, tmp_path / "out", 1, path)
-
-
-def test_a_truncated_png_is_found_before_the_run(copy, tmp_path, capsys):
-    path = copy / "frames" / "000004.jpg"
-    with Image.open(path) as picture:
-        picture.save(path.with_suffix(".png"))
-    path.unlink()
-    path = path.with_suffix(".png")
-    path.write_bytes(path.read_bytes()[:-2000])
-    edit(copy / "telemetry.csv", "000004.jpg", "000004.png")
     refused(capsys, copy, tmp_path / "out", 1, path)
 
 
@@ -507,23 +436,6 @@ def test_frames_that_are_neither_folder_nor_video(copy, tmp_path, capsys):
     refused(capsys, copy, tmp_path / "out", 1, copy / "flight.mp4", frames="flight.mp4")
     (copy / "nothing").mkdir()
     refused(capsys, copy, tmp_path / "out", 1, copy / "nothing", frames="nothing")
-
-
-@pytest.mark.parametrize(
-    ("column", "value", "words"),
-    [
-        ("frame", "nowhere.jpg", ["line 4", "frame", "nowhere.jpg"]),
-        ("frame", "000001.jpg", ["line 4", "frame", "line 3"]),
-        ("timestamp_ns", "5", ["line 4", "timestamp_ns"]),
-        ("timestamp_ns", "", ["line 4", "timestamp_ns"]),
-        ("height_agl_m", "nan", ["line 4", "height_agl_m", "nan"]),
-        ("height_agl_m", "-150", ["line 4", "height_agl_m", "-150"]),
-        ("heading_deg", "north", ["line 4", "heading_deg", "north"]),
-    ],
-)
-def test_wrong_telemetry(column, value, words, copy, tmp_path, capsys):
-    set_cell(copy / "telemetry.csv", 2, column, value)
-    refused(capsys, copy, tmp_path / "out", 1, copy / "telemetry.csv", *words)
 
 
 def test_telemetry_without_a_column(copy, tmp_path, capsys):
@@ -552,12 +464,6 @@ def test_wrong_truth(copy, tmp_path, capsys):
 def test_a_camera_of_another_resolution(copy, tmp_path, capsys):
     edit(copy / "camera.yaml", "image_width: 300", "image_width: 640")
     refused(capsys, copy, tmp_path / "out", 1, "camera", "640 x 300", "300 x 300")
-
-
-@pytest.mark.parametrize("text", ["", "][", "image_width: 300\n", "just words"])
-def test_broken_camera_files(text, copy, tmp_path, capsys):
-    (copy / "camera.yaml").write_text(text, encoding="utf-8")
-    refused(capsys, copy, tmp_path / "out", 1, copy / "camera.yaml")
 
 
 def test_evaluate_of_what_is_no_finished_track(done, tmp_path, capsys):
@@ -626,14 +532,8 @@ def test_the_learned_method_says_what_is_wrong_with_its_weights(flight, tmp_path
     option = "--settings learned.weights: "
     wanted = f"{option}expected the files of LoFTR, or LightGlue with DISK, ALIKED or SuperPoint, got none"
     refused(capsys, flight, out, 2, wanted, more=learned)
-    refused(
-        capsys,
-        flight,
-        out,
-        2,
-        "--settings learned.weights: no such file: ",
-        more=(*learned, "--settings=learned.weights=none.pth"),
-    )
+    more = (*learned, "--settings=learned.weights=none.pth")
+    refused(capsys, flight, out, 2, f"{option}no such file: ", more=more)
     more = (*learned, f"--settings=learned.weights={flight}/camera.yaml")
     refused(capsys, flight, out, 2, option, "camera.yaml", more=more)
     locate = ["locate", next(flight.joinpath("frames").iterdir()), f"--map={flight}/map.tif", *learned]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -40,12 +41,15 @@ def loaded_after(lines):
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda words: " ".join(words) or "scenematch")
-def test_h_is_help(command, capsys):
+def test_h_is_help_which_fits_80_columns_and_is_not_cut_off(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
     assert run([*command, "-h"]) == 0
     short = capsys.readouterr().out
     assert run([*command, "--help"]) == 0
     assert capsys.readouterr().out == short
     assert "-h, --help" in short
+    assert max(map(len, short.splitlines())) <= 80
+    assert "..." not in re.sub(r"(\[ARGS\]|\[NAME:=VALUE\]|\{DIR\})\.\.\.", "", short)
 
 
 def test_help_of_every_command_loads_nothing_that_only_its_work_needs():

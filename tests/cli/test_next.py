@@ -46,6 +46,12 @@ def flight(tmp_path_factory):
     return out / "f"
 
 
+def files_of(flight):
+    """Options of a flight's files, as a command says them again."""
+    names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
+    return [word for option, name in names.items() for word in (f"--{option}", str(flight / name))]
+
+
 def test_from_a_flight_to_its_export_by_what_is_said(flight, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = next_of(capsys, ["simulate", f"--out={tmp_path / 'again'}", "--frames=1"])
@@ -63,8 +69,7 @@ def test_others_name_commands_that_exist(flight, capsys):
 
 
 def test_check_looks_at_one_frame_in_n_and_track_is_named_with_the_same(flight, capsys):
-    names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
-    given = ["check", *(f"--{option}={flight / name}" for option, name in names.items())]
+    given = ["check", *files_of(flight)]
     for every, looked_at in ((1, 2), (2, 1)):
         assert run([*given, f"--settings=input.every={every}", "--json"]) == 0
         assert json.loads(capsys.readouterr().out)["looked_at"] == looked_at
@@ -77,9 +82,7 @@ def test_check_looks_at_one_frame_in_n_and_track_is_named_with_the_same(flight, 
 @pytest.mark.parametrize(("runs", "drawn"), [(["ncc"], "comparison.png"), (["ncc", "sift"], "comparison.html")])
 def test_compare_names_a_file_that_it_wrote(flight, tmp_path, capsys, runs, drawn):
     out = tmp_path / "two  spaces"
-    names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
-    files = [f"--{option}={flight / name}" for option, name in names.items()]
-    assert run(["compare", *files, f"--out={out}", *(f"--run={name}" for name in runs)]) == 0
+    assert run(["compare", *files_of(flight), f"--out={out}", *(f"--run={name}" for name in runs)]) == 0
     last = capsys.readouterr().err.splitlines()[-1]
     found = re.fullmatch(r"next: open (.+); scenematch (.+)", last)
     assert shlex.split(found[1]) == [str(out / drawn)]
@@ -120,8 +123,7 @@ def test_names_with_spaces_stay_one_word(capsys):
 
 def test_a_run_without_a_fix_is_followed_by_check_of_the_same_files(flight, tmp_path, capsys):
     """An export would refuse it. By ncc every frame is refused under a heading that is 90 degrees off."""
-    names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
-    files = [word for option, name in names.items() for word in (f"--{option}", str(flight / name))]
+    files = files_of(flight)
     corrected = ("height_offset_m=900.0", "heading_deg=heading_deg+90")
     wrong = [*(word for text in corrected for word in ("--correct", text)), "--settings", "input.every=2"]
     out = tmp_path / "out"
@@ -140,8 +142,7 @@ def test_a_run_without_a_fix_is_followed_by_check_of_the_same_files(flight, tmp_
 def test_compare_names_its_settings_again(flight, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenematch.toml").touch()
-    names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
-    files = [word for option, name in names.items() for word in (f"--{option}", str(flight / name))]
+    files = files_of(flight)
     given = ["--out=compared", "--run=ncc", "--settings=scenematch.toml"]
     words = next_of(capsys, ["compare", *files, *given])
     assert parsed(words) == "track"

@@ -100,16 +100,8 @@ def test_a_live_view_goes_to_a_file_and_to_a_viewer():
 def test_the_settings_file_lists_every_table(tmp_path, capsys):
     assert run(["doctor", "--settings"]) == 0
     text = capsys.readouterr().out
-    for line in (
-        "#threads = 1",
-        '#method = "auto"',
-        "[input]",
-        "#every = 1",
-        "[mavlink]",
-        "[ros.topics]",
-        "[fetch]",
-    ):
-        assert f"\n{line}\n" in text
+    lines = ("#threads = 1", '#method = "auto"', "[input]", "#every = 1", "[mavlink]", "[ros.topics]", "[fetch]")
+    assert all(f"\n{line}\n" in text for line in lines)
     file = tmp_path / "all.toml"
     file.write_text(text)
     assert Settings.read([file]).table("input") == Settings().table("input")

@@ -76,17 +76,14 @@ def test_a_value_out_of_range_is_refused_by_its_option(command, option, value, t
         ([*LIVE, "--telemetry=t.csv"], "--telemetry", "--frames"),
         ([*LIVE, "--settings=input.rate_hz=3"], "--settings input.rate_hz", "--frames"),
         ([*LIVE, "--settings=input.every=3"], "--settings input.every", "--frames"),
-        (
-            [*PLAYED, "--settings=input.exposure_to_grab_ms=3"],
-            "--settings input.exposure_to_grab_ms",
-            "--camera-source",
-        ),
+        ([*PLAYED, "--settings=input.exposure_to_grab_ms=3"], "--settings input.exposure_to_grab_ms",
+         "--camera-source"),
         ([*PLAYED, "--settings=bridge.nice=-5"], "--settings bridge.nice", "--settings bridge.realtime"),
         ([*ROS, "--settings=bridge.cores=0"], "--settings bridge.cores", "--settings bridge.realtime"),
         ([*PLAYED, *NO_ORIGIN], "--settings mavlink.origin_alt_m", "--settings mavlink.set_origin"),
         ([*SIMULATE, "--minutes=1"], "--minutes", "--closed-loop"),
     ],
-)
+)  # fmt: skip
 def test_an_option_that_would_say_nothing_is_refused(command, option, wanted, capsys):
     assert said(capsys, command) == f"{option}: expected with {wanted} only\n"
 

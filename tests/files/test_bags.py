@@ -70,19 +70,27 @@ def a_bag(folder, kind, **options):
     return path, frames, truth
 
 
-@pytest.mark.parametrize(("kind", "grey"), list(zip(BAG_KINDS, (False, True, False), strict=True)))
-def test_pictures_come_back_byte_for_byte(tmp_path, kind, grey):
-    path, frames, _ = a_bag(tmp_path, kind, grey=grey)
+@pytest.fixture(scope="module", params=BAG_KINDS)
+def bag(request, tmp_path_factory):
+    """A bag of each kind, to be read and not written, with the frames and truth in it."""
+    return a_bag(tmp_path_factory.mktemp("bag"), request.param)
+
+
+def test_pictures_come_back_byte_for_byte(bag):
+    path, frames, _ = bag
     source = BagFrames(path)
     assert source.stamps_ns() == [frame.timestamp_ns for frame in frames]
     for k in (0, 1, 4, 2, 2):  # forward, and back
-        image = frames[k].image if not grey else np.repeat(frames[k].image[:, :, None], 3, axis=2)
-        assert source.read(str(k)).tobytes() == image.tobytes()
+        assert source.read(str(k)).tobytes() == frames[k].image.tobytes()
 
 
-@pytest.mark.parametrize("kind", BAG_KINDS)
-def test_a_flight_comes_back(tmp_path, kind):
-    path, frames, truth = a_bag(tmp_path, kind)
+def test_grey_pictures_come_back_in_three_channels(tmp_path):
+    path, frames, _ = a_bag(tmp_path, BAG_KINDS[1], grey=True)
+    assert BagFrames(path).read("1").tobytes() == np.repeat(frames[1].image[:, :, None], 3, axis=2).tobytes()
+
+
+def test_a_flight_comes_back(bag):
+    path, frames, truth = bag
     flight = open_flight(path, camera=read_bag_camera(path))
     assert len(flight) == len(frames)
     for k, (item, frame) in enumerate(zip(flight, frames, strict=True)):
@@ -99,19 +107,16 @@ def test_a_flight_comes_back(tmp_path, kind):
             assert getattr(row, name) == pytest.approx(getattr(true, name), abs=1e-9)
 
 
-@pytest.mark.parametrize("kind", BAG_KINDS)
-def test_the_calibration_comes_back_but_its_mount(tmp_path, kind):
-    path, _, _ = a_bag(tmp_path, kind)
-    camera = read_bag_camera(path)
+def test_the_calibration_comes_back_but_its_mount(bag):
+    camera = read_bag_camera(bag[0])
     assert (camera.width_px, camera.height_px, camera.distortion_model) == (31, 23, "plumb_bob")
     assert np.array_equal(camera.matrix, CAMERA.matrix)
     assert np.array_equal(camera.distortion, CAMERA.distortion)
 
 
-@pytest.mark.parametrize("kind", BAG_KINDS)
-def test_others_read_what_is_written(tmp_path, kind):
+def test_others_read_what_is_written(bag):
     """By rosbags alone: the names, types and numbers that a ROS tool finds."""
-    path, frames, _ = a_bag(tmp_path, kind)
+    path, frames, _ = bag
     with AnyReader([path]) as reader:
         assert {c.topic: c.msgtype for c in reader.connections}[IMAGE] == "sensor_msgs/msg/Image"
         found = {}
@@ -284,15 +289,8 @@ def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker):
 def test_an_odometrys_topic_needs_a_bag(tmp_path, capsys):
     for command in ("track", "check", "compare"):
         given = [
-            "--map",
-            "m.tif",
-            "--frames",
-            "f",
-            "--telemetry",
-            "t.csv",
-            "--settings",
-            "input.odometry_topic=/vio",
-        ]
+            "--map", "m.tif", "--frames", "f", "--telemetry", "t.csv", "--settings", "input.odometry_topic=/vio",
+        ]  # fmt: skip
         out = [] if command == "check" else ["--out", str(tmp_path / "out")]
         assert main([command, *given, *out]) == 2
         assert "--settings input.odometry_topic: expected a bag as telemetry, got t.csv" in capsys.readouterr().err

@@ -100,10 +100,8 @@ def test_a_date_to_the_nanosecond(tmp_path, text, ns):
 
 
 REFUSED = {
-    "ambiguous": (
-        [10, 20, 30],
-        "rows 10 apart, which may be milliseconds or seconds: name the column timestamp_ms or",
-    ),
+    "ambiguous": ([10, 20, 30],
+     "rows 10 apart, which may be milliseconds or seconds: name the column timestamp_ms or"),
     "too dense": ([0, 0.001, 0.002], "rows 0.001 apart, which is no camera's"),
     "seconds that would not fit": ([10**15, 10**15 + 1], "rows 1 apart, which is no camera's"),
     "a date that is none": (["2026-02-30T00:00:00Z"], "expected a date in UTC such as"),
@@ -111,7 +109,7 @@ REFUSED = {
     "mixed": (["2026-02-03T00:00:00Z", 5], "line 3, timestamp_ns: expected a date in UTC"),
     "back": ([1.0, 0.5], "line 3, timestamp_ns: expected a stamp later than the row before (1.0), got '0.5'"),
     "a fraction of a nanosecond": ([0.5, 1e9, 2e9], "expected a whole number, got '0.5'"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))

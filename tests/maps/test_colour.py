@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-import rasterio
 from rasterio import Affine
 
 from engine import OrthoMap
 from engine.values import Window
+from tests.support.rasters import write_raster
 
 
 def picture(height=120, width=160):
@@ -16,17 +16,8 @@ def picture(height=120, width=160):
 
 
 def written(path, data, crs="EPSG:32643", step=(0.5, 0.5), corner=(500_000.0, 3_700_000.0), colormap=None):
-    profile = {"driver": "GTiff", "count": len(data), "dtype": data.dtype, "crs": crs}
-    profile |= {
-        "height": data.shape[1],
-        "width": data.shape[2],
-        "transform": Affine(step[0], 0, corner[0], 0, -step[1], corner[1]),
-    }
-    with rasterio.open(path, "w", **profile) as file:
-        file.write(data)
-        if colormap:
-            file.write_colormap(1, colormap)
-    return OrthoMap.open(path)
+    transform = Affine(step[0], 0, corner[0], 0, -step[1], corner[1])
+    return OrthoMap.open(write_raster(path, data, crs=crs, transform=transform, colormap=colormap))
 
 
 def test_a_window_is_that_of_the_file(tmp_path):

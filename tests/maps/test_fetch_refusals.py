@@ -49,7 +49,8 @@ def test_a_refusal_leaves_no_empty_folder(tmp_path):
 
 @pytest.mark.parametrize(
     "name",
-    ["key", "apikey", "X-Amz-Signature", "tk", "ak", "sk", "pwd", "appid", "app_id", "app_code", "ticket", "login",
+    ["key", "apikey", "api_key", "access_token",
+     "X-Amz-Signature", "tk", "ak", "sk", "pwd", "appid", "app_id", "app_code", "ticket", "login",
      "user", "pass", "sig", "access%5Ftoken", "client_id", "jwt"],
 )  # fmt: skip
 def test_what_looks_like_a_key_is_hidden(name):
@@ -63,19 +64,24 @@ def test_what_is_no_key_stays():
     assert shown("https://me:word@a.org/x?y=1") == "https://...@a.org/x?y=1"
 
 
+PLACEHOLDERS, SCHEMES = "expected {z}, {x} and {y} (or {-y}), or {q}", "begins with https:// or http://"
+
+
 @pytest.mark.parametrize(
-    "source",
+    ("source", "words"),
     [
-        "ftp://me:S3CRET@example.org/{z}/{x}/{y}.png",
-        "ftp://example.org/wms?key=S3CRET",
-        "https://example.org/{z}/{x}.png?key=S3CRET",
-        "https://{s}.example.org/{z}/{x}/{y}.png?tk=S3CRET",
-        "https://example.org/{z}/{x}/{y}.png?tk=S3 CRET",
-        "http://[::1/{z}/{x}/{y}.png?tk=S3CRET",
+        ("ftp://me:S3CRET@example.org/{z}/{x}/{y}.png", "expected"),
+        ("ftp://example.org/{z}/{x}/{y}.png?key=S3CRET", SCHEMES),
+        ("map.tif", SCHEMES),
+        ("https://example.org/{z}/{x}.png?key=S3CRET", PLACEHOLDERS),
+        ("https://{s}.example.org/{z}/{x}/{y}.png?tk=S3CRET", PLACEHOLDERS),
+        ("https://me:S3CRET@example.org/wms", "without user and password"),
+        ("https://example.org/{z}/{x}/{y}.png?tk=S3 CRET", "expected"),
+        ("http://[::1/{z}/{x}/{y}.png?tk=S3CRET", "expected"),
     ],
 )
-def test_refusals_do_not_repeat_keys(tmp_path, source):
-    with pytest.raises(OptionError, match=r"^source: expected") as error:
+def test_refusals_name_the_source_and_do_not_repeat_keys(tmp_path, source, words):
+    with pytest.raises(OptionError, match=rf"^source: .*{re.escape(words)}") as error:
         fetch_map(settings(source), tmp_path / "map.tif")
     assert "S3" not in str(error.value)
     assert "CRET" not in str(error.value)

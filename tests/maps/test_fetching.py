@@ -19,7 +19,6 @@ from engine.errors import MapError, OptionError
 from engine.values import Window
 from scenematch.fetch import pictures
 from scenematch.fetch.heights import files_for
-from scenematch.fetch.urls import shown
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.simulation import write_flight
@@ -27,6 +26,7 @@ from scenematch.runs.single_image import locate_image
 from scenematch.simulator import plan_flight
 from tests.support.map_servers import HALF_WORLD_M, serving
 from tests.support.photos import gimbal, photograph
+from tests.support.rasters import write_raster
 from tests.support.towns import drawn_town
 
 SIZE = 700
@@ -54,10 +54,8 @@ def place_of(pixels):
 @pytest.fixture(scope="module")
 def raster(tmp_path_factory):
     path = tmp_path_factory.mktemp("served") / "ortho.tif"
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 3, "width": SIZE, "height": SIZE}
-    with rasterio.open(path, "w", crs="EPSG:32633", transform=from_origin(*CORNER, GSD_M), **profile) as file:
-        file.write(np.moveaxis(encoded(SIZE), 2, 0))
-    return path
+    corner = from_origin(*CORNER, GSD_M)
+    return write_raster(path, np.moveaxis(encoded(SIZE), 2, 0), crs="EPSG:32633", transform=corner)
 
 
 @pytest.fixture(scope="module")
@@ -173,10 +171,8 @@ def test_the_engine_reads_the_pixels_that_were_served(server, settings, tmp_path
     """Of tiles cut from a picture that is on their grid: equal to the bit, in the same place."""
     step, corner = 2.0 * HALF_WORLD_M / (256 << ZOOM), (143_000 * 256 + 70, 90_900 * 256 + 40)
     origin = corner[0] * step - HALF_WORLD_M, HALF_WORLD_M - corner[1] * step
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 3, "width": SIZE, "height": SIZE, "crs": "EPSG:3857"}
     noise = np.random.default_rng(0).integers(1, 255, (3, SIZE, SIZE), np.uint8)
-    with rasterio.open(tmp_path / "own.tif", "w", transform=from_origin(*origin, step), **profile) as file:
-        file.write(noise)
+    write_raster(tmp_path / "own.tif", noise, crs="EPSG:3857", transform=from_origin(*origin, step))
     lon, lat = Transformer.from_crs(3857, 4326, always_xy=True).transform(
         origin[0] + SIZE / 2 * step, origin[1] - SIZE / 2 * step
     )
@@ -343,30 +339,6 @@ def test_a_wms_says_which_layers_it_has_and_what_was_wrong(server, settings, tmp
     assert all("format=image/jpeg" in path.lower() for path in server.asked[1:]), server.asked
 
 
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
-        ("https://tiles.example.org/{z}/{x}.png", "expected {z}, {x} and {y} (or {-y}), or {q}"),
-        ("https://{s}.example.org/{z}/{x}/{y}.png", "expected {z}, {x} and {y} (or {-y}), or {q}"),
-        ("ftp://example.org/{z}/{x}/{y}.png", "begins with https:// or http://"),
-        ("map.tif", "begins with https:// or http://"),
-        ("https://me:word@example.org/wms", "without user and password"),
-    ],
-)
-def test_sources_that_cannot_be(settings, tmp_path, source, message):
-    with pytest.raises(OptionError, match=re.escape(message)):
-        fetch_map(settings(source), tmp_path / "map.tif")
-
-
-def test_keys_are_not_repeated():
-    assert (
-        shown("https://a.org/wms?map=/x.map&api_key=abc&layers=o")
-        == "https://a.org/wms?map=/x.map&api_key=...&layers=o"
-    )
-    assert shown("https://a.org/{z}/{x}/{y}.png?access_token=abc").endswith("/{z}/{x}/{y}.png?access_token=...")
-    assert shown("https://a.org/wms?layers=o") == "https://a.org/wms?layers=o"
-
-
 # ------------------------------------------------------------ surface models
 
 
@@ -374,9 +346,8 @@ def height_tile(path, lat, lon, nodata=None):
     """A file as Copernicus GLO-30 has them, coarser: the first pixel's centre is on the north-western degree."""
     step = 1.0 / 1200.0
     transform = Affine(step, 0.0, lon - step / 2, 0.0, -step, lat + 1 + step / 2)
-    profile = {"driver": "GTiff", "dtype": "float32", "count": 1, "width": 1200, "height": 1200, "tiled": True}
-    with rasterio.open(path, "w", crs="EPSG:4326", transform=transform, nodata=nodata, **profile) as file:
-        file.write(plane(*np.meshgrid(*(transform @ (np.arange(1200) + 0.5, np.arange(1200) + 0.5)))), 1)
+    heights = plane(*np.meshgrid(*(transform @ (np.arange(1200) + 0.5, np.arange(1200) + 0.5))))
+    write_raster(path, heights, crs="EPSG:4326", transform=transform, nodata=nodata, tiled=True)
 
 
 def plane(lon, lat):

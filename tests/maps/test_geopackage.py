@@ -5,24 +5,20 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-import rasterio
 from affine import Affine
 from rasterio.shutil import copy
 
 from engine.errors import MapError
 from engine.orthomap import OrthoMap
 from engine.values import Window
+from tests.support.rasters import write_raster
 
 SIDE, WHOLE = 300, Window(20, 20, 200, 200)
 AT = Affine(0.5, 0.0, 607400.0, 0.0, -0.5, 5345369.0)
 
 
 def geotiff(path, data):
-    data = np.asarray(data)
-    shape = {"count": data.shape[0], "height": data.shape[1], "width": data.shape[2], "dtype": data.dtype}
-    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:32633", transform=AT, **shape) as dataset:
-        dataset.write(data)
-    return path
+    return write_raster(path, data, crs="EPSG:32633", transform=AT)
 
 
 @pytest.fixture

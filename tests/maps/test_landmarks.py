@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 import torch
 from rasterio.transform import Affine
 
@@ -15,6 +14,7 @@ from engine.maps import landmark_cache, landmarks
 from engine.maps.landmarks import CELL_PX, MAX_PER_CELL, TILE_PX, LandmarkMap, as_picture
 from engine.values import Window
 from tests.support.ground import Ground
+from tests.support.rasters import write_raster
 
 CPU = torch.device("cpu")
 
@@ -153,10 +153,7 @@ def stored(tmp_path, monkeypatch):
 
 def write_map(path, ground, gray):
     corner = Affine(*ground.pixel_to_crs.ravel()) @ Affine.translation(-0.5, -0.5)
-    profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "crs": f"EPSG:{ground.epsg}", "transform": corner}
-    with rasterio.open(path, "w", width=gray.shape[1], height=gray.shape[0], **profile) as file:
-        file.write(gray, 1)
-    return path
+    return write_raster(path, gray, crs=f"EPSG:{ground.epsg}", transform=corner)
 
 
 def prepared(path, upright=True, backend="auto"):

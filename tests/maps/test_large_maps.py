@@ -19,6 +19,7 @@ from engine.values import Window
 from scenematch.cli import console
 from scenematch.cli.app import run
 from scenematch.runs.checks import check_start
+from tests.support.rasters import write_raster
 
 SIDE = 17_000
 CORNER = (12_288, 6_656)  # of the town on the large map: on its cells, so that the same landmarks are chosen
@@ -164,11 +165,8 @@ def test_a_surface_read_by_tiles_is_the_surface_in_memory(tmp_path, gray, sim_to
     heights = np.random.default_rng(3).uniform(100.0, 130.0, (rows, columns)).astype(np.float32)
     heights[300:420, 200:500] = -9999.0
     (a, b, c), (d, e, f) = sim_town.pixel_to_crs
-    profile = {"driver": "GTiff", "count": 1, "crs": UTM, "transform": Affine(a, b, c - a / 2, d, e, f - e / 2)}
-    profile |= {"width": columns, "height": rows}
     for name, data in (("map.tif", gray), ("dsm.tif", heights)):
-        with rasterio.open(tmp_path / name, "w", dtype=data.dtype, **profile) as dataset:
-            dataset.write(data, 1)
+        write_raster(tmp_path / name, data, crs=UTM, transform=Affine(a, b, c - a / 2, d, e, f - e / 2))
     kept = OrthoMap.open(tmp_path / "map.tif", tmp_path / "dsm.tif")
     monkeypatch.setattr("engine.maps.surface.SURFACE_LIMIT_PX", 10_000)
     monkeypatch.setattr("engine.maps.surface.TILE_PX", 100)
@@ -192,11 +190,10 @@ def _with(site, xy, ground_m):
 
 def test_a_surface_of_a_small_part_of_the_map_gives_its_ground(large_path, tmp_path, sim_town):
     (a, b, c), (d, e, f) = sim_town.pixel_to_crs
-    profile = {"driver": "GTiff", "dtype": "float32", "count": 1, "crs": UTM, "width": 40, "height": 40}
     corner = Affine(a, b, c - a / 2, d, e, f - e / 2) @ Affine.translation(200, 300)
-    with rasterio.open(tmp_path / "dsm.tif", "w", transform=corner, **profile) as dataset:
-        dataset.write(np.full((40, 40), 77.0, np.float32), 1)
-    assert OrthoMap.open(large_path, tmp_path / "dsm.tif").ground_m == 77.0
+    heights = np.full((40, 40), 77.0, np.float32)
+    dsm = write_raster(tmp_path / "dsm.tif", heights, crs=UTM, transform=corner)
+    assert OrthoMap.open(large_path, dsm).ground_m == 77.0
 
 
 # ---------------------------------------------------------------------------------------------------- copies
@@ -220,10 +217,7 @@ def picture(request, tmp_path):
     crs, corner = (UTM, Affine(0.5, 0, 607400, 0, -0.5, 5345369))
     if getattr(request, "param", "metric") == "in degrees":
         crs, corner = "EPSG:4326", Affine(1e-5, 0, 33.0, 0, -8e-6, 32.0)
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "crs": crs, "transform": corner, "nodata": 0}
-    with rasterio.open(tmp_path / "map.tif", "w", width=500, height=400, **profile) as dataset:
-        dataset.write(data, 1)
-    return tmp_path / "map.tif"
+    return write_raster(tmp_path / "map.tif", data, crs=crs, transform=corner, nodata=0)
 
 
 def whole(site, level=0):
@@ -379,9 +373,7 @@ def test_a_large_file_is_hashed_again_when_it_changes(tmp_path, monkeypatch):
 def test_an_all_valid_file_says_so_without_being_read(tmp_path, large_path):
     from engine.maps.rasters import open_source
 
-    path = tmp_path / "plain.tif"
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "crs": UTM}
-    with rasterio.open(path, "w", width=50, height=40, transform=Affine(1, 0, 6e5, 0, -1, 5e6), **profile) as file:
-        file.write(np.full((40, 50), 9, np.uint8), 1)
+    plain = np.full((40, 50), 9, np.uint8)
+    path = write_raster(tmp_path / "plain.tif", plain, crs=UTM, transform=Affine(1, 0, 6e5, 0, -1, 5e6))
     assert GrayReader(open_source(path)).all_valid
     assert not GrayReader(open_source(large_path)).all_valid

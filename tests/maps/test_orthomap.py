@@ -19,6 +19,7 @@ from engine.orthomap import OrthoMap
 from engine.values import Window
 from scenematch.files.geotiff import write_geotiff
 from tests.support.paths import SHARED
+from tests.support.rasters import write_raster
 
 UTM = "EPSG:32636"
 STEP_M = 0.5
@@ -34,22 +35,8 @@ def noise(*shape, low=1, high=255, seed=0):
     return np.random.default_rng(seed).integers(low, high, shape).astype(np.uint8)
 
 
-def write(path, data, *, colorinterp=None, colormap=None, tags=None, **profile):
-    data = np.asarray(data)
-    data = data[None] if data.ndim == 2 else data
-    count, height, width = data.shape
-    settings = {"driver": "GTiff", "dtype": data.dtype, "crs": UTM, "transform": CORNER, **profile}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a picture without georeference is meant
-        with rasterio.open(path, "w", width=width, height=height, count=count, **settings) as dataset:
-            if colorinterp:
-                dataset.colorinterp = colorinterp
-            if colormap:
-                dataset.write_colormap(1, colormap)
-            if tags:
-                dataset.update_tags(**tags)
-            dataset.write(data)
-    return path
+def write(path, data, **profile):
+    return write_raster(path, data, **({"crs": UTM, "transform": CORNER} | profile))
 
 
 def whole(site, level=0):
@@ -724,9 +711,7 @@ def test_a_surface_is_above_the_sea_where_its_crs_says_so(tmp_path, crs, datum):
     write_geotiff(tmp_path / "map.tif", noise(40, 50), affine, 4326 if crs == "EPSG:4979" else 32633)
     corner = affine[:, 2] - 0.5 * (affine[:, 0] + affine[:, 1])
     transform = rasterio.Affine(*np.column_stack([affine[:, :2], corner]).ravel())
-    profile = {"driver": "GTiff", "height": 40, "width": 50, "count": 1, "dtype": "float32", "crs": crs}
-    with rasterio.open(tmp_path / "dsm.tif", "w", transform=transform, **profile) as file:
-        file.write(np.full((1, 40, 50), 150.0, np.float32))
+    write(tmp_path / "dsm.tif", np.full((40, 50), 150.0, np.float32), crs=crs, transform=transform)
     site = OrthoMap.open(tmp_path / "map.tif", surface=tmp_path / "dsm.tif", cache_dir=tmp_path / "cache")
     assert site.surface_datum == datum
     assert site.info()["surface_datum"] == datum

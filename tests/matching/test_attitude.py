@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from engine import Fix, Frame, NoFix, Reason
-from engine.values import Attitude, Timings, Window
+from engine import Frame, NoFix, Reason
+from engine.values import Attitude, Window
 from scenematch.report.attitude import attitude_row, check_attitude
+from tests.support.fixes import a_fix
 
 PICTURE = np.zeros((4, 4), np.uint8)
 
@@ -34,21 +35,7 @@ def flight(*, lag_s=0.0, offset_deg=(0.0, 0.0), interval_s=0.1, size=1.0, every=
             rows.append(attitude_row(frame, NoFix(reason=Reason.AMBIGUOUS)))
             continue
         attitude = Attitude(roll + rng.normal(0, 0.05), pitch + rng.normal(0, 0.05), 0.0)
-        fix = Fix(
-            timestamp_ns=stamp,
-            lat_deg=0.0,
-            lon_deg=0.0,
-            east_m=0.0,
-            north_m=0.0,
-            up_m=100.0,
-            covariance_m2=np.eye(3),
-            attitude=attitude,
-            score=0.5,
-            method="ncc",
-            window=Window(0, 0, 4, 4),
-            timings=Timings(),
-            map_xy_px=(0.0, 0.0),
-        )
+        fix = a_fix(timestamp_ns=stamp, up_m=100.0, attitude=attitude, score=0.5, window=Window(0, 0, 4, 4))
         rows.append(attitude_row(frame, fix))
     return rows
 

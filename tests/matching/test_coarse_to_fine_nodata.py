@@ -187,8 +187,7 @@ def wide(monkeypatch):
 @pytest.mark.usefixtures("wide")
 @pytest.mark.parametrize(
     ("share", "numbers"),
-    [(share, (number,)) for number, share in enumerate(SHARES[1:])]
-    + [pytest.param(share, (0, 1, 2), marks=pytest.mark.slow) for share in SHARES],
+    [(0.6, (2,))] + [pytest.param(share, (0, 1, 2), marks=pytest.mark.slow) for share in SHARES],
 )
 def test_what_a_wide_window_over_nodata_answers_is_what_every_place_of_it_does(share, numbers):
     site, valid = site_with(share, 6)

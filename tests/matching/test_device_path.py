@@ -206,7 +206,7 @@ OPTIONS = {
 @pytest.mark.parametrize(
     "options",
     [
-        pytest.param(options, id=name, marks=[] if name in ("usual", "upright") else [pytest.mark.slow])
+        pytest.param(options, id=name, marks=[] if name == "usual" else [pytest.mark.slow])
         for name, options in OPTIONS.items()
     ],
 )
@@ -275,7 +275,7 @@ METRES = {"ncc": 1e-6, "sift": 1e-2, "auto": 1e-6}
 
 @pytest.mark.parametrize("method", ["ncc", "sift", pytest.param("auto", marks=pytest.mark.slow)])
 def test_a_frame_crosses_once_each_way_and_its_fix_is_the_cpus(method, monkeypatch):
-    scene = flight(3)
+    scene = flight(2)
     options = MatcherOptions(sift=SiftOptions(backend="kornia"))
     matcher = SceneMatcher(scene.site, scene.camera, method, "cpu", options)
     expected = [matcher.locate(*pair) for pair in zip(scene.frames, scene.priors, strict=True)]

@@ -90,7 +90,7 @@ def test_other_processes_did_the_work(matchers, questions, monkeypatch):
 
 
 def test_threads_of_ones_own_may_share_a_matcher(ground, camera, questions):
-    frames, priors = questions
+    frames, priors = (part[4:] for part in questions)
     for method in ("ncc", "sift"):
         alone = SceneMatcher(ground.site, camera, method, "cpu")
         expected = [values(alone.locate(frame, prior)) for frame, prior in zip(frames, priors, strict=True)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import replace
 from functools import partial
@@ -10,7 +11,6 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-import rasterio
 import torch
 from rasterio.transform import Affine
 from rasterio.warp import Resampling, calculate_default_transform, reproject
@@ -37,6 +37,7 @@ from engine.matching.query import Query
 from engine.options import AssumedErrors, NccOptions, SiftOptions
 from engine.values import GridPose
 from tests.support.ground import Ground
+from tests.support.rasters import write_raster
 
 METHODS = ("ncc", "sift")
 NADIR = np.array([315.0, 296.0])
@@ -488,16 +489,11 @@ def test_an_explanation_asks_about_the_middle_of_its_window(matchers, ground, fr
     np.testing.assert_allclose(middle, [299.5, 280.0], atol=1e-3)
 
 
-def test_ncc_needs_the_height(matchers, frame, prior):
-    assert_refused(
-        matchers["ncc"].locate(with_telemetry(frame.image, height_agl_m=None), prior), Reason.NO_HEIGHT, "ncc"
-    )
-
-
-def test_ncc_needs_the_heading(matchers, frame, prior):
-    assert_refused(
-        matchers["ncc"].locate(with_telemetry(frame.image, heading_deg=None), prior), Reason.NO_HEADING, "ncc"
-    )
+@pytest.mark.parametrize(
+    ("missing", "reason"), [("height_agl_m", Reason.NO_HEIGHT), ("heading_deg", Reason.NO_HEADING)]
+)
+def test_ncc_needs_height_and_heading(matchers, frame, prior, missing, reason):
+    assert_refused(matchers["ncc"].locate(replace(frame, **{missing: None}), prior), reason, "ncc")
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -537,7 +533,7 @@ def test_an_answer_after_the_budget_is_late_in_the_papers_profile(ground, camera
 @pytest.mark.parametrize("method", METHODS)
 def test_a_frame_of_another_town_is_refused(other_site, sim_flight, method):
     matcher = SceneMatcher(other_site, sim_flight.camera, method, "cpu")
-    assert {type(matcher.locate(shown, HERE)) for shown in sim_flight.frames[:5]} == {NoFix}
+    assert {type(matcher.locate(shown, HERE)) for shown in sim_flight.frames[:3]} == {NoFix}
 
 
 @pytest.mark.slow
@@ -594,41 +590,25 @@ def test_options_are_refused_by_name(ground, camera):
         MatcherOptions(profile="fast")
     with pytest.raises(OptionError, match=r"^method: the paper's profile"):
         SceneMatcher(ground.site, camera, "auto", "cpu", MatcherOptions(profile="paper"))
-    for options in (NccOptions, SiftOptions):
-        with pytest.raises(OptionError, match=r"^margin: expected 1 or more, got 0.5"):
-            options(margin=0.5)
-    for name in ("fraction", "min_valid_share"):
-        with pytest.raises(OptionError, match=rf"^{name}: expected above 0 and at most 1, got 1.5"):
-            NccOptions(**{name: 1.5})
-    for name in ("scale", "ratio"):
-        with pytest.raises(OptionError, match=rf"^{name}: expected above 0 and at most 1, got 0"):
-            SiftOptions(**{name: 0.0})
-    for name, value, text in (
-        ("height_factor", 0.9, "1 or more"),
-        ("max_turn_deg", 0.0, "above 0"), ("max_scale_factor", 1.0, "above 1"),
-        ("max_height_m", 0.5, "above 1"), ("map_features", "sometimes", "one of prepared, per_frame"),
-    ):  # fmt: skip
-        with pytest.raises(OptionError, match=rf"^{name}: expected {text}, got '?{value}"):
-            SiftOptions(**{name: value})
-    for name, value in (("max_keypoints", 3), ("max_map_keypoints", 0)):
-        with pytest.raises(OptionError, match=rf"^{name}: expected 4 or more, got {value}"):
-            SiftOptions(**{name: value})
 
 
 @pytest.mark.parametrize(
     ("options", "name", "value", "text"),
     [
-        (SiftOptions, "max_tilt_deg", -1, "above 0"),
-        (SiftOptions, "min_deviation", float("nan"), "0 or more"),
-        (SiftOptions, "max_height_m", float("inf"), "a finite number"),
-        (SiftOptions, "height_factor", float("inf"), "a finite number"),
-        (SiftOptions, "margin", float("inf"), "a finite number"),
-        (NccOptions, "margin", float("inf"), "a finite number"),
-        (NccOptions, "margin", float("nan"), "1 or more"),
+        (NccOptions, "margin", 0.5, "1 or more"), (NccOptions, "margin", math.nan, "1 or more"),
+        (NccOptions, "margin", math.inf, "a finite number"), (SiftOptions, "margin", 0.5, "1 or more"),
+        *((NccOptions, name, 1.5, "above 0 and at most 1") for name in ("fraction", "min_valid_share")),
+        *((SiftOptions, name, 0.0, "above 0 and at most 1") for name in ("scale", "ratio")),
+        *((SiftOptions, name, 3, "4 or more") for name in ("max_keypoints", "max_map_keypoints")),
+        *((SiftOptions, n, math.inf, "a finite number") for n in ("max_height_m", "height_factor", "margin")),
+        (SiftOptions, "height_factor", 0.9, "1 or more"), (SiftOptions, "max_turn_deg", 0.0, "above 0"),
+        (SiftOptions, "max_scale_factor", 1.0, "above 1"), (SiftOptions, "max_height_m", 0.5, "above 1"),
+        (SiftOptions, "map_features", "sometimes", "one of prepared, per_frame"),
+        (SiftOptions, "max_tilt_deg", -1, "above 0"), (SiftOptions, "min_deviation", math.nan, "0 or more"),
     ],
-)
+)  # fmt: skip
 def test_options_by_which_every_frame_would_fail_are_refused(options, name, value, text):
-    with pytest.raises(OptionError, match=rf"^{name}: expected {text}, got {value}"):
+    with pytest.raises(OptionError, match=rf"^{name}: expected {text}, got '?{value}"):
         options(**{name: value})
 
 
@@ -673,11 +653,7 @@ def test_the_papers_profile_refuses_what_it_cannot_do(ground, camera, frame, pri
 
 
 def write_map(path, gray, crs, transform):
-    height, width = gray.shape
-    profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "nodata": 0, "crs": crs, "transform": transform}
-    with rasterio.open(path, "w", width=width, height=height, **profile) as file:
-        file.write(gray, 1)
-    return OrthoMap.open(path)
+    return OrthoMap.open(write_raster(path, gray, nodata=0, crs=crs, transform=transform))
 
 
 def projections(folder, gray, pixel_to_crs, epsg):

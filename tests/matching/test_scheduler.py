@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -291,9 +292,21 @@ def test_a_search_of_the_whole_map_has_a_budget_of_its_own(ground, make, frame):
     assert off_m(ground, fix) < 1.5
 
 
-def test_costs_are_learned_and_then_kept_to(ground, camera, frame, prior):
-    matcher = SceneMatcher(ground.site, camera, "auto", "cpu")
-    matcher.warmup()
+@pytest.fixture(scope="module")
+def warm(site, camera):
+    """Matchers after their warm-up, and what it reported."""
+
+    @cache
+    def warmed(method):
+        matcher, seen = SceneMatcher(site, camera, method, "cpu"), []
+        matcher.warmup(lambda done, total: seen.append((done, total)))
+        return matcher, seen
+
+    return warmed
+
+
+def test_costs_are_learned_and_then_kept_to(warm, frame, prior):
+    matcher, _ = warm("auto")
     for step, work in (("ncc", 1e5), ("sift", 22_500.0), ("ncc search", 1e5), ("sift search", 22_500.0)):
         assert all(matcher._costs.needed_ms(key, work) > 0.0 for key in known_steps(matcher) if key[0] == step)
     assert isinstance(matcher.locate(frame, prior, Budget(total_ms=1e4)), Fix)
@@ -324,9 +337,8 @@ def test_a_vague_prior_does_not_raise_the_cost_of_a_sharp_one(site, camera, fram
     assert isinstance(matcher.locate(frame, prior, Budget(total_ms=3_600_000.0)), Fix)
 
 
-def test_after_warmup_nothing_is_created_in_flight(ground, site, camera):
-    matcher = SceneMatcher(site, camera, "auto", "cpu")
-    matcher.warmup()
+def test_after_warmup_nothing_is_created_in_flight(ground, warm, camera):
+    matcher, _ = warm("auto")
     before = matcher.cache_counters
     assert all(count > 0 for count in before.values())
     for number in range(8):
@@ -336,9 +348,8 @@ def test_after_warmup_nothing_is_created_in_flight(ground, site, camera):
     assert matcher.cache_counters == before
 
 
-def test_after_warmup_no_loop_is_compiled_for_a_refused_frame_or_one_without_tilt(site, camera, frame, prior):
-    matcher = SceneMatcher(site, camera, "ncc", "cpu")
-    matcher.warmup()
+def test_after_warmup_no_loop_is_compiled_for_a_refused_frame_or_one_without_tilt(warm, frame, prior):
+    matcher, _ = warm("ncc")
     before = matcher.cache_counters
     assert isinstance(matcher.locate(replace(frame, roll_deg=None, pitch_deg=None), prior), Fix)
     noise = np.random.default_rng(0).integers(0, 255, frame.image.shape, np.uint8)
@@ -402,8 +413,7 @@ def test_a_late_frame_that_compiled_says_so(site, camera, frame, prior, monkeypa
     assert "compiling" not in warm.detail
 
 
-def test_warmup_reports_what_it_compiles(site, camera):
-    seen = []
-    SceneMatcher(site, camera, "ncc", "cpu").warmup(lambda done, total: seen.append((done, total)))
+def test_warmup_reports_what_it_compiles(warm):
+    _, seen = warm("ncc")
     assert [done for done, _ in seen] == list(range(1, len(seen) + 1))
     assert {total for _, total in seen} == {len(seen)}

@@ -8,6 +8,8 @@ import re
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from engine import Fix, Frame, MatcherOptions, OptionError, OrthoMap, SceneMatcher
 from engine.budget import Budget, Deadline
@@ -48,6 +50,32 @@ def test_grey_is_the_smoothed_picture_about_middle_grey():
 def test_local_is_what_is_taken_where_no_score_is_named():
     np.testing.assert_array_equal(enhance(noise()), enhance(noise(), score="local"))
     assert NccOptions().score == "local"
+
+
+def test_local_is_the_normalisation_as_written():
+    gray = np.random.default_rng(0).integers(0, 256, (40, 50)).astype(np.uint8)
+    smooth = binomial(gray)
+    for enhanced in (enhance(gray, radius_px=3), enhance(gray, radius_px=3, valid=np.ones(gray.shape, bool))):
+        for y, x in ((10, 10), (20, 33), (36, 46)):
+            box = smooth[y - 3 : y + 4, x - 3 : x + 4]
+            expected = (smooth[y, x] - box.mean()) / math.sqrt(box.var() + 4.0)
+            assert enhanced[y, x] == pytest.approx(expected, abs=0.05)  # smoothed to whole grey levels
+
+
+@given(gain=st.floats(0.5, 1.0), offset=st.integers(0, 60), seed=st.integers(0, 1000))
+def test_local_takes_exposure_out(gain, offset, seed):
+    gray = np.random.default_rng(seed).integers(0, 190, (48, 48)).astype(np.uint8)
+    exposed = np.rint(gain * gray + offset).astype(np.uint8)
+    difference = enhance(exposed, radius_px=8) - enhance(gray, radius_px=8)
+    assert np.abs(difference).max() < 0.25  # what rounding to whole grey levels leaves
+    assert np.abs(difference).mean() < 0.05
+
+
+def test_local_without_a_neighbourhood_only_smooths():
+    gray = np.random.default_rng(2).integers(0, 256, (9, 7)).astype(np.uint8)
+    np.testing.assert_allclose(enhance(gray, radius_px=0), binomial(gray), atol=0.51)
+    with pytest.raises(OptionError, match=r"^radius_px: expected 0 or more, got -1"):
+        enhance(gray, radius_px=-1)
 
 
 @pytest.mark.parametrize("masked", [False, True])

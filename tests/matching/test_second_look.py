@@ -53,13 +53,6 @@ def test_a_frame_of_which_half_the_tones_are_turned_round_is_found_at_the_second
     assert "second look" in result.timings.stages_ms
 
 
-def test_noise_is_refused_at_the_second_look_too(ground, camera):
-    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
-    for seed in range(3):
-        image = np.random.default_rng(seed).integers(0, 256, (camera.height_px, camera.width_px)).astype(np.uint8)
-        assert isinstance(matcher.locate(Frame(image, 0, 150.0, 0.0, 0.0, 0.0), ground.prior(NADIR)), NoFix)
-
-
 # Another heading
 
 

@@ -1,5 +1,6 @@
 """A telemetry whose roll and pitch are wrong: the picture outweighs it, by each method."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -21,19 +22,19 @@ def site(ground):
     )
 
 
-@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+MOUNT_OFF = {"roll_deg": 6.0, "pitch_deg": -1.0}
+WRONG = [
+    MOUNT_OFF,
+    {"roll_deg": -3.0, "pitch_deg": 4.0},  # swapped
+    {"roll_deg": -4.0, "pitch_deg": 3.0},  # of the other sign
+    {"roll_deg": 0.07, "pitch_deg": -0.05},  # radians
+    *({**TRUE, "roll_deg": roll_deg} for roll_deg in (14.0, -6.0)),
+    *({**TRUE, "pitch_deg": pitch_deg} for pitch_deg in (7.0, -13.0)),
+]
+
+
 @pytest.mark.parametrize(
-    "stated",
-    [
-        {"roll_deg": 6.0, "pitch_deg": -1.0},  # a mount that is off
-        {"roll_deg": -3.0, "pitch_deg": 4.0},  # swapped
-        {"roll_deg": -4.0, "pitch_deg": 3.0},  # of the other sign
-        {"roll_deg": 0.07, "pitch_deg": -0.05},  # radians
-        {"roll_deg": 14.0, "pitch_deg": -3.0},
-        {"roll_deg": 4.0, "pitch_deg": 7.0},
-        {"roll_deg": 4.0, "pitch_deg": -13.0},
-        {"roll_deg": -6.0, "pitch_deg": -3.0},
-    ],
+    ("method", "stated"), [*itertools.product(("ncc", "sift"), WRONG), ("auto", MOUNT_OFF), ("auto", WRONG[-1])]
 )
 def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, site, camera, method, stated):
     frame = replace(ground.frame(camera, NADIR, 150.0, **TRUE), **stated)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from engine import Fix, Frame, Navigator, Prior, Reason, Timings, Window
+from engine import Fix, Frame, Navigator, Prior, Reason, Window
 from engine.navigation.motion import PositionEstimate
 from engine.navigation.odds import (
     MAX_PROBABILITY,
@@ -19,6 +19,7 @@ from engine.navigation.odds import (
     new_ground_share,
     repeated_log_odds,
 )
+from tests.support.fixes import a_fix
 
 IMAGE = np.zeros((8, 8), np.uint8)
 SECOND = 1_000_000_000
@@ -26,12 +27,8 @@ MAP_M = 1000.0
 
 
 def fix_at(east_m, north_m, confidence=None, sigma_m=1.0):
-    return Fix(
-        timestamp_ns=None, lat_deg=48.0, lon_deg=15.0, east_m=east_m, north_m=north_m, up_m=None,
-        covariance_m2=sigma_m**2 * np.eye(3), attitude=None, score=0.9, method="sift",
-        window=Window(0, 0, round(MAP_M), round(MAP_M)), timings=Timings(), map_xy_px=(0.0, 0.0),
-        confidence=confidence,
-    )  # fmt: skip
+    window = Window(0, 0, round(MAP_M), round(MAP_M))
+    return a_fix(east_m, north_m, sigma_m, method="sift", window=window, confidence=confidence)
 
 
 class Script:

@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from engine import Fix, Frame, Navigator, NoFix, Prior, Reason, Timings, Window
+from engine import Fix, Frame, Navigator, NoFix, Prior, Reason, Window
 from engine.navigation.hypotheses import MAX_HYPOTHESES
+from tests.support.fixes import a_fix
 
 _NUMBERS = itertools.count()
 
@@ -24,11 +25,7 @@ SECOND = 1_000_000_000
 
 
 def fix_at(east_m, north_m, confidence):
-    return Fix(
-        timestamp_ns=None, lat_deg=48.0, lon_deg=15.0, east_m=east_m, north_m=north_m, up_m=None,
-        covariance_m2=np.eye(3), attitude=None, score=0.3, method="ncc", window=Window(0, 0, 200, 200),
-        timings=Timings(), map_xy_px=(0.0, 0.0), confidence=confidence,
-    )  # fmt: skip
+    return a_fix(east_m, north_m, score=0.3, window=Window(0, 0, 200, 200), confidence=confidence)
 
 
 class Doubting:

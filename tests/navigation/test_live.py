@@ -10,7 +10,8 @@ import pytest
 
 from engine.errors import OptionError, StateError, TelemetryError
 from engine.navigation.live import Live, LiveOptions
-from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
+from engine.values import Fix, Frame, NoFix, Reason
+from tests.support.fixes import a_fix
 
 IMAGE = np.zeros((4, 4), np.uint8)
 
@@ -20,11 +21,7 @@ def frame(number: int) -> Frame:
 
 
 def fix(of: Frame) -> Fix:
-    return Fix(
-        timestamp_ns=of.timestamp_ns, lat_deg=0.0, lon_deg=0.0, east_m=float(of.timestamp_ns or 0), north_m=0.0,
-        up_m=None, covariance_m2=np.eye(3), attitude=None, score=1.0, method="ncc", window=Window(0, 0, 1, 1),
-        timings=Timings(), map_xy_px=(0.0, 0.0),
-    )  # fmt: skip
+    return a_fix(float(of.timestamp_ns or 0), timestamp_ns=of.timestamp_ns)
 
 
 class Slow:

@@ -9,10 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from engine import Fix, Frame, Navigator, Prior, Timings, Window
+from engine import Fix, Frame, Navigator, Prior, Window
 from engine.geo import LocalFrame
 from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
 from engine.navigation.motion import PositionEstimate
+from tests.support.fixes import a_fix
 
 IMAGE = np.zeros((8, 8), np.uint8)
 SECOND = 1_000_000_000
@@ -20,12 +21,13 @@ STILL = {"east_velocity_mps": 0.0, "north_velocity_mps": 0.0}
 
 
 def fix_at(east_m, north_m, sigma_m=0.5, map_sigma_m=3.0):
-    return Fix(
-        timestamp_ns=None, lat_deg=48.0, lon_deg=15.0, east_m=east_m, north_m=north_m, up_m=None,
-        covariance_m2=(sigma_m**2 + map_sigma_m**2) * np.eye(3), attitude=None, score=0.9, method="sift",
-        window=Window(0, 0, 1000, 1000), timings=Timings(), map_xy_px=(0.0, 0.0), confidence=0.9999,
-        map_sigma_m=map_sigma_m,
-    )  # fmt: skip
+    stated = {
+        "method": "sift",
+        "confidence": 0.9999,
+        "map_sigma_m": map_sigma_m,
+        "window": Window(0, 0, 1000, 1000),
+    }
+    return a_fix(east_m, north_m, math.hypot(sigma_m, map_sigma_m), **stated)
 
 
 class Script:

@@ -26,10 +26,9 @@ from engine import (
     Reason,
     SceneMatcher,
     TelemetryError,
-    Timings,
-    Window,
 )
 from engine.options import ACCEPT_ALL
+from tests.support.fixes import a_fix
 
 NUMBERS = itertools.count()
 START = Prior(east_m=10.0, north_m=20.0, sigma_m=5.0)
@@ -37,22 +36,8 @@ STILL = (0.0, 0.0)
 SECOND = 1_000_000_000
 
 
-def fix_at(east_m, north_m, sigma_m=1.0, *, timestamp_ns=None, up_m=None):
-    return Fix(
-        timestamp_ns=timestamp_ns,
-        lat_deg=48.0,
-        lon_deg=15.0,
-        east_m=east_m,
-        north_m=north_m,
-        up_m=up_m,
-        covariance_m2=sigma_m**2 * np.eye(3),
-        attitude=Attitude(0.0, 0.0, 0.0),
-        score=0.9,
-        method="sift",
-        window=Window(0, 0, 10, 10),
-        timings=Timings(),
-        map_xy_px=(5.0, 5.0),
-    )
+def fix_at(east_m, north_m, sigma_m=1.0, **stated):
+    return a_fix(east_m, north_m, sigma_m, attitude=Attitude(0.0, 0.0, 0.0), method="sift", **stated)
 
 
 class Script:

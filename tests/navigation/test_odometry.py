@@ -195,18 +195,11 @@ def test_a_velocity_that_is_too_uncertain_is_refused(monkeypatch):
     assert "uncertain" in motion_between(*shown).reason
 
 
-def test_a_buffer_that_is_filled_again_is_no_picture_that_repeats():
-    odometry = VisualOdometry(CAMERA)
-    buffer = picture((0, 0), LEVEL)
+@pytest.mark.parametrize("as_given", [np.asarray, torch.from_numpy])
+def test_a_buffer_that_is_filled_again_is_no_picture_that_repeats(as_given):
+    odometry, buffer = VisualOdometry(CAMERA), as_given(picture((0, 0), LEVEL))
     odometry.update(frame(buffer))
-    buffer[:] = picture((5, 0), LEVEL)
-    assert odometry.update(frame(buffer, INTERVAL_S)).moved_m == pytest.approx([5.0, 0.0], abs=0.2)
-
-
-def test_the_same_holds_of_a_tensors_memory():
-    odometry, buffer = VisualOdometry(CAMERA), torch.from_numpy(picture((0, 0), LEVEL))
-    odometry.update(frame(buffer))
-    buffer[:] = torch.from_numpy(picture((5, 0), LEVEL))
+    buffer[:] = as_given(picture((5, 0), LEVEL))
     assert odometry.update(frame(buffer, INTERVAL_S)).moved_m == pytest.approx([5.0, 0.0], abs=0.2)
 
 

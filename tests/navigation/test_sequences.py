@@ -42,7 +42,7 @@ def test_any_sequence_ends_in_documented_ways(tiny, steps, method, start):
     "method", [method if method == "sift" else pytest.param(method, marks=pytest.mark.slow) for method in METHODS]
 )
 def test_random_sequences_end_in_documented_ways_and_some_in_fixes(tiny, method):
-    endings = sum((sequence(tiny, seed, method) for seed in range(12)), start=sequence(tiny, 99, method))
+    endings = sum((sequence(tiny, seed, method) for seed in range(6)), start=sequence(tiny, 99, method))
     assert endings["fix"] > 0
     assert endings["TelemetryError"] > 0
     assert endings["no_texture"] > 0
@@ -53,8 +53,10 @@ def sequence(tiny, seed, method):
     return fly(tiny, random_steps(rng, int(rng.integers(1, 24))), method, start=bool(rng.integers(2)))
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("fault", ["noise", "flat", "black", "saturated", "small", "float", "rgba", "empty"])
+@pytest.mark.parametrize(
+    ("method", "fault"),
+    [*(("ncc", fault) for fault in IMAGES[1:]), *((method, "noise") for method in METHODS[1:])],
+)
 def test_one_bad_frame_costs_one_frame(tiny, method, fault):
     steps = [RIGHT] * 4 + [replace(RIGHT, image=fault)] + [RIGHT] * 3
     endings = fly(tiny, steps, method, start=True)

@@ -16,9 +16,10 @@ from engine import Navigator, Prior, SceneMatcher
 from engine.errors import OptionError
 from engine.navigation.telemetry_errors import TelemetryErrors
 from engine.options import ACCEPT_ALL, AssumedErrors, NavigatorOptions
-from engine.values import Attitude, Fix, Frame, NoFix, Reason, Timings, Window
+from engine.values import Attitude, Fix, Frame, NoFix, Reason
 from scenematch.simulator import plan_flight
 from tests.support.fields import fields_of
+from tests.support.fixes import a_fix
 from tests.support.towns import drawn_town
 
 IMAGE = np.zeros((4, 4), np.uint8)
@@ -29,9 +30,7 @@ ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 
 def fix_of(attitude, up_m=GROUND_M + HEIGHT_M, stage="refined"):
     roll, pitch, heading = attitude
-    return Fix(timestamp_ns=None, lat_deg=0.0, lon_deg=0.0, east_m=0.0, north_m=0.0, up_m=up_m,
-               covariance_m2=np.eye(3), attitude=Attitude(roll, pitch, heading % 360.0), score=0.9, method="ncc",
-               stage=stage, window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0))  # fmt: skip
+    return a_fix(timestamp_ns=None, up_m=up_m, attitude=Attitude(roll, pitch, heading % 360.0), stage=stage)
 
 
 def angles(time_s):

@@ -9,18 +9,15 @@ import pytest
 
 from engine.navigation.motion import PositionEstimate
 from engine.navigation.track_guard import TrackGuard
-from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
+from engine.values import Frame, NoFix, Reason
+from tests.support.fixes import a_fix
 
 SPEED_MPS = 7.0
 STEP_S = 0.1
 
 
 def fix(east_m, north_m=0.0, sigma_m=0.3):
-    return Fix(
-        timestamp_ns=1, lat_deg=0.0, lon_deg=0.0, east_m=east_m, north_m=north_m, up_m=None,
-        covariance_m2=np.diag([sigma_m**2, sigma_m**2, 1e6]), attitude=None, score=0.9, method="ncc",
-        window=Window(0, 0, 1, 1), timings=Timings(), map_xy_px=(0.0, 0.0),
-    )  # fmt: skip
+    return a_fix(east_m, north_m, sigma_m)
 
 
 def refused(match):

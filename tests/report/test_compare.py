@@ -130,15 +130,13 @@ def test_the_usual_runs_are_table_one():
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
-        (
-            ["orb"],
-            "runs: expected ncc, sift, auto, learned, one of them with /paper, or a settings file, got 'orb'",
-        ),
+        (["orb"],
+         "runs: expected ncc, sift, auto, learned, one of them with /paper, or a settings file, got 'orb'"),
         (["ncc", "ncc"], "runs: expected runs of different names, got 'ncc' twice"),
         (["ncc/fast"], "profile: expected one of engine, paper, got 'fast'"),
         (["auto/paper"], "method: expected ncc or sift with `profile` paper, got 'auto'"),
     ],
-)
+)  # fmt: skip
 def test_a_run_that_cannot_be_is_refused(runs, message):
     with pytest.raises(OptionError) as caught:
         parse_runs(runs)

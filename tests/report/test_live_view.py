@@ -36,8 +36,8 @@ from scenematch.report import live_view
 from scenematch.report.live_shapes import FIX_RGB, SIGMAS, ellipsoid
 from tests.support import browser
 
-FRAMES = 8
-DARK = 5  # a frame that shows nothing
+FRAMES = 6
+DARK = 4  # a frame that shows nothing
 
 
 def rows_of(recording):

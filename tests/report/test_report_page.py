@@ -29,8 +29,8 @@ from tests.support.browser import missing, open_browser
 from tests.support.runs import bare_runs
 from tests.support.towns import drawn_town
 
-FRAMES = 8
-DARK = 5  # a frame that shows nothing
+FRAMES = 6
+DARK = 4  # a frame that shows nothing
 HOSTILE = "<img src=x onerror=hacked=1>"
 
 
@@ -58,31 +58,18 @@ def summary_of(**known):
 @pytest.mark.parametrize(
     ("known", "grade", "begins"),
     [
-        (
-            {},
-            "good",
-            "9 of 10 frames fixed, all within three of their own sigmas; half of the fixes within 0.12 m",
-        ),
+        ({}, "good",
+         "9 of 10 frames fixed, all within three of their own sigmas; half of the fixes within 0.12 m"),
         ({"fixes": 5, "scored_fixes": 5}, "mixed", "5 of 10 frames fixed, all within three of their own sigmas"),
         ({"deadlines_missed": 2}, "mixed", "9 of 10 frames fixed, all within three of their own sigmas"),
         # By its own sigma, not by a number of metres: 12 m off and said so, 4 m off and not said so.
-        (
-            {"wrong_over_10m": 1, "max_m": 12.0},
-            "good",
-            "9 of 10 frames fixed, all within three of their own sigmas",
-        ),
+        ({"wrong_over_10m": 1, "max_m": 12.0}, "good",
+         "9 of 10 frames fixed, all within three of their own sigmas"),
         ({"beyond_3_sigma": 1, "max_m": 4.0}, "good", "9 of 10 frames fixed, all but 1 within three of their own"),
-        (
-            {"beyond_3_sigma": 2, "max_m": 4.0},
-            "bad",
-            "2 of 9 fixes are off by more than three of their own sigmas",
-        ),
+        ({"beyond_3_sigma": 2, "max_m": 4.0}, "bad",
+         "2 of 9 fixes are off by more than three of their own sigmas"),
         ({"wrong_over_10m": 2, "false_fixes": 2}, "bad", "2 fixes are false"),
-        (
-            {"scored_fixes": 0},
-            "open",
-            "9 of 10 frames fixed; half of them state a sigma below 0.40 m. With",
-        ),
+        ({"scored_fixes": 0}, "open", "9 of 10 frames fixed; half of them state a sigma below 0.40 m. With"),
         ({"fixes": 0, "scored_fixes": 0}, "bad", "None of 10 frames fixed; most were refused as ambiguous"),
         ({"frames": 0, "fixes": 0}, "bad", "The track has no frames"),
         (  # a map that is shifted by 8 m and calls itself good to 0.5
@@ -90,13 +77,10 @@ def summary_of(**known):
             "bad",
             "9 of 9 fixes are off by more than three of their own sigmas (mean NEES 552, 2 is expected)",
         ),
-        (
-            {"fixes": 0, "scored_fixes": 0, "settings": {"diagnosis": {"heading": "the heading reads low"}}},
-            "bad",
-            "The heading reads low. None of 10 frames fixed",
-        ),
+        ({"fixes": 0, "scored_fixes": 0, "settings": {"diagnosis": {"heading": "the heading reads low"}}}, "bad",
+         "The heading reads low. None of 10 frames fixed"),
     ],
-)
+)  # fmt: skip
 def test_the_verdict_says_the_worst_first(known, grade, begins):
     verdict = verdict_of(summary_of(**known), 0.4, 40.0)
     assert verdict.grade == grade

@@ -77,12 +77,10 @@ def test_a_geotiff_that_names_no_crs_is_given_one(tmp_path):
         ({"map_bounds": "17,48,16,49"}, "map_bounds: expected west before east and south before north"),
         ({"map_bounds": "16,48,17,49", "map_crs": UTM}, "map_bounds: expected a rectangle in crs"),
         ({"map_bounds": "16,48,17,49", "map_crs": "EPSG:5"}, "map_crs: expected"),
-        (
-            {"map_bounds": "598000,5341970,598040,5342000"},
-            "map_bounds: expected west < east and south < north in degrees",
-        ),
+        ({"map_bounds": "598000,5341970,598040,5342000"},
+         "map_bounds: expected west < east and south < north in degrees"),
     ],
-)
+)  # fmt: skip
 def test_edges_that_place_no_picture_are_wrong_usage(shot, options, words):
     with pytest.raises(OptionError) as caught:
         MapInput(shot, **options).open()

@@ -160,7 +160,6 @@ def test_an_older_run_is_kept_without_force_and_leaves_nothing_with_it(folder, l
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--minutes", "1"], "--minutes"),
         (["--fault", "killed"], "--fault"),
         (["--method", "ncc"], "--method"),
         (["--closed-loop", "--frames", "3"], "--frames"),
@@ -170,7 +169,6 @@ def test_an_older_run_is_kept_without_force_and_leaves_nothing_with_it(folder, l
         (["--condition", "eclipse"], "--condition"),
         (["--surface", "dsm.tif"], "--surface"),
         (["--map", "map.tif", "--relief-m", "5"], "--relief-m"),
-        (["--relief-m", "-5"], "--relief-m"),
         (["--frames", "0"], "--frames"),
         (["--camera-pitch-deg", "-20"], "--camera-pitch-deg"),
         (["--closed-loop", "--camera-pitch-deg", "-45"], "--camera-pitch-deg"),

@@ -30,12 +30,12 @@ def picture(height: int, width: int, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(image.clip(0, 1))[None]
 
 
-@pytest.fixture(params=[(64, 80), (33, 121), (150, 149), (12, 12)], ids=str)
+@pytest.fixture(scope="module", params=[(64, 80), (33, 121), (150, 149), (12, 12)], ids=str)
 def shape(request):
     return request.param
 
 
-@pytest.fixture(params=[1, 2], ids=["as it is", "doubled"])
+@pytest.fixture(scope="module", params=[1, 2], ids=["as it is", "doubled"])
 def plan(shape, request):
     return loops.plan_loops(*shape, request.param)
 
@@ -49,23 +49,24 @@ def shaped(buffer, plan):
     return [buffer[o.offset : o.end].reshape(-1, o.height, o.width) for o in octaves(plan)]
 
 
-def both(plan, contrast_threshold=0.02):
+@pytest.fixture(scope="module")
+def both(plan):
     """The picture's levels and keypoints by the reference, and by the loops."""
-    image = picture(*octaves(plan)[0].source)[0].numpy()
+    image, contrast_threshold = picture(*octaves(plan)[0].source)[0].numpy(), 0.02
     levels = reference.levels_of(image, octaves(plan))
     buffer, rows = loops.detect(image, plan, contrast_threshold)
     return levels, reference.keypoints_of(levels, contrast_threshold), buffer.copy(), rows
 
 
-def test_levels_are_those_of_the_equation(plan):
-    expected, _, buffer, _ = both(plan)
+def test_levels_are_those_of_the_equation(plan, both):
+    expected, _, buffer, _ = both
     for wanted, got in zip(expected, shaped(buffer, plan), strict=True):
         np.testing.assert_allclose(got, wanted, atol=2e-6)
 
 
-def test_keypoints_are_those_of_the_reference(plan):
+def test_keypoints_are_those_of_the_reference(plan, both):
     """All but those that rounding moves across a threshold, of which there is at most one in a hundred."""
-    _, expected, _, got = both(plan)
+    _, expected, _, got = both
     near = [np.abs(got - row).max(axis=1).min(initial=np.inf) < 0.02 for row in expected]
     assert len(expected) - sum(near) <= 0.01 * len(expected)
     assert abs(len(expected) - len(got)) <= 0.01 * len(expected)
@@ -75,17 +76,16 @@ def test_keypoints_are_those_of_the_reference(plan):
 
 @pytest.mark.parametrize("spread", [1, 3, 6])
 @pytest.mark.parametrize("most", [7, 60, 5000])
-def test_the_strongest_are_those_of_the_reference(plan, spread, most):
-    rows = both(plan)[3]
+def test_the_strongest_are_those_of_the_reference(plan, both, spread, most):
+    rows = both[3]
     mask = np.random.default_rng(3).random(octaves(plan)[0].source) > 0.3
     kept = reference.strongest(rows, mask, plan.upsample, most, spread)
     np.testing.assert_array_equal(loops.strongest(rows, plan, mask, most, spread), rows[kept])
 
 
-@pytest.mark.parametrize("root", [True, False])
-@pytest.mark.parametrize("turn_rad", [None, 0.0], ids=["turned", "upright"])
-def test_angles_and_descriptors_are_those_of_the_reference(plan, turn_rad, root):
-    _, _, buffer, rows = both(plan)
+@pytest.mark.parametrize(("turn_rad", "root"), [(None, True), (0.0, False)], ids=["turned, root", "upright"])
+def test_angles_and_descriptors_are_those_of_the_reference(plan, both, turn_rad, root):
+    _, _, buffer, rows = both
     rows, levels, sigma = rows[:40], shaped(buffer.astype(np.float64), plan), float(plan.first_sigma)
     pictures = [levels[int(row[5])][int(row[4])] for row in rows]
     expected = np.array([reference.angle_of(p, row, sigma) for p, row in zip(pictures, rows, strict=True)])

@@ -10,11 +10,12 @@ import pytest
 from engine.errors import OptionError
 from engine.navigation.navigator import NavigatorState
 from engine.orthomap import OrthoMap
-from engine.values import Fix, Frame, NoFix, Prior, Reason, Timings, Window
+from engine.values import Frame, NoFix, Prior, Reason, Window
 from scenematch.simulator.faults import Fault, ShiftedMap
 from scenematch.simulator.loop import LoopOptions, Mode, fly_closed_loop
 from scenematch.simulator.pilot import plan_rounds
 from scenematch.simulator.vehicle import START_NS, FlightStyle
+from tests.support.fixes import a_fix
 
 SIGMA_M = 0.3
 
@@ -33,12 +34,9 @@ class Scripted:
         if self.blind:
             return NoFix(reason=Reason.NO_TEXTURE, timestamp_ns=frame.timestamp_ns)
         east, north, _ = np.frombuffer(frame.image.tobytes()) + SIGMA_M * self.rng.standard_normal(3)
-        lat, lon = self.site.frame.geodetic_from_enu(east, north)
-        return Fix(
-            timestamp_ns=frame.timestamp_ns, lat_deg=float(lat), lon_deg=float(lon), east_m=float(east),
-            north_m=float(north), up_m=None, covariance_m2=SIGMA_M**2 * np.eye(3), attitude=None, score=0.9,
-            method="ncc", window=Window(0, 0, 8, 8), timings=Timings(), map_xy_px=(0.0, 0.0),
-        )  # fmt: skip
+        lat, lon = map(float, self.site.frame.geodetic_from_enu(east, north))
+        place = {"lat_deg": lat, "lon_deg": lon, "window": Window(0, 0, 8, 8)}
+        return a_fix(float(east), float(north), SIGMA_M, timestamp_ns=frame.timestamp_ns, **place)
 
 
 def picture(state):
@@ -75,15 +73,15 @@ def modes(flown, start_s=0.0, end_s=math.inf):
 
 @pytest.fixture(scope="module")
 def undisturbed():
-    return fly(30.0)
+    return fly(20.0)
 
 
 def test_it_flies_its_plan_by_fixes_alone(undisturbed):
     assert math.sqrt(np.mean(distance(undisturbed.plan_error_m) ** 2)) < 0.8
     assert np.abs(undisturbed.plan_error_m[50:, 2]).max() < 2.0  # the barometer's drift
-    assert len(undisturbed.record) == 300
-    assert len(undisturbed.answers) == 150
-    assert len(undisturbed.used) == 149  # the last is on its way
+    assert len(undisturbed.record) == 200
+    assert len(undisturbed.answers) == 100
+    assert len(undisturbed.used) == 99  # the last is on its way
     assert modes(undisturbed) == {Mode.FOLLOW}
     assert all(row.healthy for row in rows_between(undisturbed, 1.0, 99.0))
     assert undisturbed.resets == 0
@@ -127,7 +125,7 @@ def test_a_long_latency_costs_little_because_fixes_are_taken_in_where_they_belon
 
 
 def test_with_gps_the_engines_fixes_are_not_needed():
-    flown = fly(12.0, matcher=Scripted(blind=True), gps=True)
+    flown = fly(8.0, matcher=Scripted(blind=True), gps=True)
     assert flown.used == []
     assert distance(flown.estimate_error_m[50:]).max() < 3.0
     assert modes(flown) == {Mode.FOLLOW}

@@ -12,7 +12,6 @@ from scenematch.simulator import (
     ExposureMotion,
     FlightStyle,
     Optics,
-    build_town,
     plan_flight,
     render_frame,
     take_picture,
@@ -20,6 +19,7 @@ from scenematch.simulator import (
 from scenematch.simulator.flight import DRONE_SENSOR
 from scenematch.simulator.optics import Sensor
 from tests.support.patches import CAMERA, ORIGIN, TO_CRS, centre_of_bright, patch_world, project
+from tests.support.towns import drawn_town
 
 LEVEL = Attitude(0.0, 0.0, 0.0)
 IDEAL = Sensor(
@@ -31,7 +31,7 @@ FISHEYE = Camera(300, 300, CAMERA.matrix, "equidistant", np.array([0.03, -0.012,
 
 @pytest.fixture(scope="module")
 def town():
-    return build_town(1, width_px=700, height_px=700)
+    return drawn_town(1)
 
 
 def snap(world, camera=CAMERA, optics=None, sway=None, attitude=LEVEL, sensor=IDEAL, grid=ORIGIN):

@@ -35,7 +35,7 @@ from tests.support.patches import CAMERA, EPSG, GSD, ORIGIN, SIZE, TO_CRS, centr
 TINY = {"width_px": 64, "height_px": 64}
 MIDDLING = {"width_px": 700, "height_px": 720}
 SMALL = {"width_px": 300, "height_px": 280}
-LEVEL = Attitude(0.0, 0.0, 0.0)
+LEVEL, TURNED = Attitude(0.0, 0.0, 0.0), Attitude(-6.5, 3.0, 251.0)
 PERFECT = SensorNoise(**dict.fromkeys(SensorNoise.__dataclass_fields__, 0.0))
 
 
@@ -155,8 +155,10 @@ def test_haze_is_koschmieders():
 # -------------------------------------------------------------------------------------------- relief, water
 
 
-@pytest.mark.parametrize("attitude", [LEVEL, Attitude(5.0, -4.0, 37.0), Attitude(-6.5, 3.0, 251.0)])
-@pytest.mark.parametrize("slope", [0.0, 0.08, -0.15])
+@pytest.mark.parametrize(
+    ("slope", "attitude"),
+    [(0.0, Attitude(5.0, -4.0, 37.0)), (0.08, LEVEL), (0.08, TURNED), (-0.15, TURNED)],
+)
 def test_a_patch_on_a_hillside_appears_where_geo_and_camera_put_it(slope, attitude):
     flat, (x, y) = patch_world(700, 480, 0.0), (700, 480)
     ground = (45.0 + slope * GSD * (np.arange(SIZE) - x)).astype(np.float32)

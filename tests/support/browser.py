@@ -17,14 +17,9 @@ from pathlib import Path
 from typing import Any
 
 FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--no-first-run",
-    "--hide-scrollbars",
-)
+    "--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync", "--no-first-run", "--hide-scrollbars",
+)  # fmt: skip
 WITHOUT_GL = ("--disable-gpu",)
 SOFTWARE_GL = (
     "--use-gl=angle",

@@ -208,19 +208,10 @@ def _seen(rng: np.random.Generator, points: Array) -> Matches:
 
 
 WRONG: dict[str, Callable[[np.random.Generator], Matches]] = {
-    "plane": _plane,
-    "relief": _relief,
-    "4 to 10": _few,
-    "200 to 300": _many,
-    "clustered": _clustered,
-    "on a road": _line,
-    "repeated": _repeated,
-    "one to many": _one_to_many,
-    "many to one": _many_to_one,
-    "permuted": _permuted,
-    "another period": _periodic,
-    "a false cluster": _false_cluster,
-}
+    "plane": _plane, "relief": _relief, "4 to 10": _few, "200 to 300": _many, "clustered": _clustered,
+    "on a road": _line, "repeated": _repeated, "one to many": _one_to_many, "many to one": _many_to_one,
+    "permuted": _permuted, "another period": _periodic, "a false cluster": _false_cluster,
+}  # fmt: skip
 """Ways to draw matches that no pose explains."""
 
 

@@ -23,16 +23,9 @@ DEVICE = torch.device("meta")
 _aten = torch.ops.aten
 # The host waits for these: they return a number, or their shape depends on values.
 _WAITS = {
-    _aten._local_scalar_dense,
-    _aten.equal,
-    _aten.nonzero,
-    _aten.masked_select,
-    _aten._unique2,
-    _aten.unique_dim,
-    _aten.unique_consecutive,
-    _aten.bincount,
-    _aten.histc,
-}
+    _aten._local_scalar_dense, _aten.equal, _aten.nonzero, _aten.masked_select, _aten._unique2, _aten.unique_dim,
+    _aten.unique_consecutive, _aten.bincount, _aten.histc,
+}  # fmt: skip
 _INDEXED = {_aten.index, _aten.index_put, _aten.index_put_, _aten._index_put_impl_}
 _COPIES = {_aten._to_copy, _aten.copy_}
 
