@@ -86,7 +86,7 @@ def test_the_strongest_are_those_of_the_reference(plan, both, spread, most):
 @pytest.mark.parametrize(("turn_rad", "root"), [(None, True), (0.0, False)], ids=["turned, root", "upright"])
 def test_angles_and_descriptors_are_those_of_the_reference(plan, both, turn_rad, root):
     _, _, buffer, rows = both
-    rows, levels, sigma = rows[:40], shaped(buffer.astype(np.float64), plan), float(plan.first_sigma)
+    rows, levels, sigma = rows[:20], shaped(buffer.astype(np.float64), plan), float(plan.first_sigma)
     pictures = [levels[int(row[5])][int(row[4])] for row in rows]
     expected = np.array([reference.angle_of(p, row, sigma) for p, row in zip(pictures, rows, strict=True)])
     apart = np.abs((loops.dominant_angle(buffer, rows, plan) - expected + math.pi) % math.tau - math.pi)
