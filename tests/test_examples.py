@@ -77,6 +77,7 @@ def test_beside_an_autopilot_that_hears_where_it_was(firmware, flight):
     assert np.median([off_m for _, off_m, _ in came]) < 3.0
 
 
+@pytest.mark.slow
 def test_the_notebook_prints_what_it_shows(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     monkeypatch.chdir(tmp_path)

@@ -1,14 +1,18 @@
 """What the latency benchmark counts with: the way forth and back, causes of misses, slopes, shares, and hogs."""
 
 from collections import Counter
+from functools import partial
 
 import numpy as np
 import pytest
 
+from bench.live import endless
 from bench.live.burden import hogs
 from bench.live.endless import GRACE_MS, Flown, Taken, cause, draw, stage_at, summary, there_and_back
 from bench.live.soak import slope
 from bench.pages.latency import share
+from scenematch.simulator import plan_flight
+from tests.support.towns import drawn_town
 
 STAGES = {"grey": 1.0, "align": 2.0, "match": 4.0}
 
@@ -26,7 +30,8 @@ def test_the_way_leads_forth_and_back_without_a_jump():
     assert there_and_back(7, 1) == (0, False)
 
 
-def test_an_endless_course_moves_as_its_velocities_say_also_on_the_way_back():
+def test_an_endless_course_moves_as_its_velocities_say_also_on_the_way_back(monkeypatch):
+    monkeypatch.setattr(endless, "plan_flight", partial(plan_flight, town=drawn_town()))
     course = draw(4)
     frames = [course.frame(number) for number in range(7)]
     stamps = [frame.timestamp_ns for frame in frames]

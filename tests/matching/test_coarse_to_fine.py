@@ -31,7 +31,7 @@ def texture(rng, size, correlation_px):
 
 @pytest.fixture(scope="module")
 def town():
-    return cv2.cvtColor(drawn_town(7).ortho, cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(drawn_town(1).ortho, cv2.COLOR_RGB2GRAY)
 
 
 def ground(rng, kind, size, town):

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine import Navigator, Prior, SceneMatcher
@@ -62,6 +62,7 @@ def flown(off=(0.0, 0.0, 0.0), *, lag_s=0.0, off_m=0.0, frames=100, seed=1, nois
     return errors, shown
 
 
+@settings(max_examples=20)
 @given(
     off=st.tuples(st.floats(0.9, 3.0), st.floats(-3.0, -0.9), st.floats(-8.0, -2.1)),
     lag_s=st.floats(0.0, 0.15),
