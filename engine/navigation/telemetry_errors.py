@@ -25,7 +25,7 @@ _FIRST_SHARE = 0.2  # error of the height before a picture measured it
 _WALK = np.array([0.2, 0.2, 0.5, 1e-3, 0.01])  # standard deviations of the states' change in one second
 # Standard deviations of a measured attitude, refined or by features alone; of a measured height, and a share.
 _REFINED_DEG, _FEATURES_DEG, _HEIGHT_M, _HEIGHT_SHARE = 0.6, 2.0, 1.0, 0.01
-_MAX_SIGMAS = 3.0  # larger differences are clipped to this: one fix may be wrong
+_MAX_SIGMAS = 3.0  # larger differences are clipped to this: one fix may be wrong; an error beyond it is known
 _SCATTER_SHARE = 0.2  # weight of a new difference in the mean square
 _MAX_INTERVAL_S = 0.5  # between frames; over longer ones the turn rates are unknown
 _MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
@@ -89,7 +89,7 @@ class TelemetryErrors:
         )
         self._mean, self._covariance = np.zeros(5), np.diag(self._first**2)
         self._scatter_deg2 = np.zeros(3)  # mean square of recent differences in excess of the expected
-        self._fixes = 0  # that measured more than the lag
+        self._attitudes = self._heights = 0  # fixes that measured it
         self._time_s: float | None = None
         self._stamp_ns: int | None = None
         self._angles_deg: Array | None = None  # of the newest frame, as they came
@@ -103,15 +103,14 @@ class TelemetryErrors:
     def calibration(self) -> Calibration:
         """All that was learnt."""
         sigmas = np.sqrt(np.diag(self._covariance))
-        known, height_m, share = self._fixes > 0, self._height_m, float(self._mean[_HEIGHT])
-        is_high = known and height_m is not None
+        height_m, share = self._height_m if self._heights else None, float(self._mean[_HEIGHT])
         return Calibration(
-            self._bias(sigmas) if known else None,
+            self._bias(sigmas) if self._attitudes else None,
             float(self._mean[_LAG]),
             math.hypot(float(sigmas[_LAG]), self._jitter_s),
-            share * height_m if is_high and height_m else None,
-            1.0 + share if is_high else None,
-            float(sigmas[_HEIGHT]) * height_m if is_high and height_m else None,
+            None if height_m is None else share * height_m,
+            None if height_m is None else 1.0 + share,
+            None if height_m is None else float(sigmas[_HEIGHT]) * height_m,
         )
 
     def _bias(self, sigmas: Array) -> Bias:
@@ -167,7 +166,7 @@ class TelemetryErrors:
         heading_deg = frame.heading_sigma_deg or self._assumed.heading_deg
         off: Array = np.zeros(3)
         wider_deg2 = rates_dps**2 * (variance[_LAG] + self._jitter_s**2)
-        if self._fixes >= _MIN_FIXES:
+        if self._attitudes >= _MIN_FIXES:
             is_off = np.abs(self._mean[_ANGLES]) > _MIN_SIGMAS * np.array([tilt_deg, tilt_deg, heading_deg])
             off = is_off.astype(np.float64)
             wider_deg2 = wider_deg2 + variance[_ANGLES] * off + self._scatter_deg2
@@ -187,7 +186,7 @@ class TelemetryErrors:
     def _at_its_height(self, frame: Frame) -> Frame:
         """The frame at the height that pictures measured, if it differs by more than a match tolerates."""
         share, sigma = float(self._mean[_HEIGHT]), math.sqrt(self._covariance[_HEIGHT, _HEIGHT])
-        is_known = self._fixes >= _MIN_FIXES and abs(share) > max(_MIN_SHARE, _MAX_SIGMAS * sigma)
+        is_known = self._heights >= _MIN_FIXES and abs(share) > max(_MIN_SHARE, _MAX_SIGMAS * sigma)
         if frame.height_agl_m is None or not is_known or share <= -1.0:
             return frame
         off_m = share * frame.height_agl_m
@@ -217,23 +216,23 @@ class TelemetryErrors:
             noise_deg = _REFINED_DEG if fix.stage in ("refined", "verified") else _FEATURES_DEG
             noise_deg2 = noise_deg**2 + (self._rates_dps * self._jitter_s) ** 2
             excess = self._update(off, design, noise_deg2, only_lag=ground_m is None)
-            if ground_m is not None and self._fixes:
-                beyond_deg2 = np.clip(excess, 0.0, self._first[_ANGLES] ** 2)
-                self._scatter_deg2 += _SCATTER_SHARE * (beyond_deg2 - self._scatter_deg2)
-        if ground_m is None:
-            return
-        if self._height_m is not None:
+            if ground_m is not None:
+                if self._attitudes:
+                    beyond_deg2 = np.clip(excess, 0.0, self._first[_ANGLES] ** 2)
+                    self._scatter_deg2 += _SCATTER_SHARE * (beyond_deg2 - self._scatter_deg2)
+                self._attitudes += 1
+        if ground_m is not None and self._height_m is not None:
             share = (fix.up_m - ground_m) / self._height_m - 1.0
             noise = np.array([(_HEIGHT_M / self._height_m) ** 2 + _HEIGHT_SHARE**2])
             self._update(np.array([share]), np.eye(5)[[_HEIGHT]], noise)
-        self._fixes += 1
+            self._heights += 1
 
     def forget(self) -> None:
         """Forget what was learnt, but for the lag: it came from a wrong position, or no longer holds."""
         lag_s, lag_s2 = self._mean[_LAG], self._covariance[_LAG, _LAG]
         self._mean, self._covariance = np.zeros(5), np.diag(self._first**2)
         self._mean[_LAG], self._covariance[_LAG, _LAG] = lag_s, lag_s2
-        self._scatter_deg2, self._fixes = np.zeros(3), 0
+        self._scatter_deg2, self._attitudes, self._heights = np.zeros(3), 0, 0
 
     def _follow(self, frame: Frame, time_s: float) -> None:
         """Take the newest frame: let the states walk, and compute its turn rates since the last frame."""

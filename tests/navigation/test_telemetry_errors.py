@@ -118,6 +118,26 @@ def test_without_stamp_or_attitude_there_is_no_rate(changes):
     assert list(map(fields_of, frames)) == list(map(fields_of, given))
 
 
+@pytest.mark.parametrize("missing", ANGLES)
+def test_a_frame_without_attitude_teaches_its_height_alone(missing):
+    errors, _ = flown((2.0, 2.0, 5.0), off_m=20.0, frames=5, **{missing: None})
+    found = errors.calibration
+    assert found.attitude is None
+    assert abs(found.height_m + 20.0) < 4.0 * found.height_sigma_m
+
+
+def test_a_frame_without_height_teaches_its_attitude_alone():
+    errors, _ = flown((2.0, 2.0, 5.0), height_agl_m=None)
+    found = errors.calibration
+    assert (found.height_m, found.height_factor, found.height_sigma_m) == (None, None, None)
+    assert found.attitude.heading_deg == pytest.approx(-5.0, abs=1.0)
+
+
+def test_a_fix_that_did_not_measure_its_height_teaches_nothing():
+    found = flown((2.0, 2.0, 5.0), measured=False)[0].calibration
+    assert (found.attitude, found.height_m, found.attitude_lag_s) == (None, None, 0.0)
+
+
 def test_frames_far_apart_have_no_rate_and_stamps_of_another_unit_a_bounded_one():
     errors = TelemetryErrors(NavigatorOptions())
     for k in range(4):
