@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Iterable
 from functools import partial
 from importlib import import_module
@@ -13,6 +12,7 @@ from numba.core import event
 from numba.core.sigutils import normalize_signature
 
 from engine.runtime import workers
+from engine.runtime.garbage import no_collection
 
 _FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}  # not "nnan": a flat picture divides by zero
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": _FAST, "no_cfunc_wrapper": True}
@@ -56,20 +56,18 @@ def prepare(modules: Iterable[str], report: Callable[[int, int], None] = lambda 
     written = [entry for name in names for entry in _signatures if entry[0].__module__ == name]
     # Types as in a first call: the cache distinguishes a text from the types that it denotes.
     loops = [(loop, normalize_signature(text)[0]) for loop, text in written]  # type: ignore[no-untyped-call]
-    helper, is_collecting = None, gc.isenabled()
-    gc.disable()  # little of a compiler's memory is garbage before it is done
+    helper = None
     try:
-        for number, (loop, signature) in enumerate(loops, 1):
-            loop.compile(signature)
-            if helper is None and loop.stats.cache_misses and loop.stats.cache_path:
-                helper = workers.start_helper(partial(_compile, loops[:number:-1]))
-            report(number, len(loops))
+        with no_collection():  # little of a compiler's memory is garbage before it is done
+            for number, (loop, signature) in enumerate(loops, 1):
+                loop.compile(signature)
+                if helper is None and loop.stats.cache_misses and loop.stats.cache_path:
+                    helper = workers.start_helper(partial(_compile, loops[:number:-1]))
+                report(number, len(loops))
     finally:
         if helper is not None:
             helper.kill()
             helper.join()
-        if is_collecting:
-            gc.enable()
 
 
 def _compile(loops: list[tuple[Any, Any]]) -> None:
