@@ -70,7 +70,8 @@ class PoseOptions:
         max_iterations: Upper bound on the samples that RANSAC draws.
         confidence: Probability, in (0, 1), at which RANSAC stops early.
         min_inliers: Fewest distinct inliers of a pose.
-        distinct_px: Matches nearer than this to each other, in the reduced frame, see the same and count once.
+        distinct_px: Matches nearer to each other than this count once: they see the same pixels. In pixels of the
+            picture whose matches vote, and of the frame if nothing was voted for.
         max_log10_nfa: Upper bound on log10 of the number of false alarms, the expected number of poses with as
             many inliers by chance.
         min_spread_px: Smallest standard deviation of the inliers in the image, in the direction of smallest

@@ -45,11 +45,6 @@ class Vote:
     rival_surprise: float
     tried: int
 
-    @property
-    def votes(self) -> int:
-        """How many agree."""
-        return int(np.count_nonzero(self.voters))
-
 
 def vote(photo_px: Array, map_px: Array, radius_px: float, distinct_px: float) -> Vote | None:
     """The translation that most matches agree on.
