@@ -18,8 +18,7 @@ class Budget:
 
     Attributes:
         total_ms: of a frame with a prior.
-        search_ms: of a frame that searches the whole map, because it has no prior, or headings and heights
-            (:attr:`engine.Frame.is_doubted`); None is ``total_ms``.
+        search_ms: of a frame that searches the whole map, because it has no prior; None is ``total_ms``.
 
     Raises:
         OptionError: one is not above 0.
@@ -46,7 +45,7 @@ class Deadline:
     Args:
         budget: limits.
         clock_ns: monotonic nanoseconds; tests pass their own.
-        searches: whether the frame searches the whole map, or headings and heights.
+        searches: whether the frame searches the whole map.
     """
 
     __slots__ = ("_budget_ms", "_clock_ns", "_start_ns")

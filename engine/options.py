@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from engine.errors import OptionError
 from engine.kernels.scores import check_score
 from engine.learned.pairs import PairMatcher
 from engine.sift import BACKENDS
-from engine.values import MAX_SIGMA_M, Frame, GridPose, check_positive
+from engine.values import MAX_SIGMA_M, GridPose, check_positive
 
 PROFILES = ("engine", "paper")
 MAP_FEATURES = ("prepared", "per_frame")
 MIN_HEIGHT_M = 1.0
 """The lowest height to search if the height is unknown."""
-# The largest errors of compasses and altimeters: declination, a motor's current, a different ground level.
-_DOUBTED_HEADING_DEG, _DOUBTED_HEIGHT_SHARE = 24.0, 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,10 +117,7 @@ class NccOptions:
         enhance_radius_px: neighbourhood of the local normalisation; 0 leaves it out. "grey" has none.
         min_valid_share: a place counts only if this share of the patch lies on valid map.
         exhaustive: score every place of the window at full resolution.
-        heading_search_deg: how far the frame's heading may be off; 0 trusts it, 180 searches all headings, even if
-            the frame has none.
-        height_search_share: the share by which the height may be off; 0 trusts it.
-        refine: refine the pose densely after the peak, if heading and height are trusted.
+        refine: refine the pose densely after the peak.
         exclusion_m: rivals nearer than this are the peak itself.
         min_deviation: standard deviation in grey levels below which a frame has no texture.
         errors: assumed errors of the telemetry and the map.
@@ -134,8 +129,6 @@ class NccOptions:
     enhance_radius_px: int = 8
     min_valid_share: float = 0.9
     exhaustive: bool = False
-    heading_search_deg: float = 0.0
-    height_search_share: float = 0.0
     refine: bool = True
     exclusion_m: float = 6.0
     min_deviation: float = 3.0
@@ -149,27 +142,10 @@ class NccOptions:
         for name in ("fraction", "min_valid_share"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
-        for name, limit in (("heading_search_deg", 180.0), ("height_search_share", 0.5)):
-            if not 0.0 <= getattr(self, name) <= limit:
-                raise OptionError(f"{name}: expected 0 to {limit:g}, got {getattr(self, name)}")
         check_positive(self, "exclusion_m", "min_deviation")
         check_score(self.score)
         if self.enhance_radius_px < 0:
             raise OptionError(f"enhance_radius_px: expected 0 or more, got {self.enhance_radius_px}")
-
-    def of_frame(self, frame: Frame) -> NccOptions:
-        """These options, searching headings and heights as for a frame whose own are doubted."""
-        if not frame.is_doubted:
-            return self
-        return replace(
-            self,
-            heading_search_deg=max(self.heading_search_deg, _DOUBTED_HEADING_DEG),
-            height_search_share=max(self.height_search_share, _DOUBTED_HEIGHT_SHARE),
-        )
-
-    def trusts(self, heading_deg: float | None) -> bool:
-        """Whether a frame's own heading and height are the only hypothesis."""
-        return heading_deg is not None and self.heading_search_deg == self.height_search_share == 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -45,8 +45,7 @@ class Attitude:
 
 
 # Fields of a frame that are finite or None.
-_FINITE = ("height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps",
-           "height_correction_m")  # fmt: skip
+_FINITE = ("height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps")
 _SIGMAS = ("height_sigma_m", "heading_sigma_deg", "tilt_sigma_deg", "velocity_sigma_mps")
 
 
@@ -64,12 +63,10 @@ class Frame:
         east_velocity_mps: velocity over ground, or None if unknown.
         north_velocity_mps: velocity over ground, or None if unknown.
         height_sigma_m: standard deviation of the height; None takes the matcher's assumption, as for the next two.
-        heading_sigma_deg: standard deviation of the heading.
+            How far heights and headings are searched follows from it.
+        heading_sigma_deg: standard deviation of the heading; with 180 any heading is possible.
         tilt_sigma_deg: standard deviation of roll and of pitch.
         velocity_sigma_mps: standard deviation of the velocity, per axis; None takes the navigator's assumption.
-        height_correction_m: added to the vehicle's own height because images showed a different one. The cause may
-            be a wrong focal length, so the correction also makes a fix less certain.
-        is_doubted: heading and height may be far off, so NCC searches for both; set by a navigator.
 
     Raises:
         ShapeError: the image is not (H, W) or (H, W, 3), or is empty.
@@ -89,8 +86,6 @@ class Frame:
     heading_sigma_deg: float | None = None
     tilt_sigma_deg: float | None = None
     velocity_sigma_mps: float | None = None
-    height_correction_m: float | None = None
-    is_doubted: bool = False
 
     def __post_init__(self) -> None:
         shape = tuple(self.image.shape)

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from bench import SHARED
 from bench.accuracy.flights import recorded
-from engine import Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher, set_threads
-from engine.options import NccOptions
+from engine import Camera, Fix, Frame, Navigator, OrthoMap, SceneMatcher, set_threads
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import Motion, SensorNoise, build_town, plan_flight
 from scenematch.simulator.vehicle import simulate_telemetry
@@ -103,13 +102,14 @@ def shared(name: str, starts: int) -> Flight:
 
 def blind(frame: Frame) -> Frame:
     """The frame without what a kidnapped vehicle does not know."""
-    return replace(frame, heading_deg=None, east_velocity_mps=None, north_velocity_mps=None)
+    return replace(
+        frame, heading_deg=0.0, heading_sigma_deg=180.0, east_velocity_mps=None, north_velocity_mps=None
+    )
 
 
 def matcher_for(site: OrthoMap, camera: Camera, method: str) -> SceneMatcher:
-    """A warm matcher that looks for all headings."""
-    options = MatcherOptions(ncc=NccOptions(heading_search_deg=180.0))
-    matcher = SceneMatcher(site, camera, method, "cpu", options)
+    """A warm matcher."""
+    matcher = SceneMatcher(site, camera, method, "cpu")
     matcher.warmup()
     return matcher
 

@@ -135,14 +135,15 @@ def test_hypotheses(benchmark: Any, peer: str, threads: int) -> None:
     from engine.kernels.scores import enhance
     from engine.matching.align import rectify, view_of
     from engine.values import Attitude, Window
+    from engine.window import SPREAD_SIGMAS
 
     scene = flight()
     frame, truth, site = scene.frames[5], scene.truth[5], scene.site
     assert frame.height_agl_m is not None
     if peer == "scenematch":
-        options = NccOptions(heading_search_deg=180.0, height_search_share=0.1)
-        matcher = SceneMatcher(site, scene.camera, "ncc", "cpu", MatcherOptions(ncc=options))
-        unknown = replace(frame, heading_deg=None)
+        matcher = SceneMatcher(site, scene.camera, "ncc", "cpu")
+        height_sigma_m = 0.1 * frame.height_agl_m / SPREAD_SIGMAS
+        unknown = replace(frame, heading_deg=0.0, heading_sigma_deg=180.0, height_sigma_m=height_sigma_m)
 
         def call() -> np.ndarray:
             fix = matcher.locate(unknown)

@@ -71,7 +71,7 @@ class Auto(Method):
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
-        first = self.ncc.begin(query, try_turns=False)  # SIFT finds the heading by itself
+        first = self.ncc.begin(query, widely=False)  # SIFT finds the heading by itself
         # A wrong attitude displaces the peak; refinement, which measures it, leads back.
         refined = self.ncc.refine(query, first)
         if isinstance(refined, Fix) and refined.stage == "refined":

@@ -57,6 +57,27 @@ def map_sigma_of(site: OrthoMap) -> float:
     return AssumedErrors().map_m if site.georeference_sigma_m is None else site.georeference_sigma_m
 
 
+def scale_doubt_m(off_m: float, height_m: float, camera_down: Array, told_down: Array | None) -> float:
+    """Position error to allow for if a measured height is not the telemetry's.
+
+    A focal length that is wrong by some share scales the height and the optical axis's angle off the vertical;
+    distortion missing from the calibration also looks like a tilt. Or the telemetry's height is wrong: the picture
+    cannot tell.
+
+    Args:
+        off_m: how far the heights are apart.
+        height_m: as measured.
+        camera_down: (3,) optical axis in east, north, up, as measured.
+        told_down: the same by the telemetry; None if that is unknown.
+
+    Returns:
+        One standard deviation per axis.
+    """
+    aside = float(np.hypot(*camera_down[:2])) / max(-float(camera_down[2]), 1e-3) + _ASIDE
+    turned = 0.0 if told_down is None else math.acos(min(1.0, float(told_down @ camera_down)))
+    return math.hypot(off_m * aside, height_m * math.tan(min(turned, _MAX_TURNED)))
+
+
 def with_frame_accuracy(frame: Frame, errors: AssumedErrors) -> AssumedErrors:
     """The errors, with the frame's stated accuracies in place of assumed ones."""
     return _with_accuracy(errors, frame.heading_sigma_deg, frame.tilt_sigma_deg, frame.height_sigma_m)
@@ -76,6 +97,8 @@ def _with_accuracy(
     return replace(errors, **known) if known else errors
 
 
+_MAX_TURNED = math.radians(60.0)
+_ASIDE = math.tan(math.radians(2.0))  # of an axis that counts as vertical
 _NO_SHARE = 1e-6  # for a height whose standard deviation is stated as a whole
 # Neighbouring pixels share their noise: a square with this side counts as one.
 _CORRELATION_PX = 5.0

@@ -19,15 +19,20 @@ from engine.kernels.coarse_to_fine import surfaces_over_nodata
 from engine.kernels.peaks import best_positions
 from engine.maps.prepared import Region
 from engine.matching.correlation import Aligned, Correlator
+from engine.matching.covariance import score_sigma
+from engine.matching.evidence import Evidence, is_hopeless, surprise_of
+from engine.matching.peak_evidence import places_in
 from engine.ncc_fft import surfaces
-from engine.options import NccOptions
 from engine.runtime.device import Picture, placed
 from engine.values import GridPose, NoFix, Peak, Window
+from engine.window import SPREAD_SIGMAS
 
 Array = NDArray[np.float64]
 
 
-_MAX_COARSE_PLACES = 32_000_000  # hypotheses times places on the coarse level, unless the template gets too small
+# Most hypotheses times places on the coarse level, unless the template gets too small: in all, and in multiples of
+# the places of one look at the frame's own level.
+_MAX_COARSE_PLACES, _MAX_LOOKS = 32_000_000, 16
 _MAX_COARSE_PX = 4_000_000  # of the map, likewise
 _MIN_TEMPLATE_PX = 20
 _MIN_QUICK_TEMPLATE_PX = 12  # of a quick look, whose result is kept only if beyond doubt
@@ -37,18 +42,28 @@ _SEMIFINALISTS = 4
 _FINALISTS = 2
 _HOPEFUL = 0.5  # of the best score: a lower place does not win by a better heading and height
 _MIN_GROUP, _MAX_GROUP_PX = 2, 4_000_000  # templates in one batch, or pixels of their surfaces, to bound memory
+_MAX_SHARE = 0.2  # of the height, by which it may be off
 _SLACK_PX = 3  # error of a place found on a level, in pixels of that level
 _EDGE_PX = 1.5  # error of the nearest hypothesis at the patch's corner
 _MIDDLE_ROUNDS = 2
 _FINE_ROUNDS = 2
 
 
-def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak | None, Aligned, int]:
-    """The best peak over all hypotheses in the window, at the level of ``first``; its hypothesis; their number."""
-    level, poses = _coarse_level(correlator, first, window)
+def search(
+    correlator: Correlator, first: Aligned, window: Window, *, widely: bool
+) -> tuple[Peak | None, Aligned, int]:
+    """The best peak over all hypotheses in the window, at the level of ``first``; its hypothesis; their number.
+
+    Args:
+        correlator: of the frame.
+        first: the frame's own hypothesis.
+        window: to search.
+        widely: whether to try other headings and heights than its own.
+    """
+    level, poses = _coarse_level(correlator, first, window, widely=widely)
     if level == first.level and len(poses) == 1:
         return correlator.search(first, window), first, 1
-    quick = _quick_level(correlator, first, level)
+    quick = _quick_level(correlator, first, level, widely=widely)
     if quick is not None:
         best = _from_level(correlator, first, window, *quick)
         if best is not None and _is_clear(best[0]):
@@ -56,10 +71,12 @@ def search(correlator: Correlator, first: Aligned, window: Window) -> tuple[Peak
     return *(_from_level(correlator, first, window, level, poses) or (None, first)), len(poses)
 
 
-def _quick_level(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[GridPose]] | None:
+def _quick_level(
+    correlator: Correlator, first: Aligned, level: int, *, widely: bool
+) -> tuple[int, list[GridPose]] | None:
     """Search one level above, with fewer hypotheses, at a sixteenth of the cost; None if too little is left."""
     above = level + 1
-    side_px, turns, shares = _grid_on(correlator, first, above)
+    side_px, turns, shares = _grid_on(correlator, first, above, widely=widely)
     if above == correlator.query.site.levels or side_px < _MIN_QUICK_TEMPLATE_PX:
         return None
     return above, _hypotheses(correlator.query.telemetry, turns, shares)
@@ -82,7 +99,11 @@ def _from_level(
             found.append((peak, aligned))
     found.sort(key=lambda pair: -pair[0].score)
     several = len(poses) > 1
-    if several:
+    if several and found:
+        (peak, aligned), tried = found[0], len(poses) * places_in(first, window)
+        surprise = surprise_of(peak.score, score_sigma(aligned.template.size))
+        if is_hopeless(Evidence(surprise, 0.0, tried, tried, None).nats, correlator.query.risk):
+            return None
         hopeful = [pair for pair in found[:_SEMIFINALISTS] if pair[0].score >= _HOPEFUL * found[0][0].score]
         found = [_refined(correlator, *pair, _MIDDLE_ROUNDS) for pair in hopeful]
         found.sort(key=lambda pair: -pair[0].score)
@@ -91,44 +112,55 @@ def _from_level(
 
 def coarse_px(correlator: Correlator, first: Aligned, window: Window) -> int:
     """Map pixels that :func:`search` searches first, all at once."""
-    return window.area_px >> 2 * _coarse_level(correlator, first, window)[0]
+    return window.area_px >> 2 * _coarse_level(correlator, first, window, widely=False)[0]
 
 
-def _coarse_level(correlator: Correlator, first: Aligned, window: Window) -> tuple[int, list[GridPose]]:
+def is_single(correlator: Correlator, first: Aligned, window: Window) -> bool:
+    """Whether a search tries only the frame's own heading and height, which are near all possible ones."""
+    return len(_coarse_level(correlator, first, window, widely=True)[1]) == 1
+
+
+def _coarse_level(
+    correlator: Correlator, first: Aligned, window: Window, *, widely: bool
+) -> tuple[int, list[GridPose]]:
     """The level on which to score all hypotheses, and the hypotheses: fewer at lower resolution."""
     level, levels = first.level, correlator.query.site.levels
+    most = min(_MAX_COARSE_PLACES, _MAX_LOOKS * first.work_px(window)) if widely else _MAX_COARSE_PLACES
     while True:
-        side_px, turns, shares = _grid_on(correlator, first, level)
+        side_px, turns, shares = _grid_on(correlator, first, level, widely=widely)
         area_px = window.area_px / 4**level
-        few = area_px <= _MAX_COARSE_PX and len(turns) * len(shares) * area_px <= _MAX_COARSE_PLACES
+        few = area_px <= _MAX_COARSE_PX and len(turns) * len(shares) * area_px <= most
         if few or level + 1 == levels or side_px >> 1 < _MIN_TEMPLATE_PX:
             return level, _hypotheses(correlator.query.telemetry, turns, shares)
         level += 1
 
 
-def _grid_on(correlator: Correlator, first: Aligned, level: int) -> tuple[int, list[float], list[float]]:
-    """The template's shorter side on a level, in its pixels, with the turns and shares to try there."""
-    h, w = (n >> (level - first.level) for n in first.template.shape)
-    return min(h, w), *_grid(correlator.options, math.hypot(h, w) / 2.0)
+def _grid_on(
+    correlator: Correlator, first: Aligned, level: int, *, widely: bool
+) -> tuple[int, list[float], list[float]]:
+    """The template's shorter side on a level, in its pixels, with the turns and shares to try there.
 
-
-def _grid(options: NccOptions, reach_px: float) -> tuple[list[float], list[float]]:
-    """Turns in degrees and shares of the height that keep a patch's corners within :data:`_EDGE_PX`.
-
-    Args:
-        options: how far heading and height may be off.
-        reach_px: from the patch's middle to its corner, on the level where the hypotheses are scored.
+    Turns, in degrees, and shares of the height reach as far as the position's window does, in sigmas, and keep a
+    patch's corners within :data:`_EDGE_PX` of one of them.
     """
-    step = 2.0 * _EDGE_PX / reach_px  # radians, or a share of the height: both move the corner by step * reach
-    turns = _steps(options.heading_search_deg, math.degrees(step))
-    if options.heading_search_deg == 180.0:
+    query, height_m = correlator.query, first.pose.height_agl_m
+    h, w = (n >> (level - first.level) for n in first.template.shape)
+    if not widely:
+        return min(h, w), [0.0], [0.0]
+    assert height_m is not None  # a hypothesis has one
+    errors = query.errors(correlator.options.errors)
+    turn_deg = min(SPREAD_SIGMAS * errors.heading_deg, 180.0)
+    share = min(SPREAD_SIGMAS * errors.height_sigma_m(height_m) / height_m, _MAX_SHARE)
+    step = 4.0 * _EDGE_PX / math.hypot(h, w)  # radians, or a share: each moves a corner by twice the edge
+    turns = _steps(turn_deg, math.degrees(step))
+    if turn_deg == 180.0:
         turns = turns[:-1]  # -180 and 180 are one heading
-    return turns, _steps(options.height_search_share, step)
+    return min(h, w), turns, _steps(share, step)
 
 
 def _steps(reach: float, step: float) -> list[float]:
-    """Offsets from -reach to reach, including 0, spaced by at most the step."""
-    count = math.ceil(reach / step)
+    """Offsets from -reach to reach, including 0, spaced by at most the step; 0 alone if it is near all of them."""
+    count = math.ceil(reach / step - 0.5)
     return [reach * i / count for i in range(-count, count + 1)] if count else [0.0]
 
 

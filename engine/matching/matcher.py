@@ -166,7 +166,7 @@ class SceneMatcher:
         return result
 
     def _located(self, frame: Frame, prior: Prior | None, budget: Budget) -> Fix | NoFix:
-        deadline = Deadline(budget, searches=prior is None or frame.is_doubted)
+        deadline = Deadline(budget, searches=prior is None)
         query = self._query(frame, prior, deadline)
         if query.prior_px is not None and not np.isfinite(query.prior_px).all():
             return query.refuse_outside(self.method)  # nowhere in the map's coordinate system

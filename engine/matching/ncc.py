@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from engine.geo import wrap_heading_deg
 from engine.maps.prepared import PreparedMap
 from engine.maps.samples import SampleMap
 from engine.matching import hypothesis_search
@@ -32,19 +31,17 @@ from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
 from engine.runtime.scheduler import OutOfTime
-from engine.values import Attitude, Fix, NoFix, Peak, Prior, Reason, Result, Window
+from engine.values import Fix, NoFix, Peak, Prior, Reason, Result, Window
 
 MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
-_SECOND_LOOK, _AT_ONCE = "ncc second look", "refinement at once"  # steps
+_SECOND_LOOK, _HYPOTHESES, _AT_ONCE = "ncc second look", "ncc hypotheses", "refinement at once"  # steps
 _HOPEFUL_LOOK = "ncc second look by a coarser level"
 _SURROUNDINGS_SIGMA_M = 30.0  # of the window around a place found by a search, in which it must stand out
-_TURNS_DEG = (-4.0, 4.0)  # heading errors to try if a frame was refused
-_TURNED_SIGMA_DEG = 2.0  # of the heading then
 
 
 class Ncc(Method):
-    """Normalised cross-correlation; needs height and heading, or the time to search for the heading.
+    """Normalised cross-correlation; needs height and heading, which may be off by three of their sigmas.
 
     Args:
         site: the map.
@@ -74,9 +71,6 @@ class Ncc(Method):
 
     def warmup(self, query: Query) -> None:
         """Run every variant of every step, so that it is compiled and its cost known."""
-        if not self._trusts(query):
-            self.locate(query)  # a search has one variant
-            return
         for coarser in expected_window_px(query, self.options):
             self.refine(query, self.correlate(query, coarser))
         untilted = replace(query, frame=replace(query.frame, roll_deg=None, pitch_deg=None))
@@ -88,14 +82,16 @@ class Ncc(Method):
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map, or headings and heights about the prior."""
-        doubted = replace(query, frame=replace(query.frame, is_doubted=True))
-        self.locate(query if query.prior is None else doubted)
+        if query.prior is None:
+            self.locate(query)
+        else:
+            self._by_hypotheses(query)
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that time allows, refined if time remains."""
         return self.refine(query, self.begin(query))
 
-    def begin(self, query: Query, *, try_turns: bool = True) -> Result:
+    def begin(self, query: Query, *, widely: bool = True) -> Result:
         """A refined fix that starts at the coarsest level, else one by correlation alone, see :meth:`correlate`.
 
         The peak of the coarsest level is the fix if it was accepted and there is no time for a finer one, or if
@@ -103,7 +99,7 @@ class Ncc(Method):
         """
         coarse = self._by_coarse_peak(query)
         if coarse is None:
-            return self.correlate(query, try_turns=try_turns)
+            return self.correlate(query, widely=widely)
         scheduler, work_px, is_refuted = query.scheduler, float(query.gray.size), False
         try:
             with scheduler.with_fix():
@@ -118,7 +114,7 @@ class Ncc(Method):
                 level = scheduler.first_affordable(step, finer)
                 if level is None:
                     return coarse
-                fine = self.correlate(query, level, try_turns=try_turns)
+                fine = self.correlate(query, level, widely=widely)
         except OutOfTime:
             return coarse
         if isinstance(fine, Fix):
@@ -131,7 +127,7 @@ class Ncc(Method):
 
         If roll, pitch or the ground's slope is unknown, the pose depends on the peak, which must then be fine.
         """
-        if query.prior is None or query.frame.is_doubted or not self._can_refine(query):
+        if query.prior is None or not self._can_refine(query):
             return None
         step, works = self._step(query)
         coarser, scheduler = max(works), query.scheduler
@@ -150,36 +146,50 @@ class Ncc(Method):
         distance_m = float(np.hypot(*offset_between_m(coarse, fine)))
         return distance_m < self.options.exclusion_m and agree_in_place(coarse, fine)
 
-    def correlate(self, query: Query, coarser: int | None = None, *, try_turns: bool = True) -> Result:
+    def correlate(self, query: Query, coarser: int | None = None, *, widely: bool = True) -> Result:
         """A fix by correlation alone.
 
         Args:
             query: the frame.
             coarser: levels above the one whose pixels are like the frame's; None takes the finest that time
                 allows.
-            try_turns: whether to retry a refused frame with its heading a few degrees off.
+            widely: whether to search for the heading and height of a refused frame.
         """
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
         step, works = self._step(query)
         if coarser is None:
             coarser = query.scheduler.first_affordable(step, works)
-        if coarser is None and query.frame.is_doubted:  # better its own heading and height than no fix
-            query.scheduler.costs.note_refusal((step, max(works)))
-            return self.correlate(query.undoubted, try_turns=try_turns)
         if coarser is None:
             return query.refuse_late(METHOD, (step, max(works)))
         found, result = self._find_and_judge(query, step, works, coarser)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
             with suppress(OutOfTime):  # the existing refusal stands
                 result = self._look_again(query, found, result)
-                if isinstance(result, NoFix) and try_turns and found.is_tested:
-                    result = self._look_turned(query, coarser, works[coarser], result)
+                searched = self._by_hypotheses(query) if widely and isinstance(result, NoFix) else None
+                if searched is not None:
+                    return searched
             if isinstance(result, NoFix):
                 result = replace(result, candidates=candidates_of(self._correlator(query), found))
-        if isinstance(found, PeakCandidate) and isinstance(result, Fix) and query.frame.is_doubted:
-            return self.refine(query.with_height(found.aligned.pose), result)
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
+
+    def _by_hypotheses(self, query: Query) -> Fix | None:
+        """A fix with the best of all headings and heights within three sigmas; None without one, or without time.
+
+        A compass near motors is often off by more than a patch tolerates.
+        """
+        work_px = max(self._step(query)[1].values())
+        if not query.scheduler.can_afford({_HYPOTHESES: work_px}):
+            query.scheduler.costs.note_refusal(_HYPOTHESES)
+            return None
+        with query.scheduler.costed(_HYPOTHESES, work_px):
+            found = self.find(query, widely=True)
+        again = None if isinstance(found, NoFix) else self.find_again(query, found, self._looked_at(query, found))
+        result = None if again is None else self.judge(query, again)
+        if again is None or not isinstance(result, Fix):
+            return None
+        refined = self._refined(query.at(again.aligned.pose), result)
+        return refined if isinstance(refined, Fix) else None
 
     def _find_and_judge(
         self, query: Query, step: str, works: dict[int, float], coarser: int
@@ -191,40 +201,38 @@ class Ncc(Method):
 
     def _step(self, query: Query) -> tuple[str, dict[int, float]]:
         """The name of the correlation step, and the work of its variants."""
-        doubted, map_px = query.frame.is_doubted, float(query.site.width_px * query.site.height_px)
         if query.prior is None:
-            return "ncc doubted search" if doubted else "ncc search", {0: map_px}
-        windows = expected_window_px(query, self.options)
-        if doubted:
-            return "ncc doubted", {0: max(windows.values())}
-        return ("ncc", windows) if self._trusts(query) else ("ncc hypotheses", {0: map_px})
+            return "ncc search", {0: float(query.site.width_px * query.site.height_px)}
+        return "ncc", expected_window_px(query, self.options)
 
     def refine(self, query: Query, result: Result) -> Result:
         """The fix of a fine peak, its pose refined if that is wanted, possible and affordable."""
-        if not isinstance(result, Fix) or result.stage != "fine" or not self._can_refine(query):
+        if not isinstance(result, Fix) or result.stage != "fine" or result.attitude is not None:
             return result
-        if result.attitude is not None:  # found with another heading than the frame's own
-            heading_deg = result.attitude.heading_deg
-            frame = replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
-            query = replace(query, frame=frame)
+        return self._refined(query, result)
+
+    def _refined(self, query: Query, result: Fix) -> Result:
+        if not self._can_refine(query):
+            return result
         refinement = Refinement(query, self.samples, self.options)
         return improved(query, result, "refinement", refinement.refine)
 
     def _can_refine(self, query: Query) -> bool:
-        """Whether poses are refined: not if the height was searched, as it is then not the frame's."""
-        return self.options.refine and query.telemetry.height_agl_m is not None and self._trusts(query)
+        """Whether poses are refined."""
+        known = query.telemetry
+        return self.options.refine and known.height_agl_m is not None and known.grid_attitude is not None
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The correlation surface of a window at the frame's own height and heading."""
         return explain_correlation(self._correlator(query), window)
 
-    def find(self, query: Query, *, coarser: int = 0, headings: int = 1) -> PeakCandidate | NoFix:
+    def find(self, query: Query, *, coarser: int = 0, widely: bool = False) -> PeakCandidate | NoFix:
         """The highest peak of one frame, or a refusal if there is none.
 
         Args:
             query: the frame.
             coarser: see :meth:`correlate`.
-            headings: how many headings are tried in all.
+            widely: whether to try all headings and heights within three sigmas, as a search of the map does.
         """
         refusal = self._refuse_unusable(query)
         if refusal is not None:
@@ -241,22 +249,22 @@ class Ncc(Method):
             size = f"{window.width_px} x {window.height_px} px"
             detail = f"a window of {size} is too large to search; a better prior is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
-        searched, hypotheses = not self._trusts(query), headings
-        is_window = not (searched or wide or query.prior is None)
+        if widely and hypothesis_search.is_single(correlator, aligned, window):
+            detail = "its own heading and height are near all possible ones"
+            return query.refuse(Reason.LOW_SCORE, detail, METHOD, window=window)
+        is_window, hypotheses = not (widely or wide or query.prior is None), 1
         if is_window:
             peak, aligned = self._in_window(correlator, aligned, window)
         else:
-            peak, aligned, hypotheses = hypothesis_search.search(correlator, aligned, window)
+            peak, aligned, hypotheses = hypothesis_search.search(correlator, aligned, window, widely=widely)
         if peak is None:
             detail = "the map does not cover the frame anywhere in the window"
             return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
         if query.scheduler.deadline.remaining_ms < 0:
             detail = "the budget was spent before the peak was known"
             return query.refuse(Reason.LATE, detail, METHOD, window=window)
-        tried = hypotheses * places_in(aligned, window)
+        tried, searched = hypotheses * places_in(aligned, window), hypotheses > 1
         found = candidate_of(correlator, aligned, peak, window, searched=searched, tried=tried)
-        if is_window and headings > 1 and found.evidence.nats < query.needed_nats:
-            return found  # the null hypothesis could only weaken it
         if is_window:
             return null_tested(correlator, found)
         return replace(found, is_tested=not searched and is_beyond_doubt(found.evidence.nats, query.risk))
@@ -280,28 +288,6 @@ class Ncc(Method):
         if refusal is not None:
             return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
         return found.fix
-
-    def _look_turned(self, query: Query, coarser: int, work: float, refusal: NoFix) -> Result:
-        """The fix with a heading a few degrees off, if one is accepted, else the refusal.
-
-        A compass near motors is often off by more than assumed, and a patch turned by 4 degrees hardly correlates.
-        """
-        best: Fix | None = None
-        for turn_deg in _TURNS_DEG:
-            if not query.scheduler.can_afford({("ncc", coarser): work}):
-                break
-            assert query.frame.heading_deg is not None  # the first look had one
-            heading_deg = wrap_heading_deg(query.frame.heading_deg + turn_deg)
-            turned = replace(
-                query, frame=replace(query.frame, heading_deg=heading_deg, heading_sigma_deg=_TURNED_SIGMA_DEG)
-            )
-            with query.scheduler.costed(("ncc", coarser), work):
-                found = self.find(turned, coarser=coarser, headings=1 + len(_TURNS_DEG))
-            result = found if isinstance(found, NoFix) else self.judge(turned, found)
-            if isinstance(result, Fix) and (best is None or (result.confidence or 0.0) > (best.confidence or 0.0)):
-                attitude = Attitude(query.frame.roll_deg or 0.0, query.frame.pitch_deg or 0.0, heading_deg)
-                best = replace(result, attitude=attitude)
-        return refusal if best is None else best
 
     def _look_again(self, query: Query, found: PeakCandidate, refusal: NoFix) -> Result:
         """The fix of the second look about the same place, if affordable, else the refusal."""
@@ -343,11 +329,8 @@ class Ncc(Method):
             looked = second_look(correlator, found.aligned, window)
         return None if looked is None else confirmed(correlator, found, looked, window)
 
-    def _trusts(self, query: Query) -> bool:
-        return self.options.of_frame(query.frame).trusts(query.telemetry.grid_heading_deg)
-
     def _correlator(self, query: Query) -> Correlator:
-        return Correlator(query, self.prepared, self.options.of_frame(query.frame))
+        return Correlator(query, self.prepared, self.options)
 
     def _refuse_without_height(self, query: Query) -> NoFix:
         return query.refuse(Reason.NO_HEIGHT, "NCC needs the height above ground", METHOD)
@@ -357,15 +340,15 @@ class Ncc(Method):
         pose = query.telemetry
         if pose.height_agl_m is None:
             return self._refuse_without_height(query)
-        if pose.grid_heading_deg is None and self.options.heading_search_deg < 180.0:
-            return query.refuse(Reason.NO_HEADING, "NCC needs the heading, or a search over all of them", METHOD)
+        if pose.grid_heading_deg is None:
+            detail = "NCC needs the heading; with a sigma of 180 degrees it tries all of them"
+            return query.refuse(Reason.NO_HEADING, detail, METHOD)
         return query.refuse_flat(METHOD, self.options.min_deviation)
 
     def _align(self, correlator: Correlator, coarser: int) -> Aligned | NoFix:
-        """The frame with its own height and heading, or with any heading if it came without one."""
+        """The frame with its own height and heading."""
         query, pose = correlator.query, correlator.query.telemetry
         assert pose.height_agl_m is not None  # or it was refused
         level = min(query.level_of(pose.height_agl_m) + coarser, query.site.levels - 1)
-        known = pose if pose.grid_heading_deg is not None else replace(pose, grid_heading_deg=0.0)
         with query.scheduler.stage("align"):
-            return correlator.align(known, level)
+            return correlator.align(pose, level)

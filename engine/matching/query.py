@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.geo import angle_covariance_deg2, enu_from_body, inverse_2x2, transport_covariance, wrap_heading_deg
-from engine.matching.covariance import with_frame_accuracy
+from engine.matching.covariance import scale_doubt_m, with_frame_accuracy
 from engine.matching.evidence import needed_nats, prior_chi_square
 from engine.matching.pose import AttitudePrior
 from engine.options import AssumedErrors
@@ -26,9 +25,7 @@ from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 Array = NDArray[np.float64]
 
 _AGREE_SIGMAS = 2.0  # difference at which a measured height still agrees with the telemetry's
-_MAX_TURNED = math.radians(60.0)
-_FOUND_HEIGHT_SHARE = 0.03  # standard deviation of a height that a search found
-_ASIDE = math.tan(math.radians(2.0))  # of an axis that counts as vertical
+_FOUND_HEADING_DEG, _FOUND_HEIGHT_SHARE = 2.0, 0.03  # standard deviations of what a search found
 
 
 @dataclass(frozen=True)
@@ -44,6 +41,7 @@ class Query:
         device: where pictures are correlated.
         scheduler: times its stages and decides which steps time allows.
         risk: allowed probability of a wrong fix.
+        told_height_m: the height that the frame came with, if a search replaced it.
     """
 
     frame: Frame
@@ -54,6 +52,7 @@ class Query:
     device: Device
     scheduler: Scheduler = field(repr=False)
     risk: float
+    told_height_m: float | None = None
 
     @property
     def needed_nats(self) -> float:
@@ -148,11 +147,7 @@ class Query:
         return AttitudePrior(enu_from_camera.T, (*errors.tilts_deg(known), sigma_deg), axes=mount)
 
     def scale_doubt_m(self, nadir_px: Array, up_m: float, camera_down: Array, errors: AssumedErrors) -> float:
-        """Position error to allow for if the measured height is not the telemetry's.
-
-        A focal length that is wrong by some share scales the height and the optical axis's angle off the vertical;
-        distortion missing from the calibration also looks like a tilt. Or the telemetry's height is wrong: the
-        picture cannot tell.
+        """Position error to allow for if the measured height is not the telemetry's (:func:`.scale_doubt_m`).
 
         Args:
             nadir_px: (2,) of the camera.
@@ -163,41 +158,34 @@ class Query:
         Returns:
             One standard deviation per axis, 0 if the heights agree to within two standard deviations.
         """
-        known_m = self.telemetry.height_agl_m
-        if known_m is None:
+        told_m = self.told_height_m or self.telemetry.height_agl_m
+        if told_m is None:
             return 0.0
-        told_m = known_m - (self.frame.height_correction_m or 0.0)
         measured_m = up_m - float(self.site.ground_at(nadir_px))
         off_m = abs(measured_m - told_m)
         if off_m <= _AGREE_SIGMAS * errors.height_sigma_m(told_m):
             return 0.0
-        aside = float(np.hypot(*camera_down[:2])) / max(-float(camera_down[2]), 1e-3)
-        told = self.telemetry.grid_attitude
-        turned = 0.0
-        if told is not None and self.telemetry.has_tilt:
-            told_down = self.camera.enu_from_camera(told)[:, 2]
-            turned = math.acos(min(1.0, float(told_down @ camera_down)))
-        return math.hypot(off_m * (aside + _ASIDE), measured_m * math.tan(min(turned, _MAX_TURNED)))
+        told = self.telemetry.grid_attitude if self.telemetry.has_tilt else None
+        told_down = None if told is None else self.camera.enu_from_camera(told)[:, 2]
+        return scale_doubt_m(off_m, measured_m, camera_down, told_down)
 
-    # ------------------------------------------------------------------------------- heading and height searched
-
-    @property
-    def undoubted(self) -> Query:
-        """The same query with the frame's own heading and height."""
-        return replace(self, frame=replace(self.frame, is_doubted=False))
-
-    def with_height(self, pose: GridPose) -> Query:
-        """The same query with the height that a search found, as accurate as its steps."""
-        frame, height_m = self.undoubted.frame, pose.height_agl_m
-        assert frame.height_agl_m is not None
+    def at(self, pose: GridPose) -> Query:
+        """The same query with the heading and height that a search found, as accurate as its steps."""
+        known, height_m = self.telemetry, pose.height_agl_m
+        assert self.frame.heading_deg is not None  # a hypothesis has both
+        assert known.grid_heading_deg is not None
+        assert pose.grid_heading_deg is not None
+        assert known.height_agl_m is not None
         assert height_m is not None
+        turn_deg = pose.grid_heading_deg - known.grid_heading_deg
         found = replace(
-            frame,
+            self.frame,
+            heading_deg=wrap_heading_deg(self.frame.heading_deg + turn_deg),
+            heading_sigma_deg=_FOUND_HEADING_DEG,
             height_agl_m=height_m,
             height_sigma_m=_FOUND_HEIGHT_SHARE * height_m,
-            height_correction_m=(frame.height_correction_m or 0.0) + height_m - frame.height_agl_m,
         )
-        return replace(self, frame=found)
+        return replace(self, frame=found, told_height_m=known.height_agl_m)
 
     # --------------------------------------------------------------------------------------------- answers
 

@@ -190,7 +190,7 @@ class Sift(Method):
         if not options.refine or not options.use_attitude or options.matcher is not None:
             return False
         is_known = known.height_agl_m is not None and known.grid_heading_deg is not None and known.has_tilt
-        return is_known and query.site.has_surface and not query.frame.is_doubted
+        return is_known and query.site.has_surface
 
     def _refined(self, query: Query, fix: Fix) -> Fix:
         """The fix with its pose refined, if that is possible and affordable."""

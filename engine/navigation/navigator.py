@@ -35,7 +35,7 @@ from engine.navigation.odds import (
 from engine.navigation.odometry import VisualOdometry, odometry_of
 from engine.navigation.repeats import Repeats
 from engine.navigation.state import NavigatorState
-from engine.navigation.telemetry_errors import Calibration, TelemetryErrors
+from engine.navigation.telemetry_errors import Calibration, TelemetryErrors, considered
 from engine.navigation.velocity_check import VelocityCheck
 from engine.options import MatcherOptions, NavigatorOptions
 from engine.orthomap import OrthoMap
@@ -178,6 +178,8 @@ class Navigator:
         shown = self._errors.corrected(frame, now.time_s, late=late, refusals=self._refusals)
         left = budget and budget.after(clock.elapsed_ms if self._pictures else 0.0)
         result = self._matcher.locate(self._with_height(shown), sources.prior, left)
+        if isinstance(result, Fix):
+            result = considered(result, frame, shown, getattr(self._matcher, "camera", None))
         if self._anchor is not None and self._anchor.sample is None:
             self._anchor = replace(self._anchor, sample=now)
         self._odometry.append(frame, now)

@@ -13,9 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.camera import Camera
 from engine.geo import wrap_heading_deg
+from engine.matching.covariance import scale_doubt_m
 from engine.options import AssumedErrors, NavigatorOptions
-from engine.values import Fix, Frame
+from engine.values import Attitude, Fix, Frame
 
 Array = NDArray[np.float64]
 
@@ -33,7 +35,7 @@ _MAX_LAG_DEG = 180.0  # timestamps in a wrong unit make rates of any size
 _MIN_FIXES = 3  # fewer are not used for correction: one of them may be wrong
 _MIN_SIGMAS, _MIN_SHARE = 2.0, 0.03  # of an error before it is corrected: every frame's matching allows for less
 _FIRST_SEARCH, _SEARCH_GROWTH = 3, 1.5  # refusals in a row before a search; growth until the next
-_SEARCHED_HEADING_DEG = 12.0  # standard deviation of a searched heading
+_DOUBTED_HEADING_DEG, _DOUBTED_SHARE = 8.0, 0.07  # standard deviations of a heading and a height to search for
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +144,14 @@ class TelemetryErrors:
             self._settling = 0
         else:
             self._next_search = _FIRST_SEARCH
-        return replace(shown, is_doubted=True) if self._settling else shown
+        return self._doubted(shown) if self._settling else shown
+
+    def _doubted(self, frame: Frame) -> Frame:
+        """The frame with standard deviations of heading and height so wide that both are searched."""
+        assert frame.height_agl_m is not None
+        height_m = max(frame.height_sigma_m or 0.0, _DOUBTED_SHARE * frame.height_agl_m)
+        heading_deg = max(frame.heading_sigma_deg or 0.0, _DOUBTED_HEADING_DEG)
+        return replace(frame, heading_sigma_deg=heading_deg, height_sigma_m=height_m)
 
     def without_errors(self, frame: Frame, rates_dps: Array | None = None) -> Frame:
         """A frame without the errors known so far; what is not known of them widens its standard deviations.
@@ -189,8 +198,7 @@ class TelemetryErrors:
         is_known = self._heights >= _MIN_FIXES and abs(share) > max(_MIN_SHARE, _MAX_SIGMAS * sigma)
         if frame.height_agl_m is None or not is_known or share <= -1.0:
             return frame
-        off_m = share * frame.height_agl_m
-        return replace(frame, height_agl_m=frame.height_agl_m + off_m, height_correction_m=off_m)
+        return replace(frame, height_agl_m=(1.0 + share) * frame.height_agl_m)
 
     def note(self, fix: Fix, ground_m: float | None) -> None:
         """Learn from an accepted fix of the newest frame.
@@ -204,7 +212,7 @@ class TelemetryErrors:
         if self._searched:  # earlier estimates were wrong
             self._searched = False
             self.forget()
-            self._covariance[2, 2] = max(self._covariance[2, 2], _SEARCHED_HEADING_DEG**2)
+            self._covariance[2, 2] = max(self._covariance[2, 2], _DOUBTED_HEADING_DEG**2)
         seen, known = fix.attitude, self._angles_deg
         if fix.up_m is None:
             return
@@ -262,6 +270,27 @@ class TelemetryErrors:
         left = np.eye(5) - gain @ design
         self._covariance = left @ self._covariance @ left.T + (gain * noise) @ gain.T
         return np.asarray(off**2 - np.diag(total))
+
+
+def considered(fix: Fix, frame: Frame, shown: Frame, camera: Camera | None) -> Fix:
+    """The fix, less certain if the height was corrected: the focal length may be what is wrong.
+
+    Args:
+        fix: of the frame.
+        frame: as it came.
+        shown: as it was matched.
+        camera: None takes it to look down.
+    """
+    if frame.height_agl_m is None or shown.height_agl_m in (None, frame.height_agl_m):
+        return fix
+    assert shown.height_agl_m is not None
+    told = Attitude(shown.roll_deg or 0.0, shown.pitch_deg or 0.0, shown.heading_deg or 0.0)
+    down, told_down = (
+        np.array([0.0, 0.0, -1.0]) if camera is None else camera.enu_from_camera(attitude)[:, 2]
+        for attitude in (fix.attitude or told, told)
+    )
+    doubt_m = scale_doubt_m(shown.height_agl_m - frame.height_agl_m, shown.height_agl_m, down, told_down)
+    return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0]))
 
 
 def _angles_of(frame: Frame) -> Array | None:

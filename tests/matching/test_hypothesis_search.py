@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
-from engine.matching import hypothesis_search, peak_evidence
+from engine.matching import hypothesis_search
 from engine.options import NccOptions
+from engine.window import SPREAD_SIGMAS
 from scenematch.simulator import FlightStyle, SensorNoise, plan_flight
 from tests.support.towns import drawn_town, site_of
 
@@ -17,6 +19,8 @@ EXACT = SensorNoise(
     velocity_sd_mps=0.0,
 )  # fmt: skip
 PLACES = (0, 5, 9, 13)
+REACH = {"heading_sigma_deg": 5.0 / SPREAD_SIGMAS, "height_sigma_m": 0.05 * 120.0 / SPREAD_SIGMAS}
+ANY_HEADING = {"heading_deg": 123.0, "heading_sigma_deg": 180.0}
 # (degrees, share) by which the telemetry is off; 5 and 0.05 are searched
 OFF = [
     (5.0, 0.05), pytest.param(0.0, 0.0, marks=pytest.mark.slow), pytest.param(3.3, -0.05, marks=pytest.mark.slow),
@@ -54,49 +58,35 @@ def near(truth, sigma_m=8.0):
 
 def stated(frame, turn_deg=0.0, share=0.0):
     heading = (frame.heading_deg + turn_deg) % 360.0
-    return replace(frame, heading_deg=heading, height_agl_m=frame.height_agl_m * (1.0 + share))
+    return replace(frame, heading_deg=heading, height_agl_m=frame.height_agl_m * (1.0 + share), **REACH)
 
 
 def turn_between(a_deg, b_deg):
     return abs((a_deg - b_deg + 180.0) % 360.0 - 180.0)
 
 
-@pytest.fixture
-def aligned_heights(monkeypatch):
-    """The heights of the hypotheses behind the fixes; a fix does not have them."""
-    heights, real = [], peak_evidence.fix_of
-
-    def noting(correlator, aligned, *rest, **named):
-        heights.append(aligned.pose.height_agl_m)
-        return real(correlator, aligned, *rest, **named)
-
-    monkeypatch.setattr(peak_evidence, "fix_of", noting)
-    return heights
-
-
 @pytest.mark.slow
 @KNOWN
 @pytest.mark.parametrize(("turn_deg", "share"), OFF)
-def test_a_wrong_heading_and_height_are_put_right(
-    matcher, site, flight, error_m, aligned_heights, turn_deg, share, known
-):
-    bank = matcher(heading_search_deg=5.0, height_search_share=0.05)
+def test_a_wrong_heading_and_height_are_put_right(matcher, site, flight, error_m, turn_deg, share, known):
+    bank = matcher()
     for k in PLACES:
         frame, truth = flight.frames[k], flight.truth[k]
         fix = bank.locate(stated(frame, turn_deg, share), near(truth) if known else None)
         assert error_m(site, fix, truth) < 2.0
         assert turn_between(fix.attitude.heading_deg, truth.heading_deg) < 0.3
-        assert aligned_heights[-1] == pytest.approx(truth.height_agl_m, rel=0.005)
+        height_m = fix.up_m - site.ground_at(np.array(fix.map_xy_px))
+        assert height_m == pytest.approx(truth.height_agl_m, rel=0.005)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
 def test_a_frame_without_a_heading_is_found_all_around_or_refused(matcher, site, flight, error_m, known):
-    bank = matcher(heading_search_deg=180.0)
+    bank = matcher()
     fixes = 0
     for k in PLACES:
         truth = flight.truth[k]
-        result = bank.locate(replace(flight.frames[k], heading_deg=None), near(truth) if known else None)
+        result = bank.locate(replace(flight.frames[k], **ANY_HEADING), near(truth) if known else None)
         if isinstance(result, Fix):
             fixes += 1
             assert error_m(site, result, truth) < 2.0
@@ -119,27 +109,27 @@ def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matche
 @pytest.mark.slow
 @KNOWN
 def test_a_frame_of_another_town_is_refused(matcher, other_site, flight, known):
-    bank = matcher(other_site, heading_search_deg=5.0, height_search_share=0.05)
+    bank = matcher(other_site)
     prior = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0) if known else None
     for k in PLACES:
-        assert isinstance(bank.locate(flight.frames[k], prior), NoFix)
+        assert isinstance(bank.locate(replace(flight.frames[k], **REACH), prior), NoFix)
 
 
 @pytest.mark.slow
 @KNOWN
 def test_a_frame_of_another_town_is_refused_all_around(matcher, other_site, flight, known):
-    bank = matcher(other_site, heading_search_deg=180.0)
+    bank = matcher(other_site)
     prior = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0) if known else None
     for k in PLACES:
-        assert isinstance(bank.locate(replace(flight.frames[k], heading_deg=None), prior), NoFix)
+        assert isinstance(bank.locate(replace(flight.frames[k], **ANY_HEADING), prior), NoFix)
 
 
 @pytest.mark.slow
 def test_a_frame_of_another_town_scores_far_below_one_of_this(matcher, other_site, flight):
     """What tells them apart where every heading is tried: 0.3 and less against 0.7 and more."""
-    here, there = matcher(heading_search_deg=180.0), matcher(other_site, heading_search_deg=180.0)
+    here, there = matcher(), matcher(other_site)
     for k in PLACES:
-        frame = replace(flight.frames[k], heading_deg=None)
+        frame = replace(flight.frames[k], **ANY_HEADING)
         assert here.locate(frame).score > 0.7
         assert there.locate(frame).score < 0.3
 
@@ -160,11 +150,11 @@ def looked_on(monkeypatch):
 def test_a_place_beyond_doubt_at_a_quick_look_is_that_of_the_thorough_one(
     matcher, site, flight, looked_on, monkeypatch
 ):
-    unknown = replace(flight.frames[5], heading_deg=None)
-    quick = matcher(heading_search_deg=180.0).locate(unknown)
+    unknown = replace(flight.frames[5], **ANY_HEADING)
+    quick = matcher().locate(unknown)
     levels = list(looked_on)
     monkeypatch.setattr(hypothesis_search, "_MIN_QUICK_SCORE", 2.0)  # nothing is beyond doubt
-    thorough = matcher(heading_search_deg=180.0).locate(unknown)
+    thorough = matcher().locate(unknown)
     assert len(levels) == 1
     assert looked_on == [*levels, *levels, levels[0] - 1]
     assert abs(quick.east_m - thorough.east_m) < 0.1
@@ -173,7 +163,7 @@ def test_a_place_beyond_doubt_at_a_quick_look_is_that_of_the_thorough_one(
 
 
 def test_a_place_in_doubt_at_a_quick_look_is_looked_for_thoroughly(matcher, other_site, flight, looked_on):
-    result = matcher(other_site, heading_search_deg=20.0).locate(flight.frames[5])
+    result = matcher(other_site).locate(replace(flight.frames[5], heading_sigma_deg=20.0 / SPREAD_SIGMAS))
     assert isinstance(result, NoFix)
     assert len(looked_on) == 2
     assert looked_on[0] == looked_on[1] + 1

@@ -135,8 +135,8 @@ def test_few_features_are_better_than_none_where_time_is_short(ground, site, cam
 
 @pytest.mark.parametrize(
     "known",
-    [{"roll_deg": None, "pitch_deg": None}, {"heading_deg": None}, {"height_agl_m": None}, {"is_doubted": True}],
-    ids=["no tilt", "no heading", "no height", "doubted"],
+    [{"roll_deg": None, "pitch_deg": None}, {"heading_deg": None}, {"height_agl_m": None}],
+    ids=["no tilt", "no heading", "no height"],
 )
 def test_without_a_telemetry_to_hold_to_the_features_do_it_alone(ground, camera, matcher, known):
     fix = matcher.locate(replace(shot(ground, camera), **known), ground.prior(NADIR))

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine import Navigator, Prior, SceneMatcher
+from engine import Camera, Navigator, Prior, SceneMatcher
 from engine.errors import OptionError
-from engine.navigation.telemetry_errors import TelemetryErrors
+from engine.navigation.telemetry_errors import TelemetryErrors, considered
 from engine.options import ACCEPT_ALL, AssumedErrors, NavigatorOptions
 from engine.values import Attitude, Fix, Frame, NoFix, Reason
 from scenematch.simulator import plan_flight
@@ -25,6 +25,7 @@ from tests.support.towns import drawn_town
 IMAGE = np.zeros((4, 4), np.uint8)
 GROUND_M, HEIGHT_M, INTERVAL_S = 30.0, 150.0, 0.1
 ASSUMED = AssumedErrors()
+CAMERA = Camera.from_fov(4, 4, 60.0)
 ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 
 
@@ -78,10 +79,29 @@ def test_what_is_off_is_learnt_within_its_sigma_and_taken_off(off, lag_s, off_m,
     assert abs(found.height_m + off_m) < 4.0 * found.height_sigma_m
     assert found.height_factor == pytest.approx(HEIGHT_M / (HEIGHT_M + off_m), abs=0.01)
     last = frames[-1]
-    assert np.abs(errors_of(last, angles(99 * INTERVAL_S))).max() < 2.0
+    left_deg = 2.0 + 4.0 * max(found.attitude.sigma_deg)  # an estimate within two of the heading's sigmas is left
+    assert np.abs(errors_of(last, angles(99 * INTERVAL_S))).max() < left_deg
     if abs(off_m) > 6.0:
         assert last.height_agl_m == pytest.approx(HEIGHT_M, abs=1.5)
-        assert last.height_agl_m - last.height_correction_m == pytest.approx(HEIGHT_M + off_m)
+
+
+def test_a_corrected_height_makes_a_fix_less_certain_the_more_the_camera_looks_aside():
+    fix, frame = fix_of((0.0, 0.0, 0.0)), Frame(IMAGE, None, 100.0, 0.0, 0.0, 0.0)
+    shown = replace(frame, height_agl_m=110.0)
+    assert considered(fix, frame, frame, None) is fix
+    level, aside = (
+        considered(
+            replace(fix, attitude=Attitude(0.0, pitch_deg, 0.0)),
+            frame,
+            replace(shown, pitch_deg=pitch_deg),
+            CAMERA,
+        )
+        for pitch_deg in (0.0, 45.0)
+    )
+    grown_m = [math.sqrt(one.covariance_m2[0, 0] - fix.covariance_m2[0, 0]) for one in (level, aside)]
+    assert grown_m == pytest.approx(
+        [10.0 * math.tan(math.radians(2.0)), 10.0 * (1.0 + math.tan(math.radians(2.0)))]
+    )
 
 
 def test_what_is_assumed_of_any_telemetry_is_not_corrected():
@@ -89,7 +109,7 @@ def test_what_is_assumed_of_any_telemetry_is_not_corrected():
     assert errors.calibration.attitude.roll_deg == pytest.approx(-0.4, abs=0.1)
     left = np.array([errors_of(frame, angles(k * INTERVAL_S)) for k, frame in enumerate(frames)])[50:]
     assert np.median(left, axis=0) == pytest.approx([0.4, -0.4, 1.5], abs=0.1)
-    assert (frames[-1].height_agl_m, frames[-1].height_correction_m) == (HEIGHT_M + 3.0, None)
+    assert frames[-1].height_agl_m == HEIGHT_M + 3.0
 
 
 def test_an_unknown_lag_widens_the_attitude_of_a_vehicle_that_turns():
@@ -219,12 +239,17 @@ def test_a_lag_that_is_none_is_named():
         NavigatorOptions(attitude_lag_s=-1.0)
 
 
+def is_doubted(frame):
+    """Whether its heading and height are to be searched far around."""
+    return (frame.heading_sigma_deg or 0.0) >= 8.0 and (frame.height_sigma_m or 0.0) >= 0.07 * HEIGHT_M
+
+
 def refused(frames, frame=None):
     """In which of so many frames that are all refused heading and height are doubted."""
     errors = TelemetryErrors(NavigatorOptions())
     frame = frame or Frame(IMAGE, None, HEIGHT_M, 40.0, 0.0, 0.0)
     shown = [errors.corrected(frame, 0.2 * k, late=False, refusals=k) for k in range(frames)]
-    return errors, [k for k, one in enumerate(shown) if one.is_doubted]
+    return errors, [k for k, one in enumerate(shown) if is_doubted(one)]
 
 
 def test_refused_frames_are_doubted_ever_more_rarely():
@@ -242,7 +267,7 @@ def test_after_a_fix_frames_are_doubted_until_three_fixes_settled_what_is_off():
     for k in range(6):
         errors.note(fix_of((0.0, 0.0, 30.0)), GROUND_M)
         shown = errors.corrected(Frame(IMAGE, None, HEIGHT_M, 40.0, 0.0, 0.0), 1.0 + 0.2 * k, late=False)
-        doubted.append(shown.is_doubted)
+        doubted.append(is_doubted(shown))
     assert doubted == [True, True, False, False, False, False]
     assert math.remainder(shown.heading_deg - 30.0, 360.0) == pytest.approx(0.0, abs=0.6)
 

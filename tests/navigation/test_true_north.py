@@ -73,10 +73,8 @@ def test_the_planes_heading_in_its_place_is_off(make, polar, frame):
 @pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
 def test_a_heading_that_was_searched_for_is_the_true_one(make, polar, frame, known):
     """Without a prior the search begins with north as in the map's middle."""
-    matcher = make("ncc", ncc=NccOptions(heading_search_deg=4.0))
-    fix = matcher.locate(
-        replace(frame, heading_deg=frame.heading_deg + 2.0), polar.prior(NADIR) if known else None
-    )
+    turned = replace(frame, heading_deg=frame.heading_deg + 9.0, heading_sigma_deg=4.0)
+    fix = make("ncc").locate(turned, polar.prior(NADIR) if known else None)
     assert isinstance(fix, Fix)
     assert heading_off(fix, frame.heading_deg) < 0.2
 
