@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from engine.errors import MapError
 from engine.maps.grids import Grid, apply_affine, overlap
 from engine.maps.rasters import MEMORY_LIMIT_PX, Source, map_errors
-from engine.maps.xyz_tiles import TileCache
 from engine.values import Window
 
 SURFACE_LIMIT_PX = MEMORY_LIMIT_PX // 4
@@ -47,8 +46,6 @@ def surface_part(source: Source, grid: Grid) -> Window:
     """
     dtypes = source.dataset.dtypes
     dtype = dtypes[0]
-    if isinstance(source.dataset, TileCache):
-        raise MapError(f"surface: expected heights, got a folder of pictures, {source.path}")
     if np.dtype(dtype).kind not in "iuf":
         raise MapError(f"surface: expected heights as real numbers, got {dtype} in {source.path}")
     if len(dtypes) >= 3 and set(dtypes) == {"uint8"}:  # the map given twice: its red would become relief

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from engine.errors import MapError
+from engine.maps import xyz_tiles
 from engine.maps.grids import Grid, Warp, apply_affine, wgs84
 from engine.maps.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_errors, open_source, stored_levels
-from engine.maps.xyz_tiles import TileCache
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
 
@@ -169,8 +169,8 @@ def open_metric_copy(
 def _key(source: Source, cache: Path) -> str:
     digest = hashlib.sha256(f"{GRID_VERSION} {source.grid.crs.to_wkt()}".encode())
     digest.update(source.grid.pixel_to_crs.tobytes())
-    if isinstance(source.dataset, TileCache):  # reading all files only for the key would take too long
-        digest.update(source.dataset.fingerprint())
+    if source.dataset.driver == xyz_tiles.DRIVER:  # reading all files only for the key would take too long
+        digest.update(xyz_tiles.fingerprint(source.path))
         return digest.hexdigest()
     if source.dataset.driver == "VRT":
         digest.update(source.dataset.name.encode())  # its XML: the positions of the tiles

@@ -16,6 +16,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from engine.errors import MapError
+from engine.maps import xyz_tiles
 
 SIGNATURES = (
     ("GTiff", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
@@ -95,11 +96,13 @@ def driver_of(file: Path, argument: str) -> str:
 
 
 def openable(path: Path, argument: str) -> tuple[str | Path, str]:
-    """What to give GDAL for a file or folder, the file itself or the text of a VRT; and the driver.
+    """What to give GDAL for a file or folder, the file itself or a description of the folder; and the driver.
 
     Raises:
         MapError: it is not a raster, or its tiles do not fit together.
     """
+    if path.is_dir() and xyz_tiles.is_tile_cache(path):
+        return xyz_tiles.description_of(path, argument), xyz_tiles.DRIVER
     if path.is_dir():
         return vrt_of_folder(path, argument), "VRT"
     driver = driver_of(path, argument)

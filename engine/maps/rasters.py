@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from engine.errors import MapError, OptionError
 from engine.maps.grids import Array, Grid, earth_crs, wgs84
 from engine.maps.raster_formats import local_path, openable
-from engine.maps.xyz_tiles import is_tile_cache, open_tile_cache
 from engine.values import MAX_SIGMA_M, Window
 
 if TYPE_CHECKING:
@@ -132,9 +131,12 @@ def open_source(
     Raises:
         MapError: the file is missing, is not a supported raster, or cannot be placed on the Earth.
     """
+    import rasterio
+
     file = local_path(path, argument)
     with map_errors(argument, file):
-        dataset = _open_dataset(file, argument)
+        what, driver = openable(file, argument)
+        dataset = rasterio.open(what, driver=driver)
         transform, own_crs = dataset.transform, dataset.crs
     size = dataset.width, dataset.height
     own = None if transform.is_identity else _centred(transform)
@@ -169,16 +171,6 @@ def vertical_datum(dataset: Any) -> str | None:
         return None
     axis = vertical.axis_info[0]
     return str(vertical.name) if axis.direction == "up" and axis.unit_conversion_factor == 1.0 else None
-
-
-def _open_dataset(file: Path, argument: str) -> Any:
-    """The rasterio dataset of a file or folder, or a tile cache."""
-    import rasterio
-
-    if file.is_dir() and is_tile_cache(file):
-        return open_tile_cache(file, argument)
-    what, driver = openable(file, argument)
-    return rasterio.open(what, driver=driver)
 
 
 def _checked(grid: Grid, argument: str, file: Path) -> Grid:

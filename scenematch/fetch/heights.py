@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
+from engine.maps import xyz_tiles
 from engine.maps.rasters import open_source, vertical_datum
-from engine.maps.xyz_tiles import TileCache
 from scenematch.fetch.grid import reason_of
 from scenematch.fetch.place import Bounds
 from scenematch.fetch.urls import PLACEHOLDER, check_url, shown, user_agent
@@ -133,7 +133,7 @@ def _opened(file: str) -> Any:
         if not Path(file).exists():
             return None
         dataset = open_source(file, "surface").dataset
-        if isinstance(dataset, TileCache):
+        if dataset.driver == xyz_tiles.DRIVER:
             raise MapError(f"surface: expected heights, got a folder of pictures, {file}")
         return dataset
     try:

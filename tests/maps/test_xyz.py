@@ -111,7 +111,7 @@ def test_a_tile_cache_is_the_picture_that_it_was_cut_from_and_a_gap_is_nodata(tm
         known = there()[part]
         np.testing.assert_array_equal(cached.valid(window), known)
         np.testing.assert_array_equal(cached.gray(window)[known], whole.gray(window)[known])
-    assert cached.info()["driver"] == ("TMS" if south_up else "XYZ")
+    assert cached.info()["driver"] == "WMS"
     assert cached.crs.to_epsg() == 3857
 
 
@@ -164,8 +164,7 @@ def test_what_a_tile_is_its_content_says(tmp_path, picture, plain):
         assert np.abs(apart[:, column * TILE : (column + 1) * TILE]).mean() < most
 
 
-def test_endings_may_differ_and_what_is_no_tile_is_passed_over(own):
-    tile_path(own, 2, 2).rename(tile_path(own, 2, 2).with_suffix(".jpg"))
+def test_what_is_no_tile_is_passed_over(own):
     before = OrthoMap.open(own)
     (own / "preview.png").write_bytes(tile_path(own).read_bytes())
     (own / "leaflet.html").write_text("a viewer")
@@ -188,47 +187,38 @@ def test_an_empty_file_is_a_gap(own):
 # ------------------------------------------------------------------------------------- many tiles, and levels
 
 
-def test_opening_reads_one_tile_and_a_large_map_only_its_coarse_ones(
-    cache, tmp_path, picture, tiny_limits, monkeypatch
-):
-    folder = shutil.copytree(cache, tmp_path / "tiles")
+@pytest.mark.parametrize(("south_up", "gaps", "levels"), [(False, (), 3), (False, GAPS, 1), (True, (), 1)])
+def test_complete_coarser_levels_are_overviews(tmp_path, picture, tiny_limits, south_up, gaps, levels):
+    """Counted from the south they are not, and a large map is copied."""
+    folder = cut(tmp_path / "tiles", picture, gaps=gaps, south_up=south_up)
+    if south_up:
+        (folder / "tilemapresource.xml").write_text(TMS.format(srs="EPSG:3857", profile="mercator"))
     for zoom in (17, 16):
-        cut(folder, cv2.resize(picture, None, fx=2.0 ** (zoom - ZOOM), fy=2.0 ** (zoom - ZOOM)), zoom)
-    opened = []
-    plainly = Image.open
-    monkeypatch.setattr(Image, "open", lambda path, **kw: opened.append(path.parts[-3:]) or plainly(path, **kw))
-    source = open_source(folder)
-    assert len(opened) == 1
-    assert stored_levels(source) == (0, 1, 2)
-    monkeypatch.setattr("engine.maps.rasters.OVERVIEW_PX", 80)
-    site = OrthoMap.open(folder)
-    assert site.is_large
-    assert {place[0] for place in opened[2:]} == {"16"}
-    assert site.valid(Window(0, 0, TILE, TILE)).all()
-    assert opened[-1] == ("18", str(FIRST[0]), f"{FIRST[1]}.png")
+        coarse = cv2.resize(picture, None, fx=2.0 ** (zoom - ZOOM), fy=2.0 ** (zoom - ZOOM))
+        cut(folder, coarse, zoom, south_up=south_up)
+    assert stored_levels(open_source(folder)) == tuple(range(levels))
 
 
 @pytest.mark.parametrize("level", [1, 2])
-def test_a_coarser_zoom_level_is_an_overview_at_the_same_place(own, picture, tiny_limits, level):
-    coarse = np.full_like(picture, 0)[:: 1 << level, :: 1 << level]
-    coarse[...] = np.add.outer(np.arange(coarse.shape[0]) % 7 * 10, np.arange(coarse.shape[1]))[..., None]
-    cut(own, coarse, ZOOM - level)
-    site = OrthoMap.open(own)
+def test_a_coarser_zoom_level_is_an_overview_at_the_same_place(tmp_path, picture, tiny_limits, level):
+    folder = cut(tmp_path / "tiles", picture, gaps=())
+    smaller = [np.zeros_like(picture)[:: 1 << k, :: 1 << k] for k in (1, 2)]
+    for k, coarse in enumerate(smaller, 1):
+        coarse[...] = np.add.outer(np.arange(coarse.shape[0]) % 7 * 10, np.arange(coarse.shape[1]) + k)[..., None]
+        cut(folder, coarse, ZOOM - k)
+    site = OrthoMap.open(folder)
     rows, columns = site.level_shape(level)
-    everything = Window(0, 0, columns, rows)
-    known = there()[:: 1 << level, :: 1 << level]
-    np.testing.assert_array_equal(site.valid(everything, level), known)
-    np.testing.assert_array_equal(site.gray(everything, level)[known], coarse[..., 0][known])
+    lat, lon = OrthoMap.open(cut(tmp_path / "same", picture, gaps=())).geodetic_from_pixel([-0.5, -0.5])
+    x, y = (int(v) for v in np.round((site.pixel_from_geodetic(lat, lon) + 0.5) / (1 << level)))
+    np.testing.assert_array_equal(
+        site.gray(Window(0, 0, columns, rows), level)[y:, x:], smaller[level - 1][..., 0]
+    )
 
 
-def test_a_coarser_level_with_gaps_of_its_own_is_none(own, picture, tmp_path, tiny_limits):
-    cut(own, np.full_like(picture, 9)[::2, ::2], 17)
-    tile_path(own, 1, 1, 17).unlink()
-    assert stored_levels(open_source(own)) == (0,)
-    site = OrthoMap.open(own, cache_dir=tmp_path / "copies")
-    rows, columns = site.level_shape(1)
-    both = Window(0, 0, columns, rows)
-    assert (site.gray(both, 1)[site.valid(both, 1)] != 9).mean() > 0.9
+def test_a_coarser_level_with_gaps_of_its_own_is_none(tmp_path, picture, tiny_limits):
+    folder = cut(cut(tmp_path / "tiles", picture, gaps=()), np.full_like(picture, 9)[::2, ::2], 17)
+    tile_path(folder, 1, 1, 17).unlink()
+    assert stored_levels(open_source(folder)) == (0,)
 
 
 def test_a_large_cache_without_coarser_levels_is_copied_once_and_again_when_a_tile_changes(
@@ -258,30 +248,33 @@ def test_a_large_cache_without_coarser_levels_is_copied_once_and_again_when_a_ti
 
 def spoil_size(folder):
     Image.new("RGB", (TILE * 2, TILE * 2)).save(tile_path(folder, 2, 2))
-    return (
-        r"expected tiles of 64 x 64 px and 8 bits, as the first one, got 128 x 128 px of mode RGB in .*90502\.png"
-    )
+    return r"cannot read .*90502\.png"
 
 
 def spoil_depth(folder):
-    Image.fromarray(np.zeros((TILE, TILE), np.uint16)).save(tile_path(folder, 2, 2))
-    return r"expected tiles of 64 x 64 px and 8 bits, .* of mode I;16 in"
+    Image.fromarray(np.zeros((TILE, TILE), np.uint16)).save(tile_path(folder))
+    return r"expected square tiles of 8 bits, got 64 x 64 px of mode I;16 in .*90500\.png"
 
 
 def spoil_end(folder):
     path = tile_path(folder, 2, 2)
     path.write_bytes(path.read_bytes()[:-300])
-    return r"cannot read the tile .*90502\.png: "
+    return r"cannot read .*90502\.png"
 
 
 def spoil_content(folder):
     tile_path(folder, 2, 2).write_text("<html>403 Forbidden</html>")
-    return r"cannot read the tile .*90502\.png: cannot identify image file"
+    return r"cannot read .*90502\.png"
 
 
 def spoil_first(folder):
     Image.new("RGB", (TILE, TILE // 2)).save(tile_path(folder))
-    return r"expected square tiles, got 64 x 32 px in .*90500\.png"
+    return r"expected square tiles of 8 bits, got 64 x 32 px of mode RGB in .*90500\.png"
+
+
+def spoil_ending(folder):
+    tile_path(folder, 2, 2).rename(tile_path(folder, 2, 2).with_suffix(".jpg"))
+    return "expected tiles of one ending, got jpg and png in "
 
 
 def spoil_all(folder):
@@ -316,7 +309,7 @@ def spoil_description(folder):
     "spoil",
     [
         *(spoil_size, spoil_depth, spoil_end, spoil_content, spoil_first, spoil_all),
-        *(spoil_order, spoil_extent, spoil_projection, spoil_description),
+        *(spoil_ending, spoil_order, spoil_extent, spoil_projection, spoil_description),
     ],
     ids=lambda spoil: spoil.__name__,
 )
@@ -328,7 +321,7 @@ def test_what_is_no_tile_of_the_map_is_refused_by_name(own, spoil):
 
 
 def test_pictures_are_no_surface(plain, cache):
-    with pytest.raises(MapError, match="surface: expected heights, got a folder of pictures"):
+    with pytest.raises(MapError, match="surface: expected one band of heights, got a picture of 4 bands"):
         OrthoMap.open(plain, surface=cache)
 
 
