@@ -200,7 +200,7 @@ class Correlator:
                 return self._of_every_place(region, template, exclusion_px)
         work_px = float(math.prod(search.image.shape))
         if not scheduler.can_afford({_EVERY_PLACE: work_px}):
-            scheduler.costs.note_refusal(_EVERY_PLACE)
+            scheduler.note_refusal(_EVERY_PLACE)
             raise OutOfTime
         with scheduler.costed(_EVERY_PLACE, work_px), scheduler.stage("match"):
             return self._of_every_place(region, template, exclusion_px)

@@ -136,7 +136,7 @@ class Ncc(Method):
             return None
         if not scheduler.can_afford({(step, coarser): works[coarser], _AT_ONCE: float(query.gray.size)}):
             if scheduler.can_afford({(step, coarser): works[coarser]}):
-                scheduler.costs.note_refusal(_AT_ONCE)
+                scheduler.note_refusal(_AT_ONCE)
             return None
         _, result = self._find_and_judge(query, step, works, coarser)
         return None if isinstance(result, NoFix) else replace(result, stage="coarse")
@@ -180,7 +180,7 @@ class Ncc(Method):
         """
         work_px = max(self._step(query)[1].values())
         if not query.scheduler.can_afford({_HYPOTHESES: work_px}):
-            query.scheduler.costs.note_refusal(_HYPOTHESES)
+            query.scheduler.note_refusal(_HYPOTHESES)
             return None
         with query.scheduler.costed(_HYPOTHESES, work_px):
             found = self.find(query, widely=True)

@@ -292,7 +292,7 @@ class Query:
 
     def refuse_late(self, method: str, step: Hashable) -> NoFix:
         """The refusal of a frame with no time for a step's quickest variant, see :class:`Scheduler`."""
-        self.scheduler.costs.note_refusal(step)
+        self.scheduler.note_refusal(step)
         left_ms = self.scheduler.deadline.remaining_ms
         detail = f"{left_ms:.1f} ms are left; {method}'s quickest variant takes longer"
         return self.refuse(Reason.LATE, detail, method)

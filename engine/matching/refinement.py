@@ -66,7 +66,7 @@ def improved(query: Query, fix: Fix, step: str, improve: Callable[[Fix], _T]) ->
     scheduler, work_px = query.scheduler, float(query.gray.size)
     with scheduler.with_fix():
         if not scheduler.can_afford({step: work_px}):
-            scheduler.costs.note_refusal(step)
+            scheduler.note_refusal(step)
             return fix
         with suppress(OutOfTime), scheduler.costed(step, work_px):
             return improve(fix)

@@ -155,7 +155,7 @@ class Sift(Method):
         is_only = scheduler.has_fix or scheduler.first_affordable("sift", works) is None
         if is_only and scheduler.can_afford({_FEW: works[1.0]}):
             return True
-        scheduler.costs.note_refusal(_FEW)
+        scheduler.note_refusal(_FEW)
         return False
 
     def _by_all_after(self, query: Query, few: Fix) -> Result:

@@ -11,21 +11,16 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from statistics import median_low
-from typing import TypeVar
+from typing import Any
 
 from engine.budget import Deadline
 from engine.runtime import threads
 from engine.runtime.device import Device, synchronise
 from engine.runtime.loops import loops_compiled
 
-_T = TypeVar("_T")
-RUNS, STAGES = 15, 48  # of a step, and of all stages (some six frames), that count
-DEVIATIONS = 5.0  # median absolute deviations above the median
-SEVERAL = 10.0  # medians of its runs: upper bound on a step's cost
-FADE, FORGOTTEN = (
-    0.99,
-    4,
-)  # per refusal: share of the cost that is left, and stages, so that a step is tried again
+RUNS, STAGES, WAITS = 15, 48, 240  # of a step, of all stages (some six frames), and of their waits, that count
+DEVIATIONS, SEVERAL = 5.0, 10.0  # median absolute deviations above the median; medians, the upper bound on a cost
+FADE, FORGOTTEN = 0.99, 4  # per refusal: share of the cost that is left, and stages; so a step is tried again
 MAX_WAIT_MS = 20.0  # longest wait for the processor that a fix is protected from
 
 
@@ -39,20 +34,24 @@ class Costs:
     def __init__(self) -> None:
         self._runs: dict[Hashable, deque[tuple[float, float]]] = {}  # milliseconds on the processor, and taken
         self._refusals: dict[Hashable, int] = {}  # since the last run
-        self.stages_ms: deque[tuple[float, float]] = deque(maxlen=STAGES)  # used and waited, of all steps
+        self._stages_ms: deque[tuple[float, float]] = deque(maxlen=STAGES)  # used and waited, of all steps
+        self._waits_ms: deque[float] = deque(maxlen=WAITS)
 
-    def learn(self, step: Hashable, work: float, used_ms: float, took_ms: float) -> None:
-        """Record a run of a step; it replaces one earlier run for each refusal in between."""
+    def learn(self, step: Hashable, work: float, used_ms: float, took_ms: float, *, stage: bool = False) -> None:
+        """Record a run of a step or stage; it replaces one earlier run for each refusal in between."""
         runs, work = self._runs.setdefault(step, deque(maxlen=RUNS)), max(work, 1.0)
         for _ in range(min(self._refusals.pop(step, 0), len(runs) - 1)):
             runs.popleft()
         runs.append((used_ms / work, took_ms / work))
+        if stage:
+            self._waits_ms.append(max(took_ms - used_ms, 0.0))
+            self._stages_ms.append((used_ms, self._waits_ms[-1]))
 
-    def note_refusal(self, step: Hashable) -> None:
-        """Record that a step was refused for its cost."""
+    def note_refusal(self, step: Hashable, *, is_idle: bool) -> None:
+        """Record that a step was refused for its cost; in a frame that ran none, the load may be over."""
         self._refusals[step] = self._refusals.get(step, 0) + 1
-        for _ in range(min(FORGOTTEN, len(self.stages_ms))):
-            self.stages_ms.popleft()
+        for _ in range(min(FORGOTTEN, len(self._stages_ms)) if is_idle else 0):
+            self._stages_ms.popleft(), self._waits_ms.popleft()
 
     def needed_ms(self, step: Hashable, work: float) -> float:
         """Time that a step needs; 0 with fewer than two runs."""
@@ -66,12 +65,12 @@ class Costs:
 
     def load(self) -> float:
         """Elapsed over processor time of recent stages, without the longest wait; 1 on an idle machine."""
-        stages = tuple(self.stages_ms)
+        stages = tuple(self._stages_ms)
         return 1.0 + sum(sorted(waited for _, waited in stages)[:-1]) / max(sum(used for used, _ in stages), 1e-3)
 
     def wait_ms(self) -> float:
         """How long a step may wait for the processor: the second longest recent wait."""
-        return min(sorted([0.0, 0.0, *(waited for _, waited in tuple(self.stages_ms))])[-2], MAX_WAIT_MS)
+        return min(sorted([0.0, 0.0, *tuple(self._waits_ms)])[-2], MAX_WAIT_MS)
 
 
 class Scheduler:
@@ -81,16 +80,21 @@ class Scheduler:
         self.deadline, self._device, self.costs = deadline, device, costs or Costs()
         self.stages_ms: dict[str, float] = {}
         self._step: tuple[Hashable, float] | None = None  # the running step and its work
-        self.has_fix = self._is_under_way = False
+        self.has_fix = self._is_under_way = self._has_run = False
 
     def can_afford(self, works: Mapping[Hashable, float]) -> bool:
         """Whether time allows successive steps of this work; with a fix, also for one scheduling delay."""
         needed_ms = sum(self.costs.needed_ms(step, work) for step, work in works.items())
         return needed_ms + (self.costs.wait_ms() if self.has_fix else 0.0) <= self.deadline.remaining_ms
 
-    def first_affordable(self, step: str, works: Mapping[_T, float]) -> _T | None:
+    def first_affordable(self, step: str, works: Mapping[Any, float]) -> Any:
         """The first variant of a step, by its work, that time allows; None if there is none."""
         return next((variant for variant, work in works.items() if self.can_afford({(step, variant): work})), None)
+
+    def note_refusal(self, step: Hashable) -> None:
+        """Record that a step was refused for its cost."""
+        self.costs.note_refusal(step, is_idle=not self._has_run)
+        self._has_run = True  # forget once a frame
 
     @contextmanager
     def with_fix(self) -> Iterator[None]:
@@ -104,7 +108,7 @@ class Scheduler:
     @contextmanager
     def costed(self, step: Hashable, work: float) -> Iterator[None]:
         """Learn a step's cost for this work; an abandoned step costs more than the time it had."""
-        outer, self._step, self._is_under_way = self._step, (step, work), False
+        outer, self._step, self._is_under_way, self._has_run = self._step, (step, work), False, True
         learn, had_ms = self._stopwatch(), self.deadline.remaining_ms
         try:
             yield
@@ -121,9 +125,8 @@ class Scheduler:
         key, work = ((self._step[0], name), self._step[1]) if self._step else (None, 0.0)
         if key and not self.deadline.met:
             raise OutOfTime
-        # The step's start already checked whether its first stage is affordable.
         if key and self.has_fix and self._is_under_way and not self.can_afford({key: work}):
-            self.costs.note_refusal(key)
+            self.note_refusal(key)  # of later stages: the step's start checked the first
             raise OutOfTime
         start_ms, learn, self._is_under_way = self.deadline.elapsed_ms, self._stopwatch(), True
         try:
@@ -131,19 +134,17 @@ class Scheduler:
         finally:
             synchronise(self._device)
             self.stages_ms[name] = self.stages_ms.get(name, 0.0) + self.deadline.elapsed_ms - start_ms
-        self.costs.stages_ms.extend(learn(key, work))
+        learn(key, work, stage=True)
 
-    def _stopwatch(self) -> Callable[[Hashable, float], list[tuple[float, float]]]:
-        """A function that measures the time since, unless loops were compiled: milliseconds used and waited."""
+    def _stopwatch(self) -> Callable[..., None]:
+        """A function that learns the time since, unless loops were compiled."""
         start_ms, start_ns, compiled = self.deadline.elapsed_ms, time.thread_time_ns(), loops_compiled()
 
-        def learn(step: Hashable, work: float) -> list[tuple[float, float]]:
+        def learn(step: Hashable, work: float, *, stage: bool = False) -> None:
             took_ms, used_ms = self.deadline.elapsed_ms - start_ms, (time.thread_time_ns() - start_ns) * 1e-6
-            if loops_compiled() != compiled:
-                return []
             if self._device.type != "cpu" or threads.count() > 1:  # other threads worked while this one waited
                 used_ms = took_ms
-            self.costs.learn(step, work, used_ms, took_ms)
-            return [(used_ms, max(took_ms - used_ms, 0.0))]
+            if loops_compiled() == compiled:
+                self.costs.learn(step, work, used_ms, took_ms, stage=stage)
 
         return learn

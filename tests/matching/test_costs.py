@@ -21,8 +21,7 @@ REGULAR = st.floats(0.8, 1.2)
 
 def note(costs, step, took_ms, used_share=1.0):
     """A run of a step, which is one stage."""
-    costs.learn(step, 1.0, used_share * took_ms, took_ms)
-    costs.stages_ms.append((used_share * took_ms, (1.0 - used_share) * took_ms))
+    costs.learn(step, 1.0, used_share * took_ms, took_ms, stage=True)
 
 
 def learned(runs):
@@ -119,15 +118,15 @@ def test_a_wait_that_comes_again_is_left_time_for_beside_a_fix():
 def test_a_refusal_makes_a_step_seem_cheaper_until_it_runs():
     costs = learned([("step", 5.0)] * 9)
     for _ in range(200):
-        costs.note_refusal("step")
+        costs.note_refusal("step", is_idle=False)
     assert costs.needed_ms("step", 1.0) < 2.0
     note(costs, "step", 5.0)  # tried in vain
     assert costs.needed_ms("step", 1.0) == pytest.approx(5.0)
     for _ in range(100):
-        costs.note_refusal("step")
+        costs.note_refusal("step", is_idle=False)
     note(costs, "step", 1.0)  # and has become cheap
     assert costs.needed_ms("step", 1.0) == pytest.approx(1.0)
-    costs.note_refusal("other")
+    costs.note_refusal("other", is_idle=False)
     assert costs.needed_ms("other", 1.0) == 0.0
 
 
@@ -135,9 +134,20 @@ def test_a_busy_machine_on_which_nothing_can_be_begun_is_soon_thought_idle():
     costs = learned([("step", 20.0, 0.1)] * 48)
     assert costs.load() == pytest.approx(10.0, rel=0.05)
     for _ in range(24):
-        costs.note_refusal("step")
+        Scheduler(Deadline(Budget()), Device("cpu"), costs).note_refusal("step")
         note(costs, "grey", 0.3)  # what each frame does
     assert costs.load() < 1.01
+
+
+def test_the_load_is_remembered_while_steps_run_although_others_are_refused(monkeypatch):
+    costs = learned([("step", 20.0, 0.1)] * 48)
+    clock, one = clocked(1e3, costs, monkeypatch)
+    with one.costed("step", 1.0), one.stage("match"):
+        clock["ms"] += 20.0
+    before = costs.load(), costs.wait_ms()
+    for name in ("refinement", "sift", "few"):
+        one.note_refusal(name)
+    assert (costs.load(), costs.wait_ms()) == before
 
 
 def clocked(budget_ms, costs, monkeypatch):

@@ -37,7 +37,7 @@ class FixedCosts:
 
     def __init__(self, **per_unit):
         self.per_unit = {name.replace("_", " "): cost for name, cost in per_unit.items()}
-        self.stages_ms, self.longest_wait_ms = [], 0.0
+        self.longest_wait_ms = 0.0
 
     def needed_ms(self, step, work):
         step = step if isinstance(step, str) else step[0]  # one variant of it
@@ -381,7 +381,7 @@ def test_only_if_one_thread_works_its_waiting_is_told_apart(count, used_ms, monk
     clock_ns, processor_ns = iter([0, 0, 0, 9_000_000]), iter([0, 1_000_000])
     monkeypatch.setattr(scheduler.time, "thread_time_ns", lambda: next(processor_ns))
     learned, costs = [], Costs()
-    monkeypatch.setattr(costs, "learn", lambda *run: learned.append(run))
+    monkeypatch.setattr(costs, "learn", lambda *run, stage: learned.append(run))
     one = Scheduler(Deadline(HURRY, lambda: next(clock_ns)), Device("cpu"), costs)
     with one.costed("step", 5.0):
         pass
