@@ -383,7 +383,7 @@ class NoFix:
         score: of the best match, or None if there was none.
         window: the crop that was searched, or None.
         timings: milliseconds per stage that ran.
-        candidates: a few matches that are not probable enough alone, with their own confidence and covariance.
+        match: what was found but not accepted, with its own confidence and covariance, or None.
     """
 
     reason: Reason
@@ -393,7 +393,7 @@ class NoFix:
     score: float | None = None
     window: Window | None = None
     timings: Timings = field(default_factory=Timings)
-    candidates: tuple[Fix, ...] = ()
+    match: Fix | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -143,35 +143,6 @@ def peak(
     return by_coarse_scores if quick.is_hopeless(replace(best, second_score=second)) else None
 
 
-def best_places(
-    search: Search, template: FloatImage, separation_px: float, count: int, *, min_overlap: float = 0.0
-) -> list[tuple[int, int, float]] | None:
-    """The highest positions of a wide window, out of the highest at reduced resolution.
-
-    Args:
-        search: (H, W) arrays.
-        template: (h, w) float32.
-        separation_px: positions are more than this apart in x or in y.
-        count: upper bound on their number.
-        min_overlap: see :func:`peak`.
-
-    Returns:
-        (x, y, score) in falling order of the score; None if there is no coarser level.
-    """
-    levels = _levels(search, template, min_overlap, _MAX_LOSS)
-    if levels is None:
-        return None
-    scores = _coarse_scores(levels)
-    candidates = best_positions(scores, _SEPARATION_PX, _CANDIDATES_WIDE)
-    found = [refined for x, y, _ in candidates if (refined := _refined(levels, scores, x, y)[0]) is not None]
-    kept: list[tuple[int, int, float]] = []
-    for each in sorted(found, key=lambda refined: -refined.score):
-        x, y = round(each.x), round(each.y)
-        if all(max(abs(x - u), abs(y - v)) > separation_px for u, v, _ in kept):
-            kept.append((x, y, each.score))
-    return kept[:count]
-
-
 def _levels(search: Search, template: FloatImage, min_overlap: float, max_loss: float) -> _Levels | None:
     """The levels worth searching, or None if that is only the finest.
 

@@ -80,8 +80,7 @@ class Auto(Method):
         if isinstance(first, NoFix):
             if isinstance(second, Fix):
                 return second
-            both = first.candidates + second.candidates
-            return replace(first if second.reason is Reason.LATE else second, candidates=both)
+            return first if second.reason is Reason.LATE else second
         if isinstance(second, NoFix):
             return refined
         offset_m = offset_between_m(first, second)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from engine.kernels import coarse_to_fine
 from engine.kernels.coarse_to_fine import QuickLook
-from engine.kernels.peaks import best_positions, find_peak
+from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance
 from engine.maps.prepared import PreparedMap, Region
 from engine.matching.align import MIN_SHRINK, GroundView, Patch, rectify, view_of
@@ -232,33 +232,6 @@ class Correlator:
     def is_centred(self) -> bool:
         """Whether enhanced pixels are centred on 0, the value of nodata on a coarse level."""
         return self.options.score != "grey" and self.options.enhance_radius_px > 0
-
-    def best_places(
-        self, aligned: Aligned, window: Window, separation_px: int, count: int
-    ) -> tuple[list[tuple[int, int, float]], Array] | None:
-        """The highest places of a window, separated from each other.
-
-        Args:
-            aligned: the hypothesis.
-            window: in full-resolution map pixels; searched coarse to fine if wide and on the CPU.
-            separation_px: places are more than this apart in x or in y.
-            count: upper bound on their number.
-
-        Returns:
-            Places (x, y, score) in falling order of the score, and the place (2,) that they count from, as
-            :meth:`surface`.
-        """
-        region, (height, width) = self.cut(window, aligned.level), aligned.template.shape
-        if region.window.width_px < width or region.window.height_px < height:
-            return None
-        if coarse_to_fine.is_wide(region.search) and self._has_coarse_levels(region):
-            places = coarse_to_fine.best_places(
-                region.search, aligned.template, separation_px, count, min_overlap=self.options.min_valid_share
-            )
-            if places is not None:
-                return places, np.array([region.window.x0, region.window.y0], np.float64)
-        surface = self.surface(aligned, window)
-        return None if surface is None else (best_positions(surface[0], separation_px, count), surface[1])
 
     def surface(self, aligned: Aligned, window: Window) -> tuple[Picture, Array] | None:
         """The whole surface on which :meth:`search` finds its peak, for reports.

@@ -19,7 +19,6 @@ from engine.matching.oblique import is_ground_below, is_oblique
 from engine.matching.peak_evidence import (
     PeakCandidate,
     candidate_of,
-    candidates_of,
     null_tested,
     places_in,
     quick_look,
@@ -77,7 +76,6 @@ class Ncc(Method):
         self.refine(untilted, self.correlate(untilted))
         found = self.find(query)
         if isinstance(found, PeakCandidate):  # as of a refused frame
-            candidates_of(self._correlator(query), found)
             self.find_again(query, found)
 
     def warmup_search(self, query: Query) -> None:
@@ -119,7 +117,7 @@ class Ncc(Method):
             return coarse
         if isinstance(fine, Fix):
             return with_unconfirmed_tilt(query, fine) if is_refuted and fine.stage == "coarse" else fine
-        is_same = any(self._is_same(coarse, peak) for peak in fine.candidates[:1])
+        is_same = fine.match is not None and self._is_same(coarse, fine.match)
         return coarse if is_same or fine.reason is Reason.LATE else fine
 
     def _by_coarse_peak(self, query: Query) -> Fix | None:
@@ -170,7 +168,7 @@ class Ncc(Method):
                 if searched is not None:
                     return searched
             if isinstance(result, NoFix):
-                result = replace(result, candidates=candidates_of(self._correlator(query), found))
+                result = replace(result, match=found.fix)
         return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
 
     def _by_hypotheses(self, query: Query) -> Fix | None:

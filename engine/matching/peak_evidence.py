@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from engine.kernels.coarse_to_fine import QuickLook
 from engine.kernels.scores import enhance
 from engine.matching.correlation import METHOD, Aligned, Correlator
@@ -24,8 +22,6 @@ from engine.matching.evidence import (
     surprise_of,
 )
 from engine.values import Fix, Peak, Window
-
-_MAX_CANDIDATES = 4  # of a refused frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,26 +159,3 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
         grid_attitude=pose.grid_attitude if searched else None,
         map_sigma_m=errors.map_m,
     )
-
-
-def candidates_of(correlator: Correlator, found: PeakCandidate) -> tuple[Fix, ...]:
-    """The peaks of a refused frame, each with its probability among them; none after a search.
-
-    They include rivals: over repeated structure these follow the vehicle as closely as the right place does.
-    """
-    query, aligned, window = correlator.query, found.aligned, found.fix.window
-    if not found.is_tested or query.prior is None or query.scheduler.deadline.remaining_ms < 0:
-        return ()
-    apart_px = max(2, round(correlator.exclusion_px(aligned.level)))
-    with query.scheduler.stage("candidates"):
-        best = correlator.best_places(aligned, window, apart_px, _MAX_CANDIDATES)
-    if best is None:
-        return (found.fix,)
-    (places, corner_px), fixes = best, [found.fix]
-    for x, y, score in places:
-        place = corner_px + np.array([x, y])
-        if max(abs(place - [found.peak.x, found.peak.y])) <= apart_px:
-            continue
-        peak = replace(found.peak, x=place[0], y=place[1], score=score, second_score=found.peak.score)
-        fixes.append(candidate_of(correlator, aligned, peak, window).fix)
-    return tuple(fixes[:_MAX_CANDIDATES])

@@ -217,12 +217,8 @@ class Sift(Method):
         return FeatureMatcher(query, self.landmarks, options or self.options).find()
 
     def judge(self, query: Query, found: PoseCandidate) -> Result:
-        """The fix if its pose is accepted, else a refusal that carries an improbable pose as evidence."""
-        result = FeatureMatcher(query, self.landmarks, self.options).judge(found)
-        # A pose that the null hypothesis matches (ambiguous) is no evidence, however probable it looks.
-        if isinstance(result, NoFix) and result.reason is Reason.BAD_POSE:
-            return replace(result, candidates=(found.fix,))
-        return result
+        """The fix if its pose is accepted, else a refusal."""
+        return FeatureMatcher(query, self.landmarks, self.options).judge(found)
 
     def _work_px(self, query: Query) -> dict[float, float]:
         """Pixels of the matched picture, which determine the cost, per share of the usual scale."""

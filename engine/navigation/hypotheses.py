@@ -8,7 +8,6 @@ for new ground alone, and must leave every rival behind: track before detect, in
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +18,6 @@ from engine.navigation.odds import (
     Sources,
     agreement_log_odds,
     log_odds,
-    match_log_odds,
     new_ground_share,
     repeated_log_odds,
 )
@@ -37,12 +35,10 @@ class Match:
     Attributes:
         fix: the match.
         log_odds: as of a first match, from itself and from the estimates that it agrees with or contradicts.
-        doubted: the matcher refused it.
     """
 
     fix: Fix
     log_odds: float
-    doubted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +50,12 @@ class Hypothesis:
         sample: the odometry at that match.
         count: number of its matches.
         log_odds: from all of them.
-        doubted: how many of them the matcher refused.
     """
 
     fix: Fix
     sample: OdometrySample
     count: int
     log_odds: float
-    doubted: int = 0
 
 
 class Hypotheses:
@@ -78,9 +72,8 @@ class Hypotheses:
 
     @property
     def pending(self) -> Hypothesis | None:
-        """The strongest hypothesis that the matcher itself supports; the search centres on it."""
-        supported = [each for each in self._known if each.doubted < each.count]
-        return max(supported, key=lambda each: each.log_odds, default=None)
+        """The strongest hypothesis; the search centres on it."""
+        return max(self._known, key=lambda each: each.log_odds, default=None)
 
     def clear(self) -> None:
         """Forget all of them."""
@@ -95,51 +88,39 @@ class Hypotheses:
 
     def add(
         self,
-        matches: Sequence[Match],
+        match: Match | None,
         now: OdometrySample,
         sources: Sources,
         map_m2: float,
         height_m: float | None,
     ) -> Hypothesis | None:
-        """Add the matches of one frame; each hypothesis takes the best that agrees with it.
+        """Add the match of one frame to each hypothesis that it agrees with.
 
         Args:
-            matches: of the frame; may be empty.
+            match: of the frame, if it has one.
             now: its odometry.
             sources: what else was known, and where the matcher searched.
             map_m2: area of the window if the whole map was searched.
             height_m: above the ground.
 
         Returns:
-            Hypothesis | None: the strongest that a match of this frame supports.
+            Hypothesis | None: the strongest that the match supports.
         """
         grown: list[Hypothesis] = []
-        used: set[int] = set()
         pending, about_pending = self.pending, sources.searched is not None and sources.searched is sources.pending
         for known in self._known:
             searched = about_pending and known is pending
             before = self.position(known, now)
-            agreeing = [k for k, match in enumerate(matches) if before.chi_square(match.fix) <= self._gate]
-            best = max(agreeing, key=lambda k: matches[k].log_odds, default=None)
-            if best is None:
+            if match is None or before.chi_square(match.fix) > self._gate:
                 grown.append(replace(known, log_odds=known.log_odds + (_SEARCHED_MISS if searched else _MISS)))
                 continue
-            used.add(best)
             searched_m2 = None if searched else sources.searched_m2(map_m2)
-            grown.append(_extended(known, matches[best], now, before, searched_m2, height_m))
-        for k, match in enumerate(matches):
-            if k not in used:
-                grown.append(Hypothesis(match.fix, now, 1, match.log_odds, int(match.doubted)))
+            grown.append(_extended(known, match, now, before, searched_m2, height_m))
+        if match is not None and all(each.sample is not now for each in grown):
+            grown.append(Hypothesis(match.fix, now, 1, match.log_odds))
         grown.sort(key=lambda each: -each.log_odds)
         self._known = [each for each in grown if each.log_odds >= _MIN_LOG_ODDS][:MAX_HYPOTHESES]
         return next((each for each in self._known if each.sample is now), None)
-
-    def lead(self, hypothesis: Hypothesis) -> float:
-        """Log-odds of a hypothesis against all others; its own log-odds if the matcher supports it."""
-        if not hypothesis.doubted:
-            return hypothesis.log_odds
-        rivals = [each.log_odds for each in self._known if each is not hypothesis]
-        return hypothesis.log_odds - float(np.logaddexp.reduce([0.0, *rivals]))
 
 
 def _extended(
@@ -164,7 +145,4 @@ def _extended(
     share = new_ground_share(float(np.hypot(*(en_m(fix) - en_m(known.fix)))), height_m)
     agreement = 0.0 if searched_m2 is None else agreement_log_odds(before, fix, searched_m2)
     gain = repeated_log_odds(fix, agreement, share)
-    if match.doubted:
-        gain = share * (match_log_odds(fix) + agreement)
-    doubted = known.doubted + int(match.doubted)
-    return Hypothesis(fix, now, known.count + 1, known.log_odds + gain, doubted)
+    return Hypothesis(fix, now, known.count + 1, known.log_odds + gain)

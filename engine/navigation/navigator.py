@@ -188,7 +188,7 @@ class Navigator:
             if isinstance(result, Fix) and sources.given is not None:
                 self._map_offset.add(result, sources.given, now.time_s)
         elif not late and result.reason is not Reason.LATE:
-            result = self._add_doubted(result, now, sources, frame.height_agl_m)
+            self._hypotheses.add(None, now, sources, 0.0, frame.height_agl_m)
         if not late:
             if isinstance(result, Fix):
                 self._errors.note(result, self._ground_below(result))
@@ -302,31 +302,19 @@ class Navigator:
         if late:
             return self._refuse_match(fix, against, own + others)
         match = Match(fix, others if against is not None else own + others)
-        found = self._hypotheses.add([match], now, sources, self._map_m2(fix), raw.height_agl_m)
+        found = self._hypotheses.add(match, now, sources, self._map_m2(fix), raw.height_agl_m)
         odds = match.log_odds if found is None else found.log_odds
         return self._decide(found, now, fix, disputed=disputed) or self._refuse_match(fix, against, odds)
 
-    def _add_doubted(
-        self, refusal: NoFix, now: OdometrySample, sources: Sources, height_m: float | None
-    ) -> Fix | NoFix:
-        """Add a refusal's candidates to the hypotheses; return the fix that one now yields, else the refusal."""
-        candidates = [fix for fix in refusal.candidates if is_valid(fix)]
-        matches = [Match(fix, match_log_odds(fix), doubted=True) for fix in candidates]
-        map_m2 = self._map_m2(candidates[0]) if candidates else 0.0
-        found = self._hypotheses.add(matches, now, sources, map_m2, height_m)
-        return (None if found is None else self._decide(found, now, found.fix, disputed=False)) or refusal
-
     def _decide(self, found: Hypothesis | None, now: OdometrySample, fix: Fix, *, disputed: bool) -> Fix | None:
         """The fix of a hypothesis that enough matches support."""
-        if found is None or found.count < 2 or self._hypotheses.lead(found) < self._options.min_log_odds:
+        if found is None or found.count < 2 or found.log_odds < self._options.min_log_odds:
             return None
         against = self._against(fix, now)
-        if against is not None and (found.doubted or self._dead_reckoning_outweighs(now, found.count)):
+        if against is not None and self._dead_reckoning_outweighs(now, found.count):
             return None
         self._accept(fix, now, found.count, found.log_odds, jump=against is not None, disputed=disputed)
-        if not found.doubted:
-            return fix
-        return replace(fix, confidence=probability(min(found.log_odds, log_odds(MAX_PROBABILITY))))
+        return fix
 
     def _evidence_of(self, estimate: PositionEstimate | None, fix: Fix, sources: Sources) -> float:
         """What an estimate adds to the log-odds of a match."""
@@ -381,7 +369,7 @@ class Navigator:
     def _refuse_match(self, fix: Fix, against: PositionEstimate | None, odds: float) -> NoFix:
         """The refusal of a match without enough evidence."""
         if against is not None:
-            return replace(against.refusal(fix), candidates=(fix,))
+            return replace(against.refusal(fix), match=fix)
         asked = f"{self._options.min_confidence:g} is required"
         return fix.refused(Reason.UNCONFIRMED, f"right with a probability of {probability(odds):.4f}, {asked}")
 

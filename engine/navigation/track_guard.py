@@ -236,7 +236,7 @@ def _match(result: Fix | NoFix) -> Fix | None:
     """The match of a frame, including one refused for contradicting the navigator's own track."""
     if isinstance(result, Fix):
         return result
-    return next(iter(result.candidates), None) if result.reason is Reason.INCONSISTENT else None
+    return result.match if result.reason is Reason.INCONSISTENT else None
 
 
 def _position(fix: Fix) -> PositionEstimate:

@@ -17,7 +17,7 @@ from engine.budget import Budget, Deadline
 from engine.kernels import coarse_to_fine
 from engine.kernels import ncc as kernels
 from engine.kernels.coarse_to_fine import QuickLook
-from engine.kernels.peaks import best_positions, find_peak
+from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance
 from engine.kernels.search_levels import prepare
 from engine.ncc_fft import ncc
@@ -150,19 +150,6 @@ def test_a_quick_look_allows_for_a_twin_between_coarse_pixels(monkeypatch, detai
     found = coarse_to_fine.peak(prepare(image), shown, 9.0, quick=quick)
     assert found is None or found.second_score > 0.5
     assert all(second > 0.5 for second in seconds)
-
-
-@pytest.mark.parametrize("share", SHARES)
-def test_the_best_place_of_a_wide_window_is_that_of_every_place(share):
-    search, image, valid, template, _ = drawn(4, share, detail_px=3.0)
-    places = coarse_to_fine.best_places(search, template, 9, 4, min_overlap=MIN_OVERLAP)
-    full = best_positions(every_place(image, valid, template), 9, 4)
-    assert places is not None
-    assert places[0] == (*full[0][:2], pytest.approx(full[0][2], abs=2e-6))
-    for (x, y, score), (u, v, _) in zip(places[1:], places, strict=False):
-        assert max(abs(x - u), abs(y - v)) > 9
-        assert score <= full[0][2]
-    assert len(places) == 4
 
 
 # By the matcher: a window of a few hundred pixels counts as wide, and every place of it is the reference

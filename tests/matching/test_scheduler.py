@@ -163,8 +163,8 @@ def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(
 
     def refused(self, query, level, **_):
         fix = coarse(query)
-        candidates = () if off_m is None else (replace(fix, east_m=fix.east_m + off_m),)
-        return replace(query.refuse(reason, "of the finer peak", "ncc"), candidates=candidates)
+        match = None if off_m is None else replace(fix, east_m=fix.east_m + off_m)
+        return replace(query.refuse(reason, "of the finer peak", "ncc"), match=match)
 
     monkeypatch.setattr(Ncc, "correlate", refused)
     result = make("ncc").locate(frame, prior, HURRY)

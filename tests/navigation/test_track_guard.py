@@ -21,7 +21,7 @@ def fix(east_m, north_m=0.0, sigma_m=0.3):
 
 
 def refused(match):
-    return NoFix(reason=Reason.INCONSISTENT, candidates=(match,))
+    return NoFix(reason=Reason.INCONSISTENT, match=match)
 
 
 class Flight:
