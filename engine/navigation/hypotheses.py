@@ -1,8 +1,7 @@
 """Hypotheses: places supported by matches of successive frames, moved by odometry while evidence adds up.
 
 A match that is not accepted is not lost: the next frames speak for its place, or against it. What a match adds is
-counted by the ground that is new (:mod:`engine.navigation.odds`). Matches that the matcher itself doubts count
-for new ground alone, and must leave every rival behind: track before detect, in a bounded set.
+counted by the ground that is new (:mod:`engine.navigation.odds`): track before detect, in a bounded set.
 """
 
 from __future__ import annotations
