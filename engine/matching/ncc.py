@@ -12,7 +12,7 @@ from engine.maps.samples import SampleMap
 from engine.matching import hypothesis_search
 from engine.matching.acceptance import agree_in_place, judge_peak, offset_between_m
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
-from engine.matching.evidence import is_beyond_doubt, is_hopeless
+from engine.matching.evidence import is_beyond_doubt
 from engine.matching.explanation import Explanation, explain_correlation
 from engine.matching.method import Method
 from engine.matching.oblique import is_ground_below, is_oblique
@@ -25,7 +25,7 @@ from engine.matching.peak_evidence import (
 )
 from engine.matching.query import Query
 from engine.matching.refinement import Refinement, improved, with_unconfirmed_tilt
-from engine.matching.second_look import can_look_coarsely, confirmed, hopeful_look, second_look
+from engine.matching.second_look import second_look
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
@@ -35,7 +35,6 @@ from engine.values import Fix, NoFix, Peak, Prior, Reason, Result, Window
 MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
 _SECOND_LOOK, _HYPOTHESES, _AT_ONCE = "ncc second look", "ncc hypotheses", "refinement at once"  # steps
-_HOPEFUL_LOOK = "ncc second look by a coarser level"
 _SURROUNDINGS_SIGMA_M = 30.0  # of the window around a place found by a search, in which it must stand out
 
 
@@ -313,19 +312,10 @@ class Ncc(Method):
         """
         window = window or found.fix.window
         correlator, scheduler, work_px = self._correlator(query), query.scheduler, found.aligned.work_px(window)
-        if can_look_coarsely(correlator, found.aligned, window):
-            if not scheduler.can_afford({_HOPEFUL_LOOK: work_px}):
-                return None
-            with scheduler.costed(_HOPEFUL_LOOK, work_px), scheduler.stage("second look"):
-                hopeful = hopeful_look(correlator, found.aligned, window)
-            best = None if hopeful is None else confirmed(correlator, found, hopeful, window)
-            if best is not None and is_hopeless(best.evidence.nats, query.risk):
-                return best
         if not scheduler.can_afford({_SECOND_LOOK: work_px}):
             return None
         with scheduler.costed(_SECOND_LOOK, work_px), scheduler.stage("second look"):
-            looked = second_look(correlator, found.aligned, window)
-        return None if looked is None else confirmed(correlator, found, looked, window)
+            return second_look(correlator, found, window)
 
     def _correlator(self, query: Query) -> Correlator:
         return Correlator(query, self.prepared, self.options)

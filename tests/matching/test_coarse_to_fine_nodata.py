@@ -6,14 +6,13 @@ The reference is the masked surface, which has tests of its own against sums by 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from engine import Fix, MatcherOptions, NccOptions, NoFix, OrthoMap, SceneMatcher
-from engine.budget import Budget, Deadline
+from engine.budget import Budget
 from engine.kernels import coarse_to_fine
 from engine.kernels import ncc as kernels
 from engine.kernels.coarse_to_fine import QuickLook
@@ -165,10 +164,7 @@ def site_with(share, seed):
 
 @pytest.fixture
 def wide(monkeypatch):
-    from engine.matching import second_look
-
-    for module in (coarse_to_fine, second_look):
-        monkeypatch.setattr(module, "WIDE_PX", 100_000)
+    monkeypatch.setattr(coarse_to_fine, "WIDE_PX", 100_000)
 
 
 @pytest.mark.usefixtures("wide")
@@ -236,47 +232,3 @@ def test_every_place_is_scored_only_where_there_is_time_for_it():
     assert _EVERY_PLACE in asked
     assert isinstance(result, NoFix)
     assert result.reason is Reason.LATE
-
-
-@pytest.mark.usefixtures("wide")
-def test_a_second_look_at_every_place_is_a_step_of_its_own():
-    """A second look by a coarser level is cheap, and its cost says nothing of that of every place."""
-    from engine.matching import ncc as module
-
-    site, _ = site_with(0.1, 6)
-    nadir = np.array([480.0, 450.0])
-    matcher = SceneMatcher(site, CAMERA, "ncc", "cpu")
-    frame = GROUND.frame(CAMERA, nadir)
-    shown = np.clip(255.0 - frame.image.astype(float), 0, 255).astype(np.uint8)  # grey levels the other way round
-    asked: list[str] = []
-
-    def can_afford(self, works):
-        asked.extend(works)
-        return module._SECOND_LOOK not in works
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("engine.runtime.scheduler.Scheduler.can_afford", can_afford)
-        patch.setattr(module, "is_hopeless", lambda *_: False)
-        result = matcher.locate(replace(frame, image=shown), GROUND.prior(nadir, sigma_m=60.0))
-    assert [step for step in asked if "second look" in step][:2] == [module._HOPEFUL_LOOK, module._SECOND_LOOK]
-    assert isinstance(result, NoFix)
-
-
-@pytest.mark.usefixtures("wide")
-def test_a_second_look_by_a_coarser_level_finds_the_place_of_every_place():
-    from engine.matching.second_look import hopeful_look, second_look
-
-    site, _ = site_with(0.1, 6)
-    matcher = SceneMatcher(site, CAMERA, "ncc", "cpu")
-    for number, nadir in enumerate(([480.0, 450.0], [430.0, 500.0])):
-        frame = GROUND.frame(CAMERA, np.array(nadir), heading_deg=70.0 * number)
-        query = matcher._query(frame, GROUND.prior(np.array(nadir), sigma_m=60.0), Deadline(Budget()))
-        method = matcher._method
-        found = method.find(query)
-        correlator = method._correlator(query)
-        quick = hopeful_look(correlator, found.aligned, found.fix.window)
-        whole = second_look(correlator, found.aligned, found.fix.window)
-        assert quick is not None
-        assert (quick.peak.x, quick.peak.y) == pytest.approx((whole.peak.x, whole.peak.y), abs=1e-2)
-        # Local normalisation differs a little towards the edges of a smaller crop.
-        assert quick.peak.score == pytest.approx(whole.peak.score, abs=1e-3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -178,7 +179,7 @@ def locate(ground, camera, frame, score):
     options = MatcherOptions(ncc=NccOptions(score=score))
     scheduler = Scheduler(Deadline(Budget()), CPU)
     query = Query(frame, np.asarray(frame.image), camera, ground.site, ground.prior(NADIR), CPU, scheduler, 1e-4)
-    return Ncc(ground.site, CPU, options).locate(query)
+    return replace(Ncc(ground.site, CPU, options).locate(query), timings=query.timings)
 
 
 def assert_found(result):
