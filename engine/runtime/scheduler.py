@@ -19,7 +19,7 @@ from engine.runtime.device import Device, synchronise
 from engine.runtime.loops import loops_compiled
 
 RUNS, STAGES, WAITS = 15, 48, 240  # of a step, of all stages (some six frames), and of their waits, that count
-DEVIATIONS, SEVERAL = 5.0, 10.0  # median absolute deviations above the median; medians, the upper bound on a cost
+DEVIATIONS, SEVERAL = (2.0, 5.0), 10.0  # median absolute deviations, before and beside a fix; medians at most
 FADE, FORGOTTEN = 0.99, 4  # per refusal: share of the cost that is left, and stages; so a step is tried again
 MAX_WAIT_MS = 20.0  # longest wait for the processor that a fix is protected from
 
@@ -53,13 +53,13 @@ class Costs:
         for _ in range(min(FORGOTTEN, len(self._stages_ms)) if is_idle else 0):
             self._stages_ms.popleft(), self._waits_ms.popleft()
 
-    def needed_ms(self, step: Hashable, work: float) -> float:
+    def needed_ms(self, step: Hashable, work: float, *, has_fix: bool = True) -> float:
         """Time that a step needs; 0 with fewer than two runs."""
         runs = tuple(self._runs.get(step, ()))
         if len(runs) < 2:
             return 0.0
         usual = median_low([used for used, _ in runs])
-        bound = self.load() * (usual + DEVIATIONS * median_low([abs(used - usual) for used, _ in runs]))
+        bound = self.load() * (usual + DEVIATIONS[has_fix] * median_low([abs(used - usual) for used, _ in runs]))
         bound = min(bound, SEVERAL * median_low([took for _, took in runs]))
         return bound * max(work, 1.0) * FADE ** self._refusals.get(step, 0)
 
@@ -84,7 +84,7 @@ class Scheduler:
 
     def can_afford(self, works: Mapping[Hashable, float]) -> bool:
         """Whether time allows successive steps of this work; with a fix, also for one scheduling delay."""
-        needed_ms = sum(self.costs.needed_ms(step, work) for step, work in works.items())
+        needed_ms = sum(self.costs.needed_ms(step, work, has_fix=self.has_fix) for step, work in works.items())
         return needed_ms + (self.costs.wait_ms() if self.has_fix else 0.0) <= self.deadline.remaining_ms
 
     def first_affordable(self, step: str, works: Mapping[Any, float]) -> Any:

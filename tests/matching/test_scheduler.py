@@ -39,7 +39,7 @@ class FixedCosts:
         self.per_unit = {name.replace("_", " "): cost for name, cost in per_unit.items()}
         self.longest_wait_ms = 0.0
 
-    def needed_ms(self, step, work):
+    def needed_ms(self, step, work, *, has_fix=True):
         step = step if isinstance(step, str) else step[0]  # one variant of it
         if not isinstance(step, str):
             return 0.0  # a stage of a step
@@ -113,9 +113,9 @@ def cost_of_the_finest(make, frame, prior, method, step):
     probe, work = make(method, refinement=1e9), []
     known = probe._costs.needed_ms
 
-    def noting(name, amount):
+    def noting(name, amount, **how):
         work.extend([amount] if name[0] == step else [])
-        return known(name, amount)
+        return known(name, amount, **how)
 
     probe._costs.needed_ms = noting
     probe.locate(frame, prior, HURRY)
