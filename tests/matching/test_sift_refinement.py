@@ -36,7 +36,7 @@ def plain(site, camera):
 def costs_of(others_ms=0.0, **ms):
     """Costs by step, whatever the work."""
     costs = FixedCosts()
-    costs.needed_ms = lambda step, work: ms.get(
+    costs.needed_ms = lambda step, work, **_: ms.get(
         (step if isinstance(step, str) else step[0]).replace(" ", "_"), others_ms
     )
     return costs
