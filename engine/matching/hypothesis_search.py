@@ -29,6 +29,10 @@ from engine.window import SPREAD_SIGMAS
 
 Array = NDArray[np.float64]
 
+Reach = tuple[float, float]
+"""How far off the heading, in degrees, and the height, as a share of it, may be."""
+OWN = (0.0, 0.0)
+"""The reach of the frame's own hypothesis alone."""
 
 # Most hypotheses times places on the coarse level, unless the template gets too small: in all, and in multiples of
 # the places of one look at the frame's own level.
@@ -49,8 +53,17 @@ _MIDDLE_ROUNDS = 2
 _FINE_ROUNDS = 2
 
 
+def reach_of(correlator: Correlator) -> Reach:
+    """How far heading and height are searched: as far as the position, in sigmas."""
+    query, height_m = correlator.query, correlator.query.telemetry.height_agl_m
+    assert height_m is not None  # a frame without one was refused
+    errors = query.errors(correlator.options.errors)
+    share = SPREAD_SIGMAS * errors.height_sigma_m(height_m) / height_m
+    return min(SPREAD_SIGMAS * errors.heading_deg, 180.0), min(share, _MAX_SHARE)
+
+
 def search(
-    correlator: Correlator, first: Aligned, window: Window, *, widely: bool
+    correlator: Correlator, first: Aligned, window: Window, reach: Reach
 ) -> tuple[Peak | None, Aligned, int]:
     """The best peak over all hypotheses in the window, at the level of ``first``; its hypothesis; their number.
 
@@ -58,12 +71,12 @@ def search(
         correlator: of the frame.
         first: the frame's own hypothesis.
         window: to search.
-        widely: whether to try other headings and heights than its own.
+        reach: of the other headings and heights to try.
     """
-    level, poses = _coarse_level(correlator, first, window, widely=widely)
+    level, poses = _coarse_level(correlator, first, window, reach)
     if level == first.level and len(poses) == 1:
         return correlator.search(first, window), first, 1
-    quick = _quick_level(correlator, first, level, widely=widely)
+    quick = _quick_level(correlator, first, level, reach)
     if quick is not None:
         best = _from_level(correlator, first, window, *quick)
         if best is not None and _is_clear(best[0]):
@@ -72,11 +85,11 @@ def search(
 
 
 def _quick_level(
-    correlator: Correlator, first: Aligned, level: int, *, widely: bool
+    correlator: Correlator, first: Aligned, level: int, reach: Reach
 ) -> tuple[int, list[GridPose]] | None:
     """Search one level above, with fewer hypotheses, at a sixteenth of the cost; None if too little is left."""
     above = level + 1
-    side_px, turns, shares = _grid_on(correlator, first, above, widely=widely)
+    side_px, turns, shares = _grid_on(first, above, reach)
     if above == correlator.query.site.levels or side_px < _MIN_QUICK_TEMPLATE_PX:
         return None
     return above, _hypotheses(correlator.query.telemetry, turns, shares)
@@ -111,23 +124,23 @@ def _from_level(
 
 
 def coarse_px(correlator: Correlator, first: Aligned, window: Window) -> int:
-    """Map pixels that :func:`search` searches first, all at once."""
-    return window.area_px >> 2 * _coarse_level(correlator, first, window, widely=False)[0]
+    """Map pixels that :func:`search` searches first, all at once, for the frame's own hypothesis."""
+    return window.area_px >> 2 * _coarse_level(correlator, first, window, OWN)[0]
 
 
-def is_single(correlator: Correlator, first: Aligned, window: Window) -> bool:
+def is_single(correlator: Correlator, first: Aligned, window: Window, reach: Reach) -> bool:
     """Whether a search tries only the frame's own heading and height, which are near all possible ones."""
-    return len(_coarse_level(correlator, first, window, widely=True)[1]) == 1
+    return len(_coarse_level(correlator, first, window, reach)[1]) == 1
 
 
 def _coarse_level(
-    correlator: Correlator, first: Aligned, window: Window, *, widely: bool
+    correlator: Correlator, first: Aligned, window: Window, reach: Reach
 ) -> tuple[int, list[GridPose]]:
     """The level on which to score all hypotheses, and the hypotheses: fewer at lower resolution."""
     level, levels = first.level, correlator.query.site.levels
-    most = min(_MAX_COARSE_PLACES, _MAX_LOOKS * first.work_px(window)) if widely else _MAX_COARSE_PLACES
+    most = min(_MAX_COARSE_PLACES, _MAX_LOOKS * first.work_px(window))
     while True:
-        side_px, turns, shares = _grid_on(correlator, first, level, widely=widely)
+        side_px, turns, shares = _grid_on(first, level, reach)
         area_px = window.area_px / 4**level
         few = area_px <= _MAX_COARSE_PX and len(turns) * len(shares) * area_px <= most
         if few or level + 1 == levels or side_px >> 1 < _MIN_TEMPLATE_PX:
@@ -135,22 +148,13 @@ def _coarse_level(
         level += 1
 
 
-def _grid_on(
-    correlator: Correlator, first: Aligned, level: int, *, widely: bool
-) -> tuple[int, list[float], list[float]]:
+def _grid_on(first: Aligned, level: int, reach: Reach) -> tuple[int, list[float], list[float]]:
     """The template's shorter side on a level, in its pixels, with the turns and shares to try there.
 
-    Turns, in degrees, and shares of the height reach as far as the position's window does, in sigmas, and keep a
-    patch's corners within :data:`_EDGE_PX` of one of them.
+    Turns, in degrees, and shares of the height keep a patch's corners within :data:`_EDGE_PX` of one of them.
     """
-    query, height_m = correlator.query, first.pose.height_agl_m
+    turn_deg, share = reach
     h, w = (n >> (level - first.level) for n in first.template.shape)
-    if not widely:
-        return min(h, w), [0.0], [0.0]
-    assert height_m is not None  # a hypothesis has one
-    errors = query.errors(correlator.options.errors)
-    turn_deg = min(SPREAD_SIGMAS * errors.heading_deg, 180.0)
-    share = min(SPREAD_SIGMAS * errors.height_sigma_m(height_m) / height_m, _MAX_SHARE)
     step = 4.0 * _EDGE_PX / math.hypot(h, w)  # radians, or a share: each moves a corner by twice the edge
     turns = _steps(turn_deg, math.degrees(step))
     if turn_deg == 180.0:

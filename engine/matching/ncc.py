@@ -162,7 +162,7 @@ class Ncc(Method):
         found, result = self._find_and_judge(query, step, works, coarser)
         if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
             with suppress(OutOfTime):  # the existing refusal stands
-                result = self._look_again(query, found, result)
+                result = self._look_again(query, found) or result
                 searched = self._by_hypotheses(query) if widely and isinstance(result, NoFix) else None
                 if searched is not None:
                     return searched
@@ -181,11 +181,12 @@ class Ncc(Method):
             return None
         with query.scheduler.costed(_HYPOTHESES, work_px):
             found = self.find(query, widely=True)
-        again = None if isinstance(found, NoFix) else self.find_again(query, found, self._looked_at(query, found))
-        result = None if again is None else self.judge(query, again)
-        if again is None or not isinstance(result, Fix):
+        if isinstance(found, NoFix):
             return None
-        refined = self._refined(query.at(again.aligned.pose), result)
+        result = self._look_again(query, found)
+        if not isinstance(result, Fix):
+            return None
+        refined = self._refined(query.at(found.aligned.pose), result)
         return refined if isinstance(refined, Fix) else None
 
     def _find_and_judge(
@@ -246,14 +247,15 @@ class Ncc(Method):
             size = f"{window.width_px} x {window.height_px} px"
             detail = f"a window of {size} is too large to search; a better prior is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, METHOD, window=window)
-        if widely and hypothesis_search.is_single(correlator, aligned, window):
+        reach = hypothesis_search.reach_of(correlator) if widely else hypothesis_search.OWN
+        if widely and hypothesis_search.is_single(correlator, aligned, window, reach):
             detail = "its own heading and height are near all possible ones"
             return query.refuse(Reason.LOW_SCORE, detail, METHOD, window=window)
         is_window, hypotheses = not (widely or wide or query.prior is None), 1
         if is_window:
             peak, aligned = self._in_window(correlator, aligned, window)
         else:
-            peak, aligned, hypotheses = hypothesis_search.search(correlator, aligned, window, widely=widely)
+            peak, aligned, hypotheses = hypothesis_search.search(correlator, aligned, window, reach)
         if peak is None:
             detail = "the map does not cover the frame anywhere in the window"
             return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD, window=window)
@@ -286,10 +288,10 @@ class Ncc(Method):
             return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
         return found.fix
 
-    def _look_again(self, query: Query, found: PeakCandidate, refusal: NoFix) -> Result:
-        """The fix of the second look about the same place, if affordable, else the refusal."""
+    def _look_again(self, query: Query, found: PeakCandidate) -> Result | None:
+        """What the second look about the same place gives; None if it sees nothing, or there is no time."""
         again = self.find_again(query, found, self._looked_at(query, found))
-        return refusal if again is None else self.judge(query, again)
+        return None if again is None else self.judge(query, again)
 
     def _looked_at(self, query: Query, found: PeakCandidate) -> Window:
         """The window of a second look: the first one's; after a search, the surroundings of the place."""
