@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 # States: what to add to roll, pitch and heading (deg) and to the height (a share); how late the attitude is (s).
 _ANGLES, _HEIGHT, _LAG = slice(0, 3), 3, 4
+_NO_RATES_DPS: Array = np.zeros(3)  # if they are unknown
 _FIRST_SHARE = 0.2  # error of the height before a picture measured it
 _WALK = np.array([0.2, 0.2, 0.5, 1e-3, 0.01])  # standard deviations of the states' change in one second
 # Standard deviations of a measured attitude, refined or by features alone; of a measured height, and a share.
@@ -75,6 +76,29 @@ class Calibration:
     height_sigma_m: float | None
 
 
+@dataclass(frozen=True, slots=True)
+class _Turn:
+    """A turn between two frames: (3,) of roll, pitch and heading in degrees, and how long it took."""
+
+    angles_deg: Array
+    interval_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """An attitude as a fix measured it.
+
+    Attributes:
+        off_deg: (3,) roll, pitch and heading less the telemetry's.
+        sigma_deg: standard deviation of each.
+        is_on_known_ground: whether it is on a surface model.
+    """
+
+    off_deg: Array
+    sigma_deg: float
+    is_on_known_ground: bool
+
+
 class TelemetryErrors:
     """Learns errors of the vehicle's telemetry and corrects them.
 
@@ -95,7 +119,8 @@ class TelemetryErrors:
         self._time_s: float | None = None
         self._stamp_ns: int | None = None
         self._angles_deg: Array | None = None  # of the newest frame, as they came
-        self._rates_dps = np.zeros(3)
+        self._turn: _Turn | None = None  # from the frame before to the newest
+        self._seen: _Seen | None = None  # what the newest frame's fix measured
         self._height_m: float | None = None
         self._next_search = _FIRST_SEARCH  # refusals in a row at which heading and height are searched
         self._settling = 0  # further fixes needed before a search's result is applied
@@ -134,7 +159,8 @@ class TelemetryErrors:
         if late:
             return self.without_errors(frame)
         self._follow(frame, time_s)
-        shown = self.without_errors(frame, self._rates_dps)
+        rates_dps = None if self._turn is None else self._turn.angles_deg / self._turn.interval_s
+        shown = self.without_errors(frame, rates_dps)
         if frame.heading_deg is None or self._height_m is None:
             return shown
         self._searched = refusals >= self._next_search
@@ -163,7 +189,7 @@ class TelemetryErrors:
         Returns:
             Frame: the same if nothing is known to be off.
         """
-        return self._at_its_height(self._in_its_attitude(frame, np.zeros(3) if rates_dps is None else rates_dps))
+        return self._at_its_height(self._in_its_attitude(frame, _NO_RATES_DPS if rates_dps is None else rates_dps))
 
     def _in_its_attitude(self, frame: Frame, rates_dps: Array) -> Frame:
         """The frame with the attitude at its capture."""
@@ -219,44 +245,65 @@ class TelemetryErrors:
         if seen is not None and known is not None and abs(seen.pitch_deg) <= _MAX_PITCH_DEG:
             apart = np.array([seen.roll_deg, seen.pitch_deg, seen.heading_deg]) - known
             off = np.array([math.remainder(angle, 360.0) for angle in apart.tolist()])
-            design = np.zeros((3, 5))
-            design[:, _ANGLES], design[:, _LAG] = np.eye(3), self._rates_dps
-            noise_deg = _REFINED_DEG if fix.stage in ("refined", "verified") else _FEATURES_DEG
-            noise_deg2 = noise_deg**2 + (self._rates_dps * self._jitter_s) ** 2
-            excess = self._update(off, design, noise_deg2, only_lag=ground_m is None)
-            if ground_m is not None:
-                if self._attitudes:
-                    beyond_deg2 = np.clip(excess, 0.0, self._first[_ANGLES] ** 2)
-                    self._scatter_deg2 += _SCATTER_SHARE * (beyond_deg2 - self._scatter_deg2)
-                self._attitudes += 1
+            sigma_deg = _REFINED_DEG if fix.stage in ("refined", "verified") else _FEATURES_DEG
+            self._seen = _Seen(off, sigma_deg, ground_m is not None)
         if ground_m is not None and self._height_m is not None:
             share = (fix.up_m - ground_m) / self._height_m - 1.0
             noise = np.array([(_HEIGHT_M / self._height_m) ** 2 + _HEIGHT_SHARE**2])
             self._update(np.array([share]), np.eye(5)[[_HEIGHT]], noise)
             self._heights += 1
 
+    def _learn_attitude(self, after: _Turn | None) -> None:
+        """Learn from the attitude that the newest frame's fix measured, now that the turn after it is known.
+
+        The turn rates are those from the frame before to the frame after: the noise of the frame's own angles is
+        in the rates up to it, where it looks like a lag.
+        """
+        seen, before = self._seen, self._turn
+        self._seen = None
+        if seen is None:
+            return
+        rates_dps = _NO_RATES_DPS
+        if before is not None and after is not None:
+            rates_dps = (before.angles_deg + after.angles_deg) / (before.interval_s + after.interval_s)
+        design = np.zeros((3, 5))
+        design[:, _ANGLES], design[:, _LAG] = np.eye(3), rates_dps
+        noise_deg2 = seen.sigma_deg**2 + (rates_dps * self._jitter_s) ** 2
+        excess = self._update(seen.off_deg, design, noise_deg2, only_lag=not seen.is_on_known_ground)
+        if seen.is_on_known_ground:
+            if self._attitudes:
+                beyond_deg2 = np.clip(excess, 0.0, self._first[_ANGLES] ** 2)
+                self._scatter_deg2 += _SCATTER_SHARE * (beyond_deg2 - self._scatter_deg2)
+            self._attitudes += 1
+
     def forget(self) -> None:
         """Forget what was learnt, but for the lag: it came from a wrong position, or no longer holds."""
         lag_s, lag_s2 = self._mean[_LAG], self._covariance[_LAG, _LAG]
         self._mean, self._covariance = np.zeros(5), np.diag(self._first**2)
         self._mean[_LAG], self._covariance[_LAG, _LAG] = lag_s, lag_s2
-        self._scatter_deg2, self._attitudes, self._heights = np.zeros(3), 0, 0
+        self._scatter_deg2, self._attitudes, self._heights, self._seen = np.zeros(3), 0, 0, None
 
     def _follow(self, frame: Frame, time_s: float) -> None:
-        """Take the newest frame: let the states walk, and compute its turn rates since the last frame."""
+        """Take the newest frame: learn from the last one's fix, let the states walk, and compute the turn rates."""
+        turn = self._turn_to(frame)
+        self._learn_attitude(turn)
         elapsed_s = 0.0 if self._time_s is None else max(time_s - self._time_s, 0.0)
         self._covariance = self._covariance + np.diag(_WALK**2 * elapsed_s)
         narrower = np.minimum(self._first / np.sqrt(np.diag(self._covariance)), 1.0)  # no vaguer than at first
         self._covariance *= narrower[:, None] * narrower
-        last, last_ns = self._angles_deg, self._stamp_ns
-        self._time_s, self._stamp_ns = time_s, frame.timestamp_ns
-        self._angles_deg, self._height_m, self._rates_dps = _angles_of(frame), frame.height_agl_m, np.zeros(3)
-        if last is None or last_ns is None or self._stamp_ns is None or self._angles_deg is None:
-            return
-        interval_s = (self._stamp_ns - last_ns) * 1e-9
-        if 0.0 < interval_s <= _MAX_INTERVAL_S:
-            steps = [math.remainder(float(step), 360.0) for step in self._angles_deg - last]
-            self._rates_dps = np.array(steps) / interval_s
+        self._time_s, self._stamp_ns, self._turn = time_s, frame.timestamp_ns, turn
+        self._angles_deg, self._height_m = _angles_of(frame), frame.height_agl_m
+
+    def _turn_to(self, frame: Frame) -> _Turn | None:
+        """The turn from the newest frame to the next; None if it is unknown."""
+        angles_deg, stamp_ns = _angles_of(frame), frame.timestamp_ns
+        if self._stamp_ns is None or stamp_ns is None or self._angles_deg is None or angles_deg is None:
+            return None
+        interval_s = (stamp_ns - self._stamp_ns) * 1e-9
+        if not 0.0 < interval_s <= _MAX_INTERVAL_S:
+            return None
+        steps = [math.remainder(float(step), 360.0) for step in angles_deg - self._angles_deg]
+        return _Turn(np.array(steps), interval_s)
 
     def _update(self, measured: Array, design: Array, noise: Array, *, only_lag: bool = False) -> Array:
         """A Kalman update (Schmidt's if only the lag is learnt); by how much squares exceed the expected."""

@@ -206,10 +206,26 @@ def test_differences_that_scatter_widen_the_errors():
 @pytest.mark.parametrize("stage", ["refined", "fine"])
 def test_an_unsure_attitude_counts_less(stage):
     errors = TelemetryErrors(NavigatorOptions())
-    errors.corrected(Frame(IMAGE, 0, HEIGHT_M, 350.0, 0.0, 0.0), 0.0, late=False)
+    frame = Frame(IMAGE, 0, HEIGHT_M, 350.0, 0.0, 0.0)
+    errors.corrected(frame, 0.0, late=False)
     errors.note(fix_of((2.0, 0.0, 350.0), stage=stage), GROUND_M)
+    errors.corrected(frame, 0.0, late=False)
     noise_deg = {"refined": 0.6, "fine": 2.0}[stage]
     assert errors.calibration.attitude.roll_deg == pytest.approx(2.0 / (1.0 + noise_deg**2), rel=1e-6)  # by hand
+
+
+def test_the_noise_of_an_attitude_is_no_lag():
+    """A frame's noise is in the turn rate up to it as well: the two look like a lag of half an interval."""
+    lags_s = []
+    for seed in range(10):
+        errors, rng = TelemetryErrors(NavigatorOptions()), np.random.default_rng(seed)
+        for k in range(60):
+            roll, pitch, heading = rng.normal(0.0, 1.0, 3).tolist()
+            frame = Frame(IMAGE, round(0.4e9 * k), HEIGHT_M, heading % 360.0, roll, pitch)
+            errors.corrected(frame, 0.4 * k, late=False)
+            errors.note(fix_of((0.0, 0.0, 0.0)), GROUND_M)
+        lags_s.append(errors.calibration.attitude_lag_s)
+    assert abs(np.mean(lags_s)) < 0.01
 
 
 def test_one_fix_alone_takes_nothing_off():
