@@ -284,7 +284,7 @@ class TelemetryErrors:
         self._scatter_deg2, self._attitudes, self._heights, self._seen = np.zeros(3), 0, 0, None
 
     def _follow(self, frame: Frame, time_s: float) -> None:
-        """Take the newest frame: learn from the last one's fix, let the states walk, and compute the turn rates."""
+        """Take the newest frame: learn from the last one's fix, let the states walk, compute the turn."""
         turn = self._turn_to(frame)
         self._learn_attitude(turn)
         elapsed_s = 0.0 if self._time_s is None else max(time_s - self._time_s, 0.0)
