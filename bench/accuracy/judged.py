@@ -116,7 +116,7 @@ class Bench:
         if isinstance(found, NoFix):
             return self.row(made, "NCC", None, False, [], [])
         result = ncc.judge(query, found)
-        again = None if isinstance(result, Fix) else ncc.find_again(query, found)
+        again = None if isinstance(result, Fix) else ncc.look_again(query, found, found.fix.window)
         if again is not None:
             found, result = again, ncc.judge(query, again)
         ratio = math.sqrt(found.evidence.rival / max(found.evidence.surprise, 1e-6))
@@ -128,7 +128,7 @@ class Bench:
         query, ncc, peak = self.peak(made)
         found = None if isinstance(peak, NoFix) else peak
         if found is not None and method == SECOND_LOOK:
-            found = ncc.find_again(query, found)
+            found = ncc.look_again(query, found, found.fix.window)
         if found is None:
             return self.row(made, method, None, False, [], [])
         accepted, scores = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from engine.matching.acceptance import agree_in_height, agree_in_place, offset_between_m
 from engine.matching.explanation import Explanation
+from engine.matching.ladder import is_coarse
 from engine.matching.method import Method
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
@@ -18,7 +20,6 @@ from engine.matching.sift import Sift
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.runtime.scheduler import OutOfTime
 from engine.values import Fix, NoFix, Reason, Result, Window
 
 
@@ -71,18 +72,15 @@ class Auto(Method):
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
-        first = self.ncc.begin(query, widely=False)  # SIFT finds the heading by itself
-        # A wrong attitude displaces the peak; refinement, which measures it, leads back.
-        refined = self.ncc.refine(query, first)
-        if isinstance(refined, Fix) and refined.stage == "refined":
-            first = refined
-        second = self._second(query, first if isinstance(refined, Fix) else refined)
+        first = self.ncc.locate(query, widely=False)  # SIFT finds the heading by itself
+        # A coarse pose is not refined yet: SIFT's will be.
+        agrees = partial(_agree, first) if isinstance(first, Fix) and not is_coarse(first) else None
+        with query.scheduler.with_fix() if isinstance(first, Fix) else nullcontext():
+            second = self.sift.locate(query, agrees)
         if isinstance(first, NoFix):
-            if isinstance(second, Fix):
-                return second
-            return first if second.reason is Reason.LATE else second
+            return first if isinstance(second, NoFix) and second.reason is Reason.LATE else second
         if isinstance(second, NoFix):
-            return refined
+            return first
         offset_m = offset_between_m(first, second)
         if not agree_in_place(first, second):
             if float(np.hypot(*offset_m)) < self.ncc.options.exclusion_m:
@@ -91,22 +89,10 @@ class Auto(Method):
             return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
         if not agree_in_height(first, second):
             return _vaguer(second, offset_m)
-        fixes = [fix for fix in (refined, second) if isinstance(fix, Fix)]
         # Both compare the same picture and map with the same prior, so their odds are not multiplied.
-        stated = [fix.confidence for fix in fixes if fix.confidence is not None]
-        best = min(fixes, key=lambda fix: fix.sigma_m)
+        stated = [fix.confidence for fix in (first, second) if fix.confidence is not None]
+        best = min(first, second, key=lambda fix: fix.sigma_m)
         return replace(best, stage="verified", confidence=max(stated, default=None))
-
-    def _second(self, query: Query, first: Result) -> Result:
-        try:
-            if not isinstance(first, Fix):
-                return self.sift.locate(query)
-            with query.scheduler.with_fix():
-                if first.stage == "coarse":  # its pose is not refined yet: SIFT's will be
-                    return self.sift.locate(query)
-                return self.sift.confirm(query, partial(_agree, first))
-        except OutOfTime:
-            return query.refuse(Reason.LATE, "the budget was spent before there was a second fix", "sift")
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """As NCC does."""

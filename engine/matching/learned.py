@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from dataclasses import replace
+from functools import partial
 
 from engine.learned import KeypointMatcher, load_matcher
 from engine.maps.keypoints import KeypointMap
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import FeatureMatcher
+from engine.matching.ladder import Rung, Works, climb
 from engine.matching.method import Method
 from engine.matching.point_finding import PointFinder
 from engine.matching.query import Query
@@ -54,15 +57,15 @@ class Learned(Method):
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that time allows."""
-        works = {share: query.gray.size * self._scale(query, share) ** 2 for share in _REDUCED}
-        share = query.scheduler.first_affordable(METHOD, works)
-        if share is None:
-            return query.refuse_late(METHOD, (METHOD, _REDUCED[-1]))
-        with query.scheduler.costed((METHOD, share), works[share]):
-            matcher = self._feature_matcher(query, share)
-            found = matcher.find()
+        works: Works = {(METHOD, share): query.gray.size * self._scale(query, share) ** 2 for share in _REDUCED}
+        return climb(query, METHOD, [Rung(lambda _: works, partial(self._match, query))])
+
+    def _match(self, query: Query, answer: Result | None, step: Hashable) -> Result:
+        assert isinstance(step, tuple)
+        matcher = self._feature_matcher(query, step[1])
+        found = matcher.find()
         result = found if isinstance(found, NoFix) else matcher.judge(found)
-        return replace(result, stage="coarse") if share < 1.0 and isinstance(result, Fix) else result
+        return replace(result, stage="coarse") if step[1] < 1.0 and isinstance(result, Fix) else result
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""

@@ -26,7 +26,7 @@ from engine.runtime import device as devices
 from engine.runtime import threads
 from engine.runtime import workers as processes
 from engine.runtime.loops import loops_compiled, prepare_loops
-from engine.runtime.scheduler import Costs, OutOfTime, Scheduler
+from engine.runtime.scheduler import Costs, Scheduler
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, Window
 from engine.window import level_crop, level_for
 
@@ -173,10 +173,7 @@ class SceneMatcher:
         if prior is None and not self.site.is_searchable:
             detail = f"the map of {self.site.size_km} is not searched as a whole; a start position is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method)
-        try:
-            result = self._method.locate(query)
-        except OutOfTime:
-            return query.refuse(Reason.LATE, "the budget was spent before there was a fix", self.method)
+        result = self._method.locate(query)
         if isinstance(result, Fix) and not deadline.met:
             detail = "the answer came after the budget"
             return query.refuse(Reason.LATE, detail, result.method, window=result.window)

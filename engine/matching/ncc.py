@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Hashable
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from engine.matching.acceptance import agree_in_place, judge_peak, offset_betwee
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
 from engine.matching.evidence import is_beyond_doubt
 from engine.matching.explanation import Explanation, explain_correlation
+from engine.matching.ladder import Rung, Works, climb, is_coarse, rehearse
 from engine.matching.method import Method
 from engine.matching.oblique import is_ground_below, is_oblique
 from engine.matching.peak_evidence import (
@@ -24,17 +25,17 @@ from engine.matching.peak_evidence import (
     quick_look,
 )
 from engine.matching.query import Query
-from engine.matching.refinement import Refinement, improved, with_unconfirmed_tilt
+from engine.matching.refinement import Refinement, with_unconfirmed_tilt
 from engine.matching.second_look import second_look
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.runtime.scheduler import OutOfTime
 from engine.values import Fix, NoFix, Peak, Prior, Reason, Result, Window
 
 MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
-_SECOND_LOOK, _HYPOTHESES, _AT_ONCE = "ncc second look", "ncc hypotheses", "refinement at once"  # steps
+_SEARCH, _SECOND_LOOK, _HYPOTHESES = "ncc search", "ncc second look", "ncc hypotheses"  # steps
+_AT_ONCE, _REFINEMENT = "refinement at once", "refinement"
 _SURROUNDINGS_SIGMA_M = 30.0  # of the window around a place found by a search, in which it must stand out
 
 
@@ -69,153 +70,43 @@ class Ncc(Method):
 
     def warmup(self, query: Query) -> None:
         """Run every variant of every step, so that it is compiled and its cost known."""
-        for coarser in expected_window_px(query, self.options):
-            self.refine(query, self.correlate(query, coarser))
         untilted = replace(query, frame=replace(query.frame, roll_deg=None, pitch_deg=None))
-        self.refine(untilted, self.correlate(untilted))
-        found = self.find(query)
-        if isinstance(found, PeakCandidate):  # as of a refused frame
-            self.find_again(query, found)
+        for looks in (Looks(self, query), Looks(self, untilted)):
+            for answer in rehearse(looks.query, looks.levels, None):
+                rehearse(looks.query, looks.refinement, answer)
+        looks = Looks(self, query)
+        looks.refuse(self.find(query))  # as if it were refused
+        rehearse(query, looks.second, None)
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map, or headings and heights about the prior."""
         if query.prior is None:
             self.locate(query)
         else:
-            self._by_hypotheses(query)
+            looks = Looks(self, query)
+            looks.refuse(self.find(query))
+            rehearse(query, looks.search, None)
+            rehearse(query, looks.second, None)
 
-    def locate(self, query: Query) -> Result:
-        """A fix on the finest level of the map that time allows, refined if time remains."""
-        return self.refine(query, self.begin(query))
-
-    def begin(self, query: Query, *, widely: bool = True) -> Result:
-        """A refined fix that starts at the coarsest level, else one by correlation alone, see :meth:`correlate`.
-
-        The peak of the coarsest level is the fix if it was accepted and there is no time for a finer one, or if
-        the finer one is at the same place but not accepted.
-        """
-        coarse = self._by_coarse_peak(query)
-        if coarse is None:
-            return self.correlate(query, widely=widely)
-        scheduler, work_px, is_refuted = query.scheduler, float(query.gray.size), False
-        try:
-            with scheduler.with_fix():
-                if scheduler.can_afford({_AT_ONCE: work_px}):
-                    with scheduler.costed(_AT_ONCE, work_px):
-                        refined = Refinement(query, self.samples, self.options).refine_at_once(coarse)
-                    if refined is not None:
-                        return refined
-                    coarse, is_refuted = with_unconfirmed_tilt(query, coarse), True
-                step, works = self._step(query)
-                finer = {level: work for level, work in works.items() if level < max(works)}
-                level = scheduler.first_affordable(step, finer)
-                if level is None:
-                    return coarse
-                fine = self.correlate(query, level, widely=widely)
-        except OutOfTime:
-            return coarse
-        if isinstance(fine, Fix):
-            return with_unconfirmed_tilt(query, fine) if is_refuted and fine.stage == "coarse" else fine
-        is_same = fine.match is not None and self._is_same(coarse, fine.match)
-        return coarse if is_same or fine.reason is Reason.LATE else fine
-
-    def _by_coarse_peak(self, query: Query) -> Fix | None:
-        """The peak of the coarsest level, if it is accepted and refinement may start from it.
-
-        If roll, pitch or the ground's slope is unknown, the pose depends on the peak, which must then be fine.
-        """
-        if query.prior is None or not self._can_refine(query):
-            return None
-        step, works = self._step(query)
-        coarser, scheduler = max(works), query.scheduler
-        is_wide = query.site.is_large and works[coarser] > MAX_WINDOW_PX
-        if not (coarser and query.telemetry.has_tilt and query.site.has_surface) or is_wide:
-            return None
-        if not scheduler.can_afford({(step, coarser): works[coarser], _AT_ONCE: float(query.gray.size)}):
-            if scheduler.can_afford({(step, coarser): works[coarser]}):
-                scheduler.note_refusal(_AT_ONCE)
-            return None
-        _, result = self._find_and_judge(query, step, works, coarser)
-        return None if isinstance(result, NoFix) else replace(result, stage="coarse")
-
-    def _is_same(self, coarse: Fix, fine: Fix) -> bool:
-        """Whether two peaks are of one place, so that neither is the other's rival."""
-        distance_m = float(np.hypot(*offset_between_m(coarse, fine)))
-        return distance_m < self.options.exclusion_m and agree_in_place(coarse, fine)
-
-    def correlate(self, query: Query, coarser: int | None = None, *, widely: bool = True) -> Result:
-        """A fix by correlation alone.
+    def locate(self, query: Query, *, widely: bool = True) -> Result:
+        """A fix on the finest level of the map that time allows, refined if time remains.
 
         Args:
             query: the frame.
-            coarser: levels above the one whose pixels are like the frame's; None takes the finest that time
-                allows.
-            widely: whether to search for the heading and height of a refused frame.
+            widely: whether to search for the heading and height of a frame that would be refused.
         """
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
-        step, works = self._step(query)
-        if coarser is None:
-            coarser = query.scheduler.first_affordable(step, works)
-        if coarser is None:
-            return query.refuse_late(METHOD, (step, max(works)))
-        found, result = self._find_and_judge(query, step, works, coarser)
-        if isinstance(found, PeakCandidate) and isinstance(result, NoFix):
-            with suppress(OutOfTime):  # the existing refusal stands
-                result = self._look_again(query, found) or result
-                searched = self._by_hypotheses(query) if widely and isinstance(result, NoFix) else None
-                if searched is not None:
-                    return searched
-            if isinstance(result, NoFix):
-                result = replace(result, match=found.fix)
-        return replace(result, stage="coarse") if coarser and isinstance(result, Fix) else result
+        looks = Looks(self, query)
+        return looks.settled(climb(query, METHOD, looks.rungs(widely=widely)))
 
-    def _by_hypotheses(self, query: Query) -> Fix | None:
-        """A fix with the best of all headings and heights within three sigmas; None without one, or without time.
-
-        A compass near motors is often off by more than a patch tolerates.
-        """
-        work_px = max(self._step(query)[1].values())
-        if not query.scheduler.can_afford({_HYPOTHESES: work_px}):
-            query.scheduler.note_refusal(_HYPOTHESES)
-            return None
-        with query.scheduler.costed(_HYPOTHESES, work_px):
-            found = self.find(query, widely=True)
-        if isinstance(found, NoFix):
-            return None
-        result = self._look_again(query, found)
-        if not isinstance(result, Fix):
-            return None
-        refined = self._refined(query.at(found.aligned.pose), result)
-        return refined if isinstance(refined, Fix) else None
-
-    def _find_and_judge(
-        self, query: Query, step: str, works: dict[int, float], coarser: int
-    ) -> tuple[PeakCandidate | NoFix, Result]:
-        """Find and judge the highest peak on a level; a variant of a step, whose cost is learned."""
-        with query.scheduler.costed((step, coarser), works[coarser]):
-            found = self.find(query, coarser=coarser)
-            return found, found if isinstance(found, NoFix) else self.judge(query, found)
-
-    def _step(self, query: Query) -> tuple[str, dict[int, float]]:
-        """The name of the correlation step, and the work of its variants."""
+    def works(self, query: Query) -> Works:
+        """Correlation on each level, the frame's own first; or the search of the whole map."""
         if query.prior is None:
-            return "ncc search", {0: float(query.site.width_px * query.site.height_px)}
-        return "ncc", expected_window_px(query, self.options)
+            return {(_SEARCH, 0): float(query.site.width_px * query.site.height_px)}
+        return {(METHOD, coarser): work for coarser, work in expected_window_px(query, self.options).items()}
 
-    def refine(self, query: Query, result: Result) -> Result:
-        """The fix of a fine peak, its pose refined if that is wanted, possible and affordable."""
-        if not isinstance(result, Fix) or result.stage != "fine" or result.attitude is not None:
-            return result
-        return self._refined(query, result)
-
-    def _refined(self, query: Query, result: Fix) -> Result:
-        if not self._can_refine(query):
-            return result
-        refinement = Refinement(query, self.samples, self.options)
-        return improved(query, result, "refinement", refinement.refine)
-
-    def _can_refine(self, query: Query) -> bool:
+    def can_refine(self, query: Query) -> bool:
         """Whether poses are refined."""
         known = query.telemetry
         return self.options.refine and known.height_agl_m is not None and known.grid_attitude is not None
@@ -288,36 +179,26 @@ class Ncc(Method):
             return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
         return found.fix
 
-    def _look_again(self, query: Query, found: PeakCandidate) -> Result | None:
-        """What the second look about the same place gives; None if it sees nothing, or there is no time."""
-        again = self.find_again(query, found, self._looked_at(query, found))
-        return None if again is None else self.judge(query, again)
-
-    def _looked_at(self, query: Query, found: PeakCandidate) -> Window:
-        """The window of a second look: the first one's; after a search, the surroundings of the place."""
-        if found.is_tested:
-            return found.fix.window
-        place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
-        correlator = self._correlator(replace(query, prior=place))
-        return correlator.window(found.aligned) or found.fix.window
-
-    def find_again(self, query: Query, found: PeakCandidate, window: Window | None = None) -> PeakCandidate | None:
+    def look_again(self, query: Query, found: PeakCandidate, window: Window) -> PeakCandidate | None:
         """The highest peak of the second look, see :mod:`engine.matching.second_look`.
 
         Args:
             query: the frame.
             found: the candidate of the first look.
-            window: to look at; None takes that of the first look, which the fix names in any case.
+            window: to look at; the fix names that of the first look in any case.
 
         Returns:
-            PeakCandidate | None: None if the template is nowhere on the map, or there is no time.
+            PeakCandidate | None: None if the template is nowhere on the map.
         """
-        window = window or found.fix.window
-        correlator, scheduler, work_px = self._correlator(query), query.scheduler, found.aligned.work_px(window)
-        if not scheduler.can_afford({_SECOND_LOOK: work_px}):
-            return None
-        with scheduler.costed(_SECOND_LOOK, work_px), scheduler.stage("second look"):
-            return second_look(correlator, found, window)
+        with query.scheduler.stage("second look"):
+            return second_look(self._correlator(query), found, window)
+
+    def surroundings(self, query: Query, found: PeakCandidate) -> Window:
+        """The window of a second look: the first one's; after a search, the surroundings of the place."""
+        if found.is_tested:
+            return found.fix.window
+        place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
+        return self._correlator(replace(query, prior=place)).window(found.aligned) or found.fix.window
 
     def _correlator(self, query: Query) -> Correlator:
         return Correlator(query, self.prepared, self.options)
@@ -342,3 +223,155 @@ class Ncc(Method):
         level = min(query.level_of(pose.height_agl_m) + coarser, query.site.levels - 1)
         with query.scheduler.stage("align"):
             return correlator.align(pose, level)
+
+
+class Looks:
+    """All looks at one frame: the rungs of NCC's ladder and what they leave to each other.
+
+    Args:
+        ncc: the method.
+        query: the frame.
+    """
+
+    def __init__(self, ncc: Ncc, query: Query) -> None:
+        self.query, self._ncc = query, ncc
+        self._refused: PeakCandidate | None = None  # the newest peak, if it was not accepted
+        self._is_new = False  # whether it had no second look
+        self._refusal: NoFix | None = None  # of the frame at its own heading and height
+        self._works, frame_px = ncc.works(query), float(query.gray.size)
+        self.coarsest = Rung(self._if_coarse_suffices, self._look_coarsely)
+        self.at_once = Rung(lambda answer: {_AT_ONCE: frame_px} if is_coarse(answer) else {}, self._refine_at_once)
+        self.levels = Rung(self._finer, self._correlate)
+        self.second = Rung(self._if_unseen, self._look_again)
+        self.search = Rung(self._if_refused, self._search)
+        self.refinement = Rung(
+            lambda answer: {_REFINEMENT: frame_px} if self._is_refinable(answer) else {}, self._refine
+        )
+
+    def rungs(self, *, widely: bool) -> list[Rung]:
+        """In their order; ``widely`` is that of :meth:`Ncc.locate`."""
+        wide = [self.search, self.second] if widely else []
+        return [self.coarsest, self.at_once, self.levels, self.second, *wide, self.refinement]
+
+    def settled(self, answer: Result) -> Result:
+        """The ladder's answer, or the refusal of the finer level if that contradicts a coarse fix."""
+        refusal = self._refusal
+        if not is_coarse(answer) or refusal is None or refusal.reason is Reason.LATE:
+            return answer
+        is_same = refusal.match is not None and self._is_same(answer, refusal.match)
+        return answer if is_same else refusal
+
+    def refuse(self, found: PeakCandidate | NoFix) -> None:
+        """Take a peak as refused."""
+        self._refused, self._is_new = (found, True) if isinstance(found, PeakCandidate) else (None, False)
+
+    # ------------------------------------------------------------------------------------------------ rungs
+
+    def _if_coarse_suffices(self, answer: Result | None) -> Works:
+        """The coarsest level, if refinement may start from its peak and there is time for both.
+
+        If roll, pitch or the ground's slope is unknown, the pose depends on the peak, which must then be fine.
+        """
+        query, (*finer, (coarsest, work)) = self.query, self._works.items()
+        is_wide = query.site.is_large and work > MAX_WINDOW_PX
+        is_known = query.telemetry.has_tilt and query.site.has_surface and self._ncc.can_refine(query)
+        if is_wide or not (finer and is_known and query.scheduler.can_afford({coarsest: work})):
+            return {}
+        if not query.scheduler.can_afford({coarsest: work, _AT_ONCE: float(query.gray.size)}):
+            query.scheduler.note_refusal(_AT_ONCE)
+            return {}
+        return {coarsest: work}
+
+    def _finer(self, answer: Result | None) -> Works:
+        """Every level that is finer than the answer."""
+        if answer is not None and not is_coarse(answer):
+            return {}
+        return dict(list(self._works.items())[: None if answer is None else -1])
+
+    def _look_coarsely(self, answer: Result | None, step: Hashable) -> Result | None:
+        """The peak of the coarsest level, if it is accepted; a refusal says nothing, as finer levels show more."""
+        found = self._find(step)
+        result = found if isinstance(found, NoFix) else self._ncc.judge(self.query, found)
+        return replace(result, stage="coarse") if isinstance(result, Fix) else None
+
+    def _correlate(self, answer: Result | None, step: Hashable) -> Result | None:
+        """The peak of one level."""
+        found = self._find(step)
+        self.refuse(found)
+        return self._judged(answer, found, found)
+
+    def _find(self, step: Hashable) -> PeakCandidate | NoFix:
+        assert isinstance(step, tuple)
+        return self._ncc.find(self.query, coarser=step[1])
+
+    def _look_again(self, answer: Result | None, step: Hashable) -> Result | None:
+        """The second look at the refused peak."""
+        query, first, self._is_new = self.query, self._refused, False
+        assert first is not None  # or it was not offered
+        again = self._ncc.look_again(query, first, self._ncc.surroundings(query, first))
+        if again is None:
+            return None
+        if not first.searched:
+            return self._judged(answer, again, first)
+        result = self._ncc.judge(query, again)
+        if isinstance(result, NoFix):
+            return None
+        self.query, self._refused = query.at(again.aligned.pose), None
+        return result
+
+    def _judged(
+        self, answer: Result | None, found: PeakCandidate | NoFix, first: PeakCandidate | NoFix
+    ) -> Result | None:
+        """The fix of a peak, or its refusal, which names the first look's match and leaves a coarse fix alone."""
+        query, height_m = self.query, self.query.telemetry.height_agl_m
+        result = found if isinstance(found, NoFix) else self._ncc.judge(query, found)
+        if isinstance(result, NoFix):
+            self._refusal = replace(result, match=None if isinstance(first, NoFix) else first.fix)
+            return None if isinstance(answer, Fix) else self._refusal
+        assert isinstance(found, PeakCandidate)
+        assert height_m is not None
+        self._refused = None
+        if found.aligned.level == query.level_of(height_m):
+            return result
+        result = replace(result, stage="coarse")
+        return with_unconfirmed_tilt(query, result) if is_coarse(answer) else result
+
+    def _if_unseen(self, answer: Result | None) -> Works:
+        """The second look at a refused peak that had none."""
+        found = self._refused
+        if found is None or not self._is_new:
+            return {}
+        return {_SECOND_LOOK: found.aligned.work_px(self._ncc.surroundings(self.query, found))}
+
+    def _if_refused(self, answer: Result | None) -> Works:
+        """The search of headings and heights, if a peak is refused."""
+        return {} if self._refused is None else {_HYPOTHESES: max(self._works.values())}
+
+    def _search(self, answer: Result | None, step: Hashable) -> None:
+        """The best of all headings and heights within three sigmas; only a second look can accept it.
+
+        A compass near motors is often off by more than a patch tolerates.
+        """
+        self.refuse(self._ncc.find(self.query, widely=True))
+
+    def _refine_at_once(self, answer: Result | None, step: Hashable) -> Fix:
+        """The pose of a coarse peak refined, or the peak with a tilt that nothing confirmed."""
+        assert isinstance(answer, Fix)
+        return self._refinement.refine_at_once(answer) or with_unconfirmed_tilt(self.query, answer)
+
+    def _refine(self, answer: Result | None, step: Hashable) -> Result:
+        """The pose of a fine peak refined."""
+        assert isinstance(answer, Fix)
+        return self._refinement.refine(answer)
+
+    def _is_refinable(self, answer: Result | None) -> bool:
+        return isinstance(answer, Fix) and answer.stage == "fine" and self._ncc.can_refine(self.query)
+
+    @property
+    def _refinement(self) -> Refinement:
+        return Refinement(self.query, self._ncc.samples, self._ncc.options)
+
+    def _is_same(self, coarse: Fix, fine: Fix) -> bool:
+        """Whether two peaks are of one place, so that neither is the other's rival."""
+        distance_m = float(np.hypot(*offset_between_m(coarse, fine)))
+        return distance_m < self._ncc.options.exclusion_m and agree_in_place(coarse, fine)

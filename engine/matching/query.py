@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -290,9 +289,11 @@ class Query:
         """The refusal of a frame whose window does not overlap the map."""
         return self.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)
 
-    def refuse_late(self, method: str, step: Hashable) -> NoFix:
-        """The refusal of a frame with no time for a step's quickest variant, see :class:`Scheduler`."""
-        self.scheduler.note_refusal(step)
+    def refuse_late(self, method: str) -> NoFix:
+        """The refusal of a frame with no time for a method's quickest variant."""
         left_ms = self.scheduler.deadline.remaining_ms
-        detail = f"{left_ms:.1f} ms are left; {method}'s quickest variant takes longer"
-        return self.refuse(Reason.LATE, detail, method)
+        if left_ms < 0.0:
+            return self.refuse(Reason.LATE, "the budget was spent before there was a fix", method)
+        return self.refuse(
+            Reason.LATE, f"{left_ms:.1f} ms are left; {method}'s quickest variant takes longer", method
+        )

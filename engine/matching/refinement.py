@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -35,7 +32,6 @@ from engine.runtime.scheduler import OutOfTime
 from engine.values import Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
-_T = TypeVar("_T")
 
 # If refinement fails on the frame's own level it restarts this many levels above: one if the tilt is known; two if
 # it is not, or if one failed as well.
@@ -59,18 +55,6 @@ _UNCONFIRMED_TILT_DEG = 1.5
 _DOUBTED_TILT_DEG, _DOUBTED_HEADING_DEG = 6.0, 6.0
 _HEIGHT_SHARE = 2e-4  # bias of the height from walls and the ground hidden behind them: 3 cm at 150 m
 _COARSE_SAMPLES = 800  # on a coarser level
-
-
-def improved(query: Query, fix: Fix, step: str, improve: Callable[[Fix], _T]) -> Fix | _T:
-    """The fix after a step, or unchanged if there is no time for the step."""
-    scheduler, work_px = query.scheduler, float(query.gray.size)
-    with scheduler.with_fix():
-        if not scheduler.can_afford({step: work_px}):
-            scheduler.note_refusal(step)
-            return fix
-        with suppress(OutOfTime), scheduler.costed(step, work_px):
-            return improve(fix)
-    return fix
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import partial
 
@@ -14,14 +14,14 @@ from engine.matching.align import SIDE_STEP_PX
 from engine.matching.evidence import is_beyond_doubt, nats_of
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate
+from engine.matching.ladder import Rung, Works, climb, rehearse
 from engine.matching.method import Method
 from engine.matching.query import Query
-from engine.matching.refinement import MIN_CORRELATION_AT_ONCE, Refinement, improved, with_unconfirmed_tilt
+from engine.matching.refinement import MIN_CORRELATION_AT_ONCE, Refinement, with_unconfirmed_tilt
 from engine.matching.views import coarser_scale, drawn_px
 from engine.options import MatcherOptions, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.runtime.scheduler import OutOfTime
 from engine.runtime.tensors import torch
 from engine.values import Fix, NoFix, Reason, Result, Window
 
@@ -88,103 +88,45 @@ class Sift(Method):
         longest_px = 3 * max(query.gray.shape)
         if chosen_backend(self.options.backend, torch.device(query.device)) == "compiled":
             prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX))
-        self._by_few_features(query)
-        for share, work_px in self._work_px(query).items():
-            with query.scheduler.costed(("sift", share), work_px):
-                result = self._at_scale(query, share)
-            if isinstance(result, Fix) and self._can_refine(query):
-                self._refined(query, result)
-                Refinement(query, self.samples, self._enhancement).refine_from_coarser(result)
+        looks = Looks(self, query)
+        rehearse(query, looks.few, None)
+        for answer in rehearse(query, looks.all, None):
+            rehearse(query, Looks(self, query).refinement, answer)
+            if isinstance(answer, Fix) and self.can_refine(query):
+                self._refinement(query).refine_from_coarser(answer)
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map."""
         if query.prior is None:
             self.locate(query)
 
-    def locate(self, query: Query) -> Result:
+    def locate(self, query: Query, agrees: Callable[[Fix], bool] | None = None) -> Result:
         """A refined fix by few features, else one by all at the highest resolution that time allows.
 
         Few features take a fifth of the time, and refinement restores the accuracy that their pose lacks.
-        """
-        few = self._by_few_features(query)
-        if few is None:
-            result = self._by_all_features(query)
-            return self._refined(query, result) if isinstance(result, Fix) else result
-        refined = self._refined(query, few)
-        is_refined, is_certain = refined.stage == "refined", _is_certain(query, few)
-        if is_refined and (is_certain or refined.score >= MIN_CORRELATION_AT_ONCE):
-            return refined
-        result = self._by_all_after(query, few) if is_certain else self._by_all_features(query)
-        return self._refined(query, result) if is_refined and isinstance(result, Fix) else result
-
-    def confirm(self, query: Query, agrees: Callable[[Fix], bool]) -> Result:
-        """A fix to compare with another method's: not refined by the grey levels that the other uses.
 
         Args:
             query: the frame.
-            agrees: whether a fix agrees with the other method's. If one by few features does not, all are used.
+            agrees: whether a fix agrees with another method's. The fix is then for comparison: not refined by the
+                grey levels that the other uses, and by all features if one by few does not agree.
         """
-        few = self._by_few_features(query)
-        if few is not None and _is_certain(query, few) and agrees(few):
-            return few
-        return self._by_all_features(query)
+        looks = Looks(self, query, agrees)
+        return looks.settled(climb(query, METHOD, looks.rungs))
 
-    def _by_few_features(self, query: Query) -> Fix | None:
-        """A fix by half as many keypoints, a level coarser and not upsampled; None if it is not accepted."""
-        scale = self._few_scale(query)
-        if scale is None or not self._has_time_for_few(query):
-            return None
-        with query.scheduler.costed(_FEW, self._work_px(query)[1.0]):
-            found = FeatureMatcher(query, self.landmarks, replace(self._few, scale=scale)).find_at_once()
-        if isinstance(found, NoFix) or found.evidence.nats < query.needed_nats:
-            return None
-        return found.fix
-
-    def _few_scale(self, query: Query) -> float | None:
+    def few_scale(self, query: Query) -> float | None:
         """The frame's scale for few features; None if they are not wanted or the map has no such level."""
         height_m = query.telemetry.height_agl_m
-        if query.prior is None or height_m is None or not self.options.upright or not self._can_refine(query):
+        if query.prior is None or height_m is None or not self.options.upright or not self.can_refine(query):
             return None
         return coarser_scale(query, height_m, self.options.scale)
 
-    def _has_time_for_few(self, query: Query) -> bool:
-        """Whether time allows few features first and then all, or only few."""
-        scheduler, works = query.scheduler, self._work_px(query)
-        if scheduler.can_afford({_FEW: works[1.0], ("sift", _REDUCED[-1]): works[_REDUCED[-1]]}):
-            return True
-        is_only = scheduler.has_fix or scheduler.first_affordable("sift", works) is None
-        if is_only and scheduler.can_afford({_FEW: works[1.0]}):
-            return True
-        scheduler.note_refusal(_FEW)
-        return False
+    def find_few(self, query: Query) -> PoseCandidate | NoFix:
+        """The pose by half as many keypoints, a level coarser and not upsampled."""
+        scale = self.few_scale(query)
+        assert scale is not None  # or few features are not wanted
+        return FeatureMatcher(query, self.landmarks, replace(self._few, scale=scale)).find_at_once()
 
-    def _by_all_after(self, query: Query, few: Fix) -> Result:
-        """A fix by all features; without time the fix by few, with a covariance for a wrong tilt.
-
-        Few features of a coarse picture follow the telemetry's attitude, which nothing has confirmed.
-        """
-        try:
-            with query.scheduler.with_fix():
-                result = self._by_all_features(query)
-        except OutOfTime:
-            result = query.refuse_late(METHOD, ("sift", _REDUCED[-1]))
-        if isinstance(result, Fix) or result.reason is not Reason.LATE:
-            return result
-        return replace(with_unconfirmed_tilt(query, few), stage="coarse")
-
-    def _by_all_features(self, query: Query) -> Result:
-        """An unrefined fix by all keypoints, at the highest frame resolution that time allows."""
-        step = "sift"
-        if query.prior is None or query.telemetry.height_agl_m is None:
-            step = "sift search" if query.prior is None else "sift heights"
-        works = self._work_px(query)
-        share = query.scheduler.first_affordable(step, works)
-        if share is None:
-            return query.refuse_late(METHOD, (step, _REDUCED[-1]))
-        with query.scheduler.costed((step, share), works[share]):
-            return self._at_scale(query, share)
-
-    def _can_refine(self, query: Query) -> bool:
+    def can_refine(self, query: Query) -> bool:
         """Whether poses are refined: only with trusted telemetry over a surface model."""
         options, known = self.options, query.telemetry
         if not options.refine or not options.use_attitude or options.matcher is not None:
@@ -192,16 +134,13 @@ class Sift(Method):
         is_known = known.height_agl_m is not None and known.grid_heading_deg is not None and known.has_tilt
         return is_known and query.site.has_surface
 
-    def _refined(self, query: Query, fix: Fix) -> Fix:
-        """The fix with its pose refined, if that is possible and affordable."""
-        if not self._can_refine(query):
-            return fix
-        refinement = Refinement(query, self.samples, self._enhancement)
+    def refined(self, query: Query, fix: Fix) -> Fix | None:
+        """The fix with its pose refined, from a coarser level if necessary; None if that fails."""
+        refinement = self._refinement(query)
+        return refinement.refine_at_once(fix) or refinement.refine_from_coarser(fix)
 
-        def improve(fix: Fix) -> Fix:
-            return refinement.refine_at_once(fix) or refinement.refine_from_coarser(fix) or fix
-
-        return improved(query, fix, _REFINEMENT, improve)
+    def _refinement(self, query: Query) -> Refinement:
+        return Refinement(query, self.samples, self._enhancement)
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""
@@ -220,21 +159,123 @@ class Sift(Method):
         """The fix if its pose is accepted, else a refusal."""
         return FeatureMatcher(query, self.landmarks, self.options).judge(found)
 
-    def _work_px(self, query: Query) -> dict[float, float]:
-        """Pixels of the matched picture, which determine the cost, per share of the usual scale."""
+    def works(self, query: Query) -> Works:
+        """Shares of the usual scale, by the pixels of the matched picture, which determine the cost."""
         known, scale = query.telemetry, self.options.scale
+        if query.prior is None or known.height_agl_m is None:
+            step = "sift search" if query.prior is None else "sift heights"
+        else:
+            step = METHOD
         if not self.options.upright or known.height_agl_m is None or known.grid_heading_deg is None:
-            return {share: query.gray.size * (scale * share) ** 2 for share in _REDUCED}
-        return {share: drawn_px(query, known.height_agl_m, scale * share) for share in _REDUCED}
+            return {(step, share): query.gray.size * (scale * share) ** 2 for share in _REDUCED}
+        return {(step, share): drawn_px(query, known.height_agl_m, scale * share) for share in _REDUCED}
 
-    def _at_scale(self, query: Query, share: float) -> Result:
+    def at_scale(self, query: Query, share: float) -> Result:
+        """The fix by all features at a share of the usual scale, not refined; or its refusal."""
         options = self.options if share == 1.0 else replace(self.options, scale=self.options.scale * share)
         found = self.find(query, options)
         result = found if isinstance(found, NoFix) else self.judge(query, found)
         return replace(result, stage="coarse") if share < 1.0 and isinstance(result, Fix) else result
 
 
-def _is_certain(query: Query, fix: Fix) -> bool:
-    """Whether a pose is so probable that no null hypothesis is needed."""
-    assert fix.confidence is not None  # each pose has one
-    return is_beyond_doubt(nats_of(fix.confidence), query.risk)
+class Looks:
+    """All looks at one frame: the rungs of SIFT's ladder and what they leave to each other.
+
+    Args:
+        sift: the method.
+        query: the frame.
+        agrees: see :meth:`Sift.locate`.
+    """
+
+    def __init__(self, sift: Sift, query: Query, agrees: Callable[[Fix], bool] | None = None) -> None:
+        self._sift, self._query, self._agrees = sift, query, agrees
+        self._few: Fix | None = None
+        self._is_settled = self._is_unrefinable = False
+        self._works, frame_px = sift.works(query), float(query.gray.size)
+        self.few = Rung(self._if_few_suffice, self._by_few)
+        self.few_refined = Rung(
+            lambda answer: {} if self._few is None or agrees else {_REFINEMENT: frame_px}, self._refine_few
+        )
+        self.all = Rung(lambda answer: {} if self._is_settled else self._works, self._by_all)
+        self.refinement = Rung(
+            lambda answer: {_REFINEMENT: frame_px} if self._is_refinable(answer) else {}, self._refine
+        )
+
+    @property
+    def rungs(self) -> list[Rung]:
+        """In their order."""
+        return [self.few, self.few_refined, self.all, self.refinement]
+
+    def settled(self, answer: Result) -> Result:
+        """The ladder's answer; a fix by few features that nothing confirmed has a covariance for a wrong tilt.
+
+        Few features of a coarse picture follow the telemetry's attitude.
+        """
+        if answer is not self._few or self._is_settled:
+            return answer
+        return replace(with_unconfirmed_tilt(self._query, self._few), stage="coarse")
+
+    # ------------------------------------------------------------------------------------------------ rungs
+
+    def _if_few_suffice(self, answer: Result | None) -> Works:
+        """Few features, if time allows all of them as well, or only few."""
+        query, scheduler = self._query, self._query.scheduler
+        if self._sift.few_scale(query) is None:
+            return {}
+        few: Works = {_FEW: next(iter(self._works.values()))}
+        *_, least = self._works.items()
+        if scheduler.has_fix or not scheduler.can_afford(dict([least])):
+            return few
+        if scheduler.can_afford({**few, **dict([least])}):
+            return few
+        scheduler.note_refusal(_FEW)
+        return {}
+
+    def _by_few(self, answer: Result | None, step: Hashable) -> Fix | None:
+        """The fix by few features, if it is beyond doubt and agrees."""
+        found = self._sift.find_few(self._query)
+        if isinstance(found, NoFix) or found.evidence.nats < self._query.needed_nats:
+            return None
+        self._few = found.fix
+        if not self._is_certain or (self._agrees and not self._agrees(found.fix)):
+            return None
+        self._is_settled = self._agrees is not None
+        return found.fix
+
+    def _refine_few(self, answer: Result | None, step: Hashable) -> Fix | None:
+        """The fix by few features refined, if it is beyond doubt or the picture confirms it."""
+        assert self._few is not None  # or it was not offered
+        refined = self._sift.refined(self._query, self._few)
+        self._is_unrefinable = refined is None
+        if refined is None or not (self._is_certain or refined.score >= MIN_CORRELATION_AT_ONCE):
+            return None
+        self._is_settled = True
+        return refined
+
+    def _by_all(self, answer: Result | None, step: Hashable) -> Result | None:
+        """The fix by all features, or their refusal."""
+        assert isinstance(step, tuple)
+        result = self._sift.at_scale(self._query, step[1])
+        is_late = isinstance(result, NoFix) and result.reason is Reason.LATE
+        return None if is_late and isinstance(answer, Fix) else result
+
+    def _is_refinable(self, answer: Result | None) -> bool:
+        is_done = self._is_settled or self._is_unrefinable or self._agrees is not None
+        return (
+            isinstance(answer, Fix)
+            and answer is not self._few
+            and not is_done
+            and self._sift.can_refine(self._query)
+        )
+
+    def _refine(self, answer: Result | None, step: Hashable) -> Fix | None:
+        """The fix by all features refined."""
+        assert isinstance(answer, Fix)
+        return self._sift.refined(self._query, answer)
+
+    @property
+    def _is_certain(self) -> bool:
+        """Whether few features are so much evidence that no null hypothesis is needed."""
+        assert self._few is not None
+        assert self._few.confidence is not None  # each pose has one
+        return is_beyond_doubt(nats_of(self._few.confidence), self._query.risk)

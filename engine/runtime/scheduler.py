@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from statistics import median_low
-from typing import Any
 
 from engine.budget import Deadline
 from engine.runtime import threads
@@ -80,6 +79,7 @@ class Scheduler:
         self.deadline, self._device, self.costs = deadline, device, costs or Costs()
         self.stages_ms: dict[str, float] = {}
         self._step: tuple[Hashable, float] | None = None  # the running step and its work
+        self._refused: set[Hashable] = set()
         self.has_fix = self._is_under_way = self._has_run = False
 
     def can_afford(self, works: Mapping[Hashable, float]) -> bool:
@@ -87,14 +87,11 @@ class Scheduler:
         needed_ms = sum(self.costs.needed_ms(step, work, has_fix=self.has_fix) for step, work in works.items())
         return needed_ms + (self.costs.wait_ms() if self.has_fix else 0.0) <= self.deadline.remaining_ms
 
-    def first_affordable(self, step: str, works: Mapping[Any, float]) -> Any:
-        """The first variant of a step, by its work, that time allows; None if there is none."""
-        return next((variant for variant, work in works.items() if self.can_afford({(step, variant): work})), None)
-
     def note_refusal(self, step: Hashable) -> None:
-        """Record that a step was refused for its cost."""
-        self.costs.note_refusal(step, is_idle=not self._has_run)
-        self._has_run = True  # forget once a frame
+        """Record that a step was refused for its cost, once a frame."""
+        if step not in self._refused:
+            self.costs.note_refusal(step, is_idle=not (self._has_run or self._refused))
+            self._refused.add(step)
 
     @contextmanager
     def with_fix(self) -> Iterator[None]:

@@ -18,17 +18,16 @@ def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
     ground, site, camera, monkeypatch, off_m, same_place
 ):
     frame, prior = ground.frame(camera, NADIR, 150.0, heading_deg=20.0), ground.prior(NADIR)
-    own, compared = Ncc.correlate, Sift.confirm
+    own, compared = Ncc.locate, Sift.locate
     seen = []
-    monkeypatch.setattr(Sift, "confirm", lambda self, *args: seen.append(compared(self, *args)) or seen[-1])
+    monkeypatch.setattr(Sift, "locate", lambda self, *args: seen.append(compared(self, *args)) or seen[-1])
 
     def off(self, query, *args, **kwargs):
         fix = own(self, query, *args, **kwargs)
-        return replace(fix, east_m=fix.east_m + off_m, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
+        off = {"east_m": fix.east_m + off_m, "covariance_m2": 0.01 * np.eye(3), "map_sigma_m": 0.0}
+        return replace(fix, stage="fine", **off)
 
-    monkeypatch.setattr(Ncc, "correlate", off)
-    monkeypatch.setattr(Ncc, "_by_coarse_peak", lambda _self, _query: None)
-    monkeypatch.setattr(Ncc, "refine", lambda _self, _query, result: result)  # it would lead back
+    monkeypatch.setattr(Ncc, "locate", off)
     result = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)
     if same_place:
         assert isinstance(result, Fix)
@@ -46,15 +45,18 @@ def test_few_features_that_disagree_are_not_the_second_opinion(ground, site, cam
         ground.frame(camera, NADIR, 150.0, heading_deg=20.0, roll_deg=0.0, pitch_deg=0.0),
         ground.prior(NADIR),
     )
-    few = Sift._by_few_features
     matcher = SceneMatcher(site, camera, "auto", "cpu")
     expected = matcher.locate(frame, prior)
 
-    def off(self, query):
-        fix = few(self, query)
-        return replace(fix, north_m=fix.north_m + 4.0, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
+    few = Sift.find_few
 
-    monkeypatch.setattr(Sift, "_by_few_features", off)
+    def off(self, query):
+        found = few(self, query)
+        north_m = found.fix.north_m + 4.0
+        fix = replace(found.fix, north_m=north_m, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
+        return replace(found, fix=fix)
+
+    monkeypatch.setattr(Sift, "find_few", off)
     result = matcher.locate(frame, prior)
     assert result.stage == expected.stage == "verified"
     assert (result.east_m, result.north_m) == (expected.east_m, expected.north_m)

@@ -21,7 +21,7 @@ from engine import (
     SceneMatcher,
 )
 from engine.budget import Deadline
-from engine.matching.ncc import Ncc
+from engine.matching.ncc import Looks, Ncc
 from engine.matching.refinement import Refinement
 from engine.matching.sift import Sift
 from engine.runtime import scheduler, threads
@@ -126,7 +126,7 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(ground, make, f
     """Where there is no time for the finest level; and where there is, the coarse one is enough."""
     hurried = make("ncc", ncc=cost_of_the_finest(make, frame, prior, "ncc", "ncc")).locate(frame, prior, HURRY)
     by_coarse = make("ncc").locate(frame, prior)
-    monkeypatch.setattr(Ncc, "_by_coarse_peak", lambda self, query: None)
+    monkeypatch.setattr(Looks, "_if_coarse_suffices", lambda self, answer: {})
     by_fine = make("ncc").locate(frame, prior)
     for fix in (hurried, by_coarse, by_fine):
         assert off_m(ground, fix) < 0.3
@@ -135,11 +135,12 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(ground, make, f
     assert apart_m < by_fine.relative_sigma_m
 
 
-def test_a_refinement_that_is_abandoned_leaves_the_coarse_fix(ground, make, frame, prior, monkeypatch):
-    def out_of_time(self, fix):
+def test_steps_that_are_abandoned_leave_the_coarse_fix(ground, make, frame, prior, monkeypatch):
+    def out_of_time(*_):
         raise OutOfTime
 
     monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
+    monkeypatch.setattr(Looks, "_correlate", out_of_time)
     fix = make("ncc").locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 3.0
     assert fix.stage == "coarse"
@@ -159,19 +160,20 @@ def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(
     make, frame, prior, monkeypatch, reason, off_m, is_fixed
 ):
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
-    coarse = make("ncc")._method._by_coarse_peak
+    coarse = []
 
-    def refused(self, query, level, **_):
-        fix = coarse(query)
-        match = None if off_m is None else replace(fix, east_m=fix.east_m + off_m)
-        return replace(query.refuse(reason, "of the finer peak", "ncc"), match=match)
+    def refused(self, answer, _step):
+        coarse.append(answer)
+        match = None if off_m is None else replace(answer, east_m=answer.east_m + off_m)
+        self._refusal = replace(self.query.refuse(reason, "of the finer peak", "ncc"), match=match)
 
-    monkeypatch.setattr(Ncc, "correlate", refused)
+    monkeypatch.setattr(Looks, "_correlate", refused)
     result = make("ncc").locate(frame, prior, HURRY)
     assert isinstance(result, Fix) == is_fixed
     if is_fixed:  # refinement did not confirm the tilt, and a refused peak makes nothing more certain
         assert result.confidence == pytest.approx(1.0, abs=1e-3)
-        assert result.sigma_m > 1.5 * coarse(make("ncc")._query(frame, prior, Deadline(HURRY))).sigma_m
+        assert result.relative_sigma_m > 3.5
+        assert replace(result, timings=coarse[0].timings) == coarse[0]
     assert (result.stage if is_fixed else result.reason) == ("coarse" if is_fixed else reason)
 
 
@@ -190,12 +192,8 @@ def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_coarser_level(
 
     monkeypatch.setattr(Ncc, "find", noted)
     matcher = make("ncc")
-    affordable = {2: 0, **dict.fromkeys(finer, 0)}
-    monkeypatch.setattr(
-        Scheduler,
-        "first_affordable",
-        lambda _self, _step, works: next((w for w in works if w in affordable), None),
-    )
+    too_dear = {("ncc", level) for level in (0, 1)} - {("ncc", level) for level in finer}
+    monkeypatch.setattr(Scheduler, "can_afford", lambda _self, works: not too_dear & set(works))
     fix = matcher.locate(frame, prior, HURRY)
     assert correlated == [2, *finer[-1:]]
     assert (fix.relative_sigma_m > 3.5) == (fix.stage == "coarse")
@@ -204,14 +202,14 @@ def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_coarser_level(
 def test_refinement_at_once_is_begun_only_where_there_is_time_for_it(ground, make, frame, prior, monkeypatch):
     """What comes before it may have taken longer than thought."""
     matcher = make("ncc")
-    by_coarse_peak = Ncc._by_coarse_peak
+    look_coarsely = Looks._look_coarsely
 
-    def slow(self, query):
-        found = by_coarse_peak(self, query)
+    def slow(self, *args):
+        found = look_coarsely(self, *args)
         matcher._costs.per_unit = {"refinement": 1e9, "ncc": 1e9}
         return found
 
-    monkeypatch.setattr(Ncc, "_by_coarse_peak", slow)
+    monkeypatch.setattr(Looks, "_look_coarsely", slow)
     fix = matcher.locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 3.0
     assert fix.stage == "coarse"
@@ -264,13 +262,13 @@ def test_with_time_for_one_method_there_is_one(ground, make, frame, prior, costs
 
 
 def test_two_fixes_of_two_places_are_none(make, frame, prior, monkeypatch):
-    honest = Sift.confirm
+    honest = Sift.locate
 
-    def elsewhere(*args, **named):
-        fix = honest(*args, **named)
+    def elsewhere(*args):
+        fix = honest(*args)
         return replace(fix, east_m=fix.east_m + 40.0)
 
-    monkeypatch.setattr(Sift, "confirm", elsewhere)
+    monkeypatch.setattr(Sift, "locate", elsewhere)
     result = make("auto").locate(frame, prior)
     assert isinstance(result, NoFix)
     assert result.reason is Reason.INCONSISTENT

@@ -208,11 +208,11 @@ def test_few_features_leave_the_time_for_all(ground, camera, site, monkeypatch):
 
 
 def test_certain_few_features_are_kept_where_all_come_too_late(ground, camera, matcher, monkeypatch):
-    def out_of_time(_self, _query):
+    def out_of_time(_self, _query, _share):
         raise OutOfTime
 
     refuse_to_refine(monkeypatch)
-    monkeypatch.setattr(Sift, "_by_all_features", out_of_time)
+    monkeypatch.setattr(Sift, "at_scale", out_of_time)
     fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
     assert isinstance(fix, Fix)
     assert fix.stage == "coarse"
