@@ -1,4 +1,4 @@
-"""Local features: a batched SIFT that detects, describes and matches tensors on any torch device.
+"""Local features: a batched SIFT that detects, describes and matches arrays, or tensors on any torch device.
 
 The detector is Lowe's: extrema of differences of Gaussians over position and scale, refined by a quadratic.
 The descriptor is Lowe's 4 x 4 cells of 8 orientations. On a CPU both are compiled loops
@@ -21,13 +21,19 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.runtime.tensors import Tensor, torch
-from engine.sift import BACKENDS, tensors
+from engine.runtime.device import CPU, Device, Picture, as_float, as_tensor, element_type, like, on_host
+from engine.sift import BACKENDS
 from engine.sift.matching import match
 from engine.sift.scale_space import octaves_of
-from engine.sift.values import Features, Matches, SiftChoice
+from engine.sift.values import Features, Matches, SiftChoice, fields_of
+
+if TYPE_CHECKING:
+    from engine.runtime.tensors import torch
 
 _MAX_MAGNITUDE = 1e6  # of a pixel's value
 _MAX_SPREAD = 1000
@@ -35,13 +41,13 @@ __all__ = ["Features", "Matches", "chosen_backend", "match", "plans_created", "p
 
 
 def sift(
-    images: Tensor,
+    images: Picture,
     *,
     max_keypoints: int = 300,
     backend: str = "auto",
     upright: bool = False,
     up_deg: float = 0.0,
-    mask: Tensor | None = None,
+    mask: Picture | None = None,
     upsample: int = 2,
     contrast_threshold: float = 0.02,
     root: bool = True,
@@ -50,7 +56,7 @@ def sift(
     """Detect and describe at most ``max_keypoints`` SIFT features per image, spread over the image.
 
     Args:
-        images: (B, 1, H, W) floating point, values in [0, 1].
+        images: (B, 1, H, W) floating point, values in [0, 1]: an array, or a tensor on any device.
         max_keypoints: Number of slots N.
         backend: "compiled" loops (CPU) or "kornia" (any device); "auto" takes the first on a CPU, else the second.
         upright: Use ``up_deg`` as every angle instead of the dominant gradient's; faster, for a known heading.
@@ -63,7 +69,7 @@ def sift(
             ranks by strength alone: contrast times the square root of scale.
 
     Returns:
-        Features on the images' device; no value is NaN.
+        Features as arrays or tensors, as the images are, on their device; no value is NaN.
 
     Raises:
         ShapeError: The images or the mask have another shape.
@@ -76,15 +82,27 @@ def sift(
         max_keypoints, math.radians(up_deg) if upright else None, int(upsample), contrast_threshold, root, spread
     )
     # Sums of values far from [0, 1] may overflow, and the loops use them as indices.
-    pictures = images[:, 0].float().nan_to_num(0.0, 1.0, 0.0).clamp(-_MAX_MAGNITUDE, _MAX_MAGNITUDE)
-    if chosen_backend(backend, images.device) == "kornia":
-        return tensors.find_features(pictures, mask, choice)
-    from engine.sift import loops  # numba takes a while to import
+    pictures = as_float(images[:, 0], "float32")
+    if chosen_backend(backend, device_of(images)) == "kornia":
+        from engine.sift import tensors  # torch takes a while to import
 
-    return loops.find_features(pictures, mask, choice)
+        pictures = as_tensor(pictures).nan_to_num(0.0, 1.0, 0.0).clamp(-_MAX_MAGNITUDE, _MAX_MAGNITUDE)
+        found = tensors.find_features(pictures, None if mask is None else as_tensor(mask), choice)
+    else:
+        from engine.sift import loops  # numba takes a while to import
+
+        pictures = np.nan_to_num(on_host(pictures), nan=0.0, posinf=1.0, neginf=0.0)
+        pictures = np.ascontiguousarray(pictures.clip(-_MAX_MAGNITUDE, _MAX_MAGNITUDE))
+        found = loops.find_features(pictures, None if mask is None else on_host(mask), choice)
+    return Features(*(like(images, values) for values in fields_of(found)))
 
 
-def chosen_backend(backend: str, device: torch.device) -> str:
+def device_of(picture: Picture) -> Device | torch.device:
+    """The device that an array or a tensor is on."""
+    return CPU if isinstance(picture, np.ndarray) else picture.device
+
+
+def chosen_backend(backend: str, device: Device | torch.device) -> str:
     """The backend of features on a device.
 
     Args:
@@ -126,14 +144,14 @@ def plans_created() -> int:
     return loops.filters.cache_info().misses
 
 
-def _check_images(images: Tensor, mask: Tensor | None) -> None:
+def _check_images(images: Picture, mask: Picture | None) -> None:
     if images.ndim != 4 or images.shape[1] != 1 or 0 in images.shape:
         raise ShapeError(f"images: expected (B, 1, H, W), got {tuple(images.shape)}")
-    if not images.is_floating_point():
+    if "float" not in element_type(images):
         raise DtypeError(f"images: expected floating point, got {images.dtype}")
     if mask is not None and mask.shape != images.shape:
         raise ShapeError(f"mask: expected {tuple(images.shape)} as the images, got {tuple(mask.shape)}")
-    if mask is not None and mask.dtype != torch.bool:
+    if mask is not None and element_type(mask) != "bool":
         raise DtypeError(f"mask: expected bool, got {mask.dtype}")
 
 

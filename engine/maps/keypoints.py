@@ -15,6 +15,7 @@ import numpy as np
 from engine.learned import KeypointMatcher, Keypoints
 from engine.maps.landmarks import as_picture
 from engine.maps.recently_used import RecentlyUsed
+from engine.runtime.device import CPU, as_tensor
 from engine.runtime.tensors import torch
 from engine.values import Window
 
@@ -82,7 +83,7 @@ class KeypointMap:
         x1, y1 = min(columns, x0 + TILE_PX), min(rows, y0 + TILE_PX)
         left, top = max(0, x0 - HALO_PX), max(0, y0 - HALO_PX)
         wide = Window(left, top, min(columns, x1 + HALO_PX) - left, min(rows, y1 + HALO_PX) - top)
-        picture = as_picture(self._site.gray(wide, level), torch.device("cpu"))
+        picture = as_tensor(as_picture(self._site.gray(wide, level), CPU))
         found = self._matcher.extract(picture, math.ceil(wide.area_px / PX_PER_KEYPOINT))
         xy = found.xy_px + found.xy_px.new_tensor([left, top])
         own = ((xy >= xy.new_tensor([x0, y0]) - 0.5) & (xy < xy.new_tensor([x1, y1]) - 0.5)).all(dim=1)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from engine.features import Features, chosen_backend, sift
 from engine.maps.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
 from engine.maps.recently_used import RecentlyUsed
-from engine.runtime.tensors import download, torch, upload
+from engine.runtime.device import Device, Picture, all_on_host, all_placed, as_float, placed
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -81,9 +81,9 @@ class LandmarkMap:
         backend: of :func:`engine.features.sift`.
     """
 
-    def __init__(self, site: OrthoMap, device: str | torch.device, backend: str = "auto") -> None:
+    def __init__(self, site: OrthoMap, device: Device, backend: str = "auto") -> None:
         self._site, self._device = site, device
-        self._backend = chosen_backend(backend, torch.device(device))
+        self._backend = chosen_backend(backend, device)
         self._tiles: RecentlyUsed[_Key, NamedArrays] = RecentlyUsed()
         self._max_landmarks = MAX_LANDMARKS
 
@@ -170,12 +170,12 @@ class LandmarkMap:
             max_keypoints=_SLOTS,
             backend=self._backend,
             upright=upright,
-            mask=torch.from_numpy(mask)[None, None].to(self._device),
+            mask=placed(mask[None, None], self._device),
             contrast_threshold=MIN_CONTRAST,
             spread=1,  # by strength alone; the level's cells spread landmarks
         )
         fields = (found.valid, found.xy_px, found.scale_px, found.angle_deg, found.descriptors)
-        valid, *all_slots = download([values[0] for values in fields])
+        valid, *all_slots = all_on_host([values[0] for values in fields])
         positions, scale, angle, descriptors = (values[valid] for values in all_slots)
         xy = positions + np.array([left, top], np.float32)
         rank = _rank_in_cells(xy)
@@ -192,16 +192,17 @@ class LandmarkMap:
 
     def _to_landmarks(self, found: NamedArrays) -> Landmarks:
         columns = [found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors")]
-        xy, scale, angle, descriptors = (column[None] for column in upload(columns, self._device))
-        valid = torch.ones(1, len(found["rank"]), dtype=torch.bool, device=self._device)
-        return Landmarks(Features(xy, scale, angle, descriptors.float(), valid), found["xy_px"], found["points_m"])
+        xy, scale, angle, descriptors = (column[None] for column in all_placed(columns, self._device))
+        valid = scale > 0.0  # of every landmark
+        features = Features(xy, scale, angle, as_float(descriptors, "float32"), valid)
+        return Landmarks(features, found["xy_px"], found["points_m"])
 
 
 def _count(tile: NamedArrays) -> int:
     return len(tile["rank"])
 
 
-def as_picture(gray: NDArray[np.uint8], device: str | torch.device) -> torch.Tensor:
+def as_picture(gray: NDArray[np.uint8], device: Device) -> Picture:
     """Grey levels as a batch of one picture for :func:`engine.features.sift`.
 
     Args:
@@ -211,7 +212,7 @@ def as_picture(gray: NDArray[np.uint8], device: str | torch.device) -> torch.Ten
     Returns:
         (1, 1, H, W) float32 in [0, 1].
     """
-    return torch.from_numpy(np.ascontiguousarray(gray)).to(device)[None, None].float() / 255.0
+    return as_float(placed(np.ascontiguousarray(gray), device), "float32")[None, None] / 255.0
 
 
 def _keys(window: Window, level: int, upright: bool) -> list[_Key]:

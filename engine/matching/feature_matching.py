@@ -8,6 +8,7 @@ the frame itself are matched at any angle and scale, and RANSAC finds those that
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,7 +18,6 @@ from engine.features import Features, Matches, match, sift
 from engine.geo import wrap_heading_deg
 from engine.maps.landmarks import LandmarkMap, Landmarks, as_picture
 from engine.matching.align import Orthophoto, orthorectify
-from engine.matching.point_finding import PointFinder
 from engine.matching.pose import PoseStart
 from engine.matching.query import Query
 from engine.matching.relief import ground_relief
@@ -25,8 +25,11 @@ from engine.matching.views import MapView, TelemetryHypothesis, map_px_per_pixel
 from engine.matching.votes import Vote, similarity, vote
 from engine.options import SiftOptions
 from engine.orthomap import OrthoMap
-from engine.runtime.tensors import download, torch, upload
+from engine.runtime.device import Picture, all_on_host, all_placed, as_float, on_host, placed
 from engine.values import Attitude
+
+if TYPE_CHECKING:  # it loads torch
+    from engine.matching.point_finding import PointFinder
 
 Array = NDArray[np.float64]
 
@@ -82,6 +85,8 @@ def match_views(
         finder: finds the points instead of features; None takes ``options.matcher`` if there is one.
     """
     if finder is None and options.matcher is not None:
+        from engine.matching.point_finding import PointFinder
+
         finder = PointFinder(options.matcher)
     source = finder or landmarks
     assert source is not None  # only a finder needs no landmarks
@@ -90,9 +95,9 @@ def match_views(
         found = [_by_orthophoto(query, source, options, view, attitude, height_m) for view in views]
         if None not in found:
             return [matched for matched in found if matched is not None]
-    if isinstance(source, PointFinder):
-        return _by_reduced(query, source, options, views)
-    return _by_frame(query, source, options, views, hypothesis)
+    if isinstance(source, LandmarkMap):
+        return _by_frame(query, source, options, views, hypothesis)
+    return _by_reduced(query, source, options, views)
 
 
 # ----------------------------------------------------------------------------------- by the orthophoto
@@ -113,11 +118,11 @@ def _by_orthophoto(
         photo = orthorectify(query.gray, query.camera, attitude, height_m, jacobian, relief)
     if photo is None:
         return None
-    if isinstance(source, PointFinder):
+    if isinstance(source, LandmarkMap):
+        photo_px, map_px, scale_px = _feature_pairs(query, source, photo, view, options)
+    else:
         photo_px, map_px = source.find(query, as_picture(photo.gray, query.device), photo.valid, view)
         scale_px = np.zeros(len(photo_px))
-    else:
-        photo_px, map_px, scale_px = _feature_pairs(query, source, photo, view, options)
     ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
     weights = _weights(query.site, ground_m, scale_px)
     per_px = 2.0**view.level / map_px_per_pixel(query, height_m)  # frame pixels per pixel of the level
@@ -133,9 +138,9 @@ def _feature_pairs(
     with query.scheduler.stage("frame features"):
         shown_px = int(np.count_nonzero(photo.valid))
         keypoints = max(options.max_keypoints, min(round(shown_px * options.keypoints_per_px), MAX_KEYPOINTS))
-        gray, valid = upload([photo.gray, photo.valid], query.device)
+        gray, valid = all_placed([photo.gray, photo.valid], query.device)
         features = sift(
-            gray[None, None].float() / 255.0,
+            as_float(gray, "float32")[None, None] / 255.0,
             max_keypoints=keypoints,
             backend=options.backend,
             upright=True,
@@ -157,7 +162,7 @@ def _feature_pairs(
 def _matched(features: Features, found: Matches) -> tuple[NDArray[np.float32], Array, NDArray[np.int64]]:
     """Accepted pairs, in one copy: (M, 2) feature pixels, (M,) their scales, (M,) indices on the map."""
     columns = (features.xy_px[0], features.scale_px[0], found.valid[0], found.train_index[0])
-    xy_px, scale_px, valid, index = download(columns)
+    xy_px, scale_px, valid, index = all_on_host(columns)
     return xy_px[valid], scale_px[valid].astype(np.float64), index[valid]
 
 
@@ -200,7 +205,7 @@ def _voted(
 class _Reduced:
     """The frame reduced as in the paper, (1, 1, H, W) in [0, 1], and the scale (x, y) of the reduction."""
 
-    picture: torch.Tensor
+    picture: Picture
     scale: Array
 
     def full(self, xy_px: Array | NDArray[np.float32]) -> Array:
@@ -268,8 +273,8 @@ def _reduce(query: Query, scale: float) -> _Reduced:
     height, width = query.gray.shape
     size = (max(16, round(width * scale)), max(16, round(height * scale)))
     picture = cv2.resize(query.gray, size, interpolation=cv2.INTER_AREA)
-    tensor = as_picture(np.asarray(picture, np.uint8), query.device)
-    return _Reduced(tensor, np.array(size) / [width, height])
+    shrunk = as_picture(np.asarray(picture, np.uint8), query.device)
+    return _Reduced(shrunk, np.array(size) / [width, height])
 
 
 def _map_features(
@@ -286,10 +291,10 @@ def _map_features(
     )
     mask = None
     if not site.fully_valid:
-        mask = torch.from_numpy(site.valid(crop, view.level)).to(query.device)[None, None]
+        mask = placed(site.valid(crop, view.level), query.device)[None, None]
     picture = as_picture(site.gray(crop, view.level), query.device)
     features = sift(picture, max_keypoints=int(count), backend=options.backend, upright=upright, mask=mask)
-    xy_px = download([features.xy_px[0]])[0]
+    xy_px = on_host(features.xy_px[0])
     return Landmarks(features, xy_px, lifted(site, site.full_from_level(xy_px + view.corner_px, view.level)))
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,6 @@ from engine.matching.acceptance import judge_pose
 from engine.matching.covariance import tilt_covariance
 from engine.matching.evidence import Evidence, is_beyond_doubt, probability
 from engine.matching.feature_matching import NOMINAL_SCALE, Matched, match_views
-from engine.matching.point_finding import PointFinder
 from engine.matching.pose import PoseStats, solve_pose
 from engine.matching.query import Query
 from engine.matching.views import TelemetryHypothesis, level_at, view_in, views_of, x_axis_deg
@@ -24,6 +24,9 @@ from engine.matching.votes import Vote
 from engine.options import MIN_HEIGHT_M, AssumedErrors, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, NoFix, Reason, Window
+
+if TYPE_CHECKING:  # it loads torch
+    from engine.matching.point_finding import PointFinder
 
 Array = NDArray[np.float64]
 

@@ -14,6 +14,7 @@ from engine.maps.landmarks import as_picture
 from engine.matching.align import RIM_PX
 from engine.matching.query import Query
 from engine.matching.views import MapView
+from engine.runtime.device import Picture, as_tensor
 from engine.runtime.tensors import torch
 
 Array = NDArray[np.float64]
@@ -41,9 +42,7 @@ class PointFinder:
         """Whether a view is too large to search."""
         return self.max_window_px is not None and view.crop.area_px > self.max_window_px
 
-    def find(
-        self, query: Query, picture: torch.Tensor, valid: NDArray[np.bool_], view: MapView
-    ) -> tuple[Array, Array]:
+    def find(self, query: Query, picture: Picture, valid: NDArray[np.bool_], view: MapView) -> tuple[Array, Array]:
         """The points that a picture and a view share.
 
         Args:
@@ -55,12 +54,12 @@ class PointFinder:
         Returns:
             (M, 2) pixels of the picture and (M, 2) pixels of the view's level.
         """
-        picture = _plain_outside(picture, valid)
+        picture = _plain_outside(as_tensor(picture), valid)
         if self.keypoints is not None and isinstance(self.matcher, KeypointMatcher):
             points, places = self._by_keypoints(query, view, picture, self.matcher, self.keypoints, valid)
         else:
             with query.scheduler.stage("match"), torch.inference_mode():
-                crop = as_picture(query.site.gray(view.crop, view.level), query.device)
+                crop = as_tensor(as_picture(query.site.gray(view.crop, view.level), query.device))
                 points, places = (_points(found) for found in self.matcher(picture, crop))
                 shown = _is_valid(points, valid)
                 points, places = points[shown], places[shown]

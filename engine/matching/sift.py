@@ -22,7 +22,6 @@ from engine.matching.views import coarser_scale, drawn_px
 from engine.options import MatcherOptions, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.runtime.tensors import torch
 from engine.values import Fix, NoFix, Reason, Result, Window
 
 _REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched; the smaller if time is short
@@ -86,7 +85,7 @@ class Sift(Method):
         """Run every variant of every step, so that it is compiled and its cost known."""
         # An orthophoto's side has at most twice the frame's pixels; half as many more if turned by 45 degrees.
         longest_px = 3 * max(query.gray.shape)
-        if chosen_backend(self.options.backend, torch.device(query.device)) == "compiled":
+        if chosen_backend(self.options.backend, query.device) == "compiled":
             prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX))
         looks = Looks(self, query)
         rehearse(query, looks.few, None)

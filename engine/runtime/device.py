@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import re
 import sys
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -102,6 +103,24 @@ def placed(array: AnyArray, device: Device | torch.device) -> Picture:
     return torch.from_numpy(array).to(device)
 
 
+def all_placed(arrays: Sequence[AnyArray], device: Device | torch.device) -> Sequence[Picture]:
+    """Several arrays on the device, sent in one copy; see :func:`placed`."""
+    if device.type == "cpu":
+        return arrays
+    from engine.runtime.tensors import upload
+
+    return upload(arrays, device)
+
+
+def all_on_host(pictures: Sequence[Picture]) -> Sequence[AnyArray]:
+    """Several pictures of one device as arrays, fetched in one copy; see :func:`on_host`."""
+    if all(isinstance(picture, np.ndarray) for picture in pictures):
+        return pictures
+    from engine.runtime.tensors import download
+
+    return download(pictures)
+
+
 def on_host(picture: Picture) -> AnyArray:
     """A picture as an array.
 
@@ -111,7 +130,7 @@ def on_host(picture: Picture) -> AnyArray:
     Returns:
         The picture itself, or a copy from its device.
     """
-    return picture if isinstance(picture, np.ndarray) else np.asarray(picture.cpu())
+    return picture if isinstance(picture, np.ndarray) else np.asarray(picture.detach().cpu())
 
 
 def element_type(picture: Picture) -> str:

@@ -1,8 +1,8 @@
 """torch with the chosen number of threads, and copies of arrays to and from a device.
 
 Only this module imports torch; modules that work on tensors import it from here, at the top. Loading torch takes
-seconds and 180 MB, and NCC on the CPU works on NumPy arrays: its modules import tensor code only if they have a
-tensor.
+seconds and 180 MB, and on the CPU NCC and SIFT work on NumPy arrays: their modules import tensor code only if they
+have a tensor.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ threads.tell(torch)
 
 
 def upload(arrays: Sequence[AnyArray], device: str | torch.device) -> list[Tensor]:
-    """Arrays as tensors on a device, in one copy; on the CPU they share memory with the arrays.
+    """Arrays as tensors on a device, in one copy.
 
     Args:
         arrays: of any shapes and of types that torch has.
@@ -37,13 +37,11 @@ def upload(arrays: Sequence[AnyArray], device: str | torch.device) -> list[Tenso
         As many, of the same shapes and types.
     """
     tensors = [torch.from_numpy(np.ascontiguousarray(array)) for array in arrays]
-    if torch.device(device).type == "cpu":
-        return tensors
     return _unpacked(_packed(tensors).to(device), tensors)
 
 
 def download(tensors: Sequence[Tensor]) -> list[AnyArray]:
-    """Tensors of one device as arrays, in one copy; those of the CPU share memory with the arrays.
+    """Tensors of one device as arrays, in one copy.
 
     Args:
         tensors: of any shapes.
@@ -51,8 +49,6 @@ def download(tensors: Sequence[Tensor]) -> list[AnyArray]:
     Returns:
         As many, of the same shapes and types.
     """
-    if all(tensor.device.type == "cpu" for tensor in tensors):
-        return [tensor.numpy() for tensor in tensors]
     return [tensor.numpy() for tensor in _unpacked(_packed(tensors).cpu(), tensors)]
 
 

@@ -1,4 +1,4 @@
-"""The number of threads of OpenCV, torch and the engine's own loops, and work divided among them.
+"""The number of threads of OpenCV, NumPy's BLAS, torch and the engine's own loops, and work divided among them.
 
 torch is configured now if loaded, else when it is loaded (:mod:`engine.runtime.tensors`).
 """
@@ -22,7 +22,7 @@ _chosen: list[int] = []  # empty, or the number that was chosen, for the whole p
 
 
 def set_threads(count: int) -> None:
-    """Set the number of threads of torch and of OpenCV, before or after a matcher is made.
+    """Set the number of threads of torch, OpenCV and NumPy's BLAS, before or after a matcher is made.
 
     Without it, and without ``OMP_NUM_THREADS``, the first matcher sets one: if other work shares the processor,
     several threads wait for each other, and frames come late.
@@ -31,11 +31,13 @@ def set_threads(count: int) -> None:
         OptionError: ``count`` is below 1.
     """
     import cv2
+    from threadpoolctl import threadpool_limits
 
     if count < 1:
         raise OptionError(f"threads: expected 1 or more, got {count}")
     _chosen[:] = [count]
     cv2.setNumThreads(count)
+    threadpool_limits(count, "blas")
     if "torch" in sys.modules:
         tell(sys.modules["torch"])
 

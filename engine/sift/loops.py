@@ -18,7 +18,6 @@ from engine.kernels.sift_extrema import TAPS, find_extrema
 from engine.kernels.sift_refinement import refine_extrema
 from engine.kernels.sift_selection import spread_out
 from engine.runtime import threads
-from engine.runtime.tensors import Tensor, torch
 from engine.sift.descriptors import CELL_SAMPLES, CELL_SIGMAS, ORIENT_STEP, orientation_weights, tents
 from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, Octave, octaves_of, reach_px
 from engine.sift.values import Features, SiftChoice
@@ -121,29 +120,29 @@ def _weights(sigmas: tuple[float, ...], reach: tuple[int, ...], up: int) -> tupl
     return weights.astype(np.float32), below
 
 
-def find_features(images: Tensor, mask: Tensor | None, choice: SiftChoice) -> Features:
+def find_features(pictures: Floats, allowed: NDArray[np.bool_] | None, choice: SiftChoice) -> Features:
     """The strongest features of pictures, one at a time.
 
     Args:
-        images: (B, H, W) float32 on the CPU.
-        mask: (B, 1, H, W) bool, True where keypoints are allowed; None is everywhere.
+        pictures: (B, H, W).
+        allowed: (B, 1, H, W), True where keypoints are allowed; None is everywhere.
         choice: which keypoints to keep and describe.
 
     Returns:
-        Features on the CPU.
+        Features as arrays.
     """
-    slots = [np.zeros((len(images), choice.max_keypoints, *shape), np.float32) for shape in ((2,), (), (), (128,))]
-    valid = np.zeros((len(images), choice.max_keypoints), np.bool_)
-    pictures, allowed = images.detach().contiguous().numpy(), None if mask is None else mask.numpy()
+    size = (len(pictures), choice.max_keypoints)
+    points, scales, angles = (np.zeros((*size, *shape), np.float32) for shape in ((2,), (), ()))
+    descriptors, valid = np.zeros((*size, 128), np.float32), np.zeros(size, np.bool_)
 
     def work(image: int) -> None:
         found = _of_picture(pictures[image], None if allowed is None else allowed[image, 0], choice)
         valid[image, : len(found[0])] = True
-        for slot, values in zip(slots, found, strict=True):
+        for slot, values in zip((points, scales, angles, descriptors), found, strict=True):
             slot[image, : len(values)] = values
 
-    threads.in_parallel(work, range(len(images)))
-    return Features(*map(torch.from_numpy, (*slots, valid)))
+    threads.in_parallel(work, range(len(pictures)))
+    return Features(points, scales, angles, descriptors, valid)
 
 
 def _of_picture(image: Floats, mask: NDArray[np.bool_] | None, choice: SiftChoice) -> tuple[Floats, ...]:

@@ -9,16 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.runtime.tensors import Tensor, torch
-from engine.sift.values import Features, Matches
+from engine.runtime.device import as_float, like, on_host
+from engine.sift.values import FORBIDDEN, ROUNDING, TRAIN_CHUNK, Features, Limits, Matches, fields_of
 
 Floats = NDArray[np.float32]
 AnyArray = NDArray[Any]
-
-_TRAIN_CHUNK = 4096  # train slots compared at a time, to bound memory for a whole map
-_FAR = 1e30
-_FORBIDDEN = -2.0  # below every cosine
-_ROUNDING = 2e-3  # distance between a descriptor and itself by float32 rounding
 
 
 def match(
@@ -54,9 +49,21 @@ def match(
     """
     _check_ratio(ratio)
     limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
-    if query.descriptors.device.type == "cpu":
-        return _by_loops(query, train, limits, ratio, mutual)
-    return _by_tensors(query, train, limits, ratio, mutual)
+    given = query.descriptors
+    if not isinstance(given, np.ndarray) and given.device.type != "cpu":
+        from engine.sift.matching_tensors import match_tensors  # torch takes a while to import
+
+        return match_tensors(query, train, limits, ratio, mutual)
+    found = _by_loops(_as_arrays(query), _as_arrays(train), limits, ratio, mutual)
+    return Matches(
+        *(like(given, values) for values in (found.train_index, found.distance, found.ratio, found.valid))
+    )
+
+
+def _as_arrays(features: Features) -> Features:
+    *numbers, valid = fields_of(features)
+    xy_px, scale_px, angle_deg, descriptors = (on_host(as_float(each, "float32")) for each in numbers)
+    return Features(xy_px, scale_px, angle_deg, descriptors, on_host(valid))
 
 
 def _check_ratio(ratio: float) -> None:
@@ -64,107 +71,24 @@ def _check_ratio(ratio: float) -> None:
         raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
 
 
-_Limits = tuple[float, float | None, float, float | None]  # rotation and its largest error, scale and its factor
-
-
-# -------------------------------------------------------------------------------------------------- tensor ops
-
-
-def _by_tensors(query: Features, train: Features, limits: _Limits, ratio: float, mutual: bool) -> Matches:
-    with torch.inference_mode():
-        first, index, second, is_mutual = _nearest(query, train, limits)
-        nearest, next_nearest = _distance(first), _distance(second)
-        # Two equal distances give a ratio of 1, even if rounding makes one of them 0.
-        quotient = (nearest.clamp_min(_ROUNDING) / next_nearest.clamp_min(_ROUNDING)).nan_to_num(1.0)
-        valid = nearest.isfinite() & (quotient <= ratio)
-    return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
-
-
-def _nearest(query: Features, train: Features, limits: _Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """:func:`_two_nearest` over all train slots, by chunks that bound the memory."""
-    found = []
-    for start in range(0, max(1, train.valid.shape[1]), _TRAIN_CHUNK):
-        first, index, second, is_mutual = _two_nearest(query, _slots(train, start, start + _TRAIN_CHUNK), limits)
-        found.append((first, index + start, second, is_mutual))
-    return found[0] if len(found) == 1 else _merged(found)
-
-
-def _distance(cosine: Tensor) -> Tensor:
-    """Distance of unit vectors; infinite for a forbidden pair."""
-    return (2 - 2 * cosine).clamp_min_(0).sqrt_().masked_fill_(cosine < _FORBIDDEN, torch.inf)
-
-
-def _slots(features: Features, start: int, end: int) -> Features:
-    """A range of the slots."""
-    return Features(*(values[:, start:end] for values in _fields(features)))
-
-
-def _forbid(
-    cosine: Tensor,
-    query: Features,
-    train: Features,
-    rotation_deg: float,
-    max_angle_diff_deg: float | None,
-    scale: float,
-    max_scale_factor: float | None,
-) -> None:
-    """Lower the cosine (B, N, M) of excluded pairs by a large number, in place; faster than masks."""
-    for valid, dim in ((query.valid, 2), (train.valid, 1)):
-        cosine.sub_((~valid).to(cosine.dtype).unsqueeze(dim), alpha=_FAR)
-    if max_angle_diff_deg is not None and max_angle_diff_deg < 180:
-        expected, actual = torch.deg2rad(query.angle_deg + rotation_deg), torch.deg2rad(train.angle_deg)
-        cos_diff = torch.stack([expected.cos(), expected.sin()], dim=2) @ torch.stack(
-            [actual.cos(), actual.sin()], dim=1
-        )
-        excess = math.cos(math.radians(max_angle_diff_deg)) - cos_diff
-        cosine.sub_(excess.clamp_min_(0), alpha=_FAR)
-    if max_scale_factor is not None:
-        own, other = (query.scale_px * scale).clamp_min(1e-9).log(), train.scale_px.clamp_min(1e-9).log()
-        excess = (other[:, None, :] - own[:, :, None]).abs_().sub_(math.log(max_scale_factor))
-        cosine.sub_(excess.clamp_min_(0), alpha=_FAR)
-
-
-def _two_nearest(query: Features, train: Features, limits: _Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best."""
-    cosine = query.descriptors @ train.descriptors.mT
-    _forbid(cosine, query, train, *limits)
-    if 0 in cosine.shape:
-        none = cosine.new_full(cosine.shape[:2], -torch.inf)
-        return none, torch.zeros_like(none, dtype=torch.int64), none, none > 0
-    index = cosine.argmax(2)[:, :, None]
-    first = cosine.gather(2, index)
-    is_mutual = first[:, :, 0] == cosine.amax(dim=1).gather(1, index[:, :, 0])
-    second = cosine.scatter_(2, index, -torch.inf).amax(dim=2)
-    return first[:, :, 0], index[:, :, 0], second, is_mutual
-
-
-def _merged(found: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The nearest over all chunks, and the second nearest: of the same chunk or the nearest of another."""
-    first, index, second, is_mutual = (torch.stack(values) for values in zip(*found, strict=True))
-    best = first.argmax(dim=0, keepdim=True)
-    others = first.scatter(0, best, second.gather(0, best))
-    return first.gather(0, best)[0], index.gather(0, best)[0], others.amax(dim=0), is_mutual.gather(0, best)[0]
-
-
 # -------------------------------------------------------------------------------------------------------- loops
 
 
-def _by_loops(query: Features, train: Features, limits: _Limits, ratio: float, mutual: bool) -> Matches:
-    """The same on the CPU: a matrix product by torch, and one pass over it."""
+def _by_loops(query: Features, train: Features, limits: Limits, ratio: float, mutual: bool) -> Matches:
+    """On the CPU: a matrix product, and one pass over it."""
     first, index, second, is_mutual = _nearest_by_loops(query, train, limits)
     nearest, next_nearest = (
-        np.where(c < _FORBIDDEN, np.inf, np.sqrt(np.maximum(2 - 2 * c, 0))) for c in (first, second)
+        np.where(c < FORBIDDEN, np.inf, np.sqrt(np.maximum(2 - 2 * c, 0))) for c in (first, second)
     )
     with np.errstate(invalid="ignore"):  # of two that are infinite
-        quotient = np.maximum(nearest, _ROUNDING) / np.maximum(next_nearest, _ROUNDING)
+        quotient = np.maximum(nearest, ROUNDING) / np.maximum(next_nearest, ROUNDING)
     quotient = np.where(np.isnan(quotient), np.float32(1), quotient)
     valid = np.isfinite(nearest) & (quotient <= ratio)
-    columns = (index, nearest, quotient, valid & is_mutual if mutual else valid)
-    return Matches(*map(torch.from_numpy, columns))
+    return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
 
 
-def _nearest_by_loops(query: Features, train: Features, limits: _Limits) -> tuple[AnyArray, ...]:
-    """As :func:`_nearest`, in arrays."""
+def _nearest_by_loops(query: Features, train: Features, limits: Limits) -> tuple[AnyArray, ...]:
+    """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best."""
     from engine.kernels import nearest  # numba takes a while to import
 
     rotation_deg, max_angle_diff_deg, scale, max_scale_factor = limits
@@ -178,10 +102,9 @@ def _nearest_by_loops(query: Features, train: Features, limits: _Limits) -> tupl
     for n in range(count):
         q, t = min(n, len(query.valid) - 1), min(n, len(train.valid) - 1)
         out = (first[n], index[n], second[n], is_mutual[n])
-        for start in range(0, train.valid.shape[1], _TRAIN_CHUNK):
-            end = start + _TRAIN_CHUNK
-            with torch.inference_mode():
-                cosine = torch.mm(train.descriptors[t, start:end], query.descriptors[q].T).float().numpy()
+        for start in range(0, train.valid.shape[1], TRAIN_CHUNK):
+            end = start + TRAIN_CHUNK
+            cosine = train.descriptors[t, start:end] @ query.descriptors[q].T
             angles = np.ascontiguousarray(other[:, t, start:end])
             nearest.two_nearest(
                 cosine, np.ascontiguousarray(own[:, q]), angles, np.float32(least_cos), most_log, start, *out
@@ -191,11 +114,7 @@ def _nearest_by_loops(query: Features, train: Features, limits: _Limits) -> tupl
 
 def _angles_and_scales(features: Features, rotation_deg: float, scale: float, is_limited: bool) -> Floats:
     """(3, B, N) logarithm of scale if used, NaN without a keypoint; cosine and sine of the angle."""
-    sizes = features.scale_px.float().numpy() if is_limited else np.ones(features.valid.shape, np.float32)
-    angle = np.deg2rad(features.angle_deg.float().numpy() + np.float32(rotation_deg))
-    log = np.log(np.where(features.valid.numpy(), np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
+    sizes = features.scale_px if is_limited else np.ones(features.valid.shape, np.float32)
+    angle = np.deg2rad(features.angle_deg + np.float32(rotation_deg))
+    log = np.log(np.where(features.valid, np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
     return np.stack([log, np.cos(angle), np.sin(angle)]).astype(np.float32)
-
-
-def _fields(features: Features) -> tuple[Tensor, ...]:
-    return features.xy_px, features.scale_px, features.angle_deg, features.descriptors, features.valid

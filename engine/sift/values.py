@@ -3,8 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from engine.runtime.tensors import Tensor, torch
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.runtime.device import Picture, as_tensor, on_host
+
+if TYPE_CHECKING:
+    from engine.runtime.tensors import Tensor
+
+Limits = tuple[float, float | None, float, float | None]
+"""Rotation between matched keypoints and its largest error in degrees, ratio of their scales and its factor."""
+TRAIN_CHUNK = 4096  # train slots compared at a time, to bound memory for a whole map
+FORBIDDEN = -2.0  # below every cosine
+ROUNDING = 2e-3  # distance between a descriptor and itself by float32 rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +43,7 @@ class SiftChoice:
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """Keypoints and descriptors of a batch of images, in a fixed number of slots.
+    """Keypoints and descriptors of a batch of images, in a fixed number of slots: arrays or tensors.
 
     A slot without keypoint is False in ``valid`` and zero elsewhere. The first slots hold the keypoints within
     their cell's share (see :func:`sift`), the next those beyond it, both by falling strength.
@@ -43,14 +56,14 @@ class Features:
         valid: (B, N) bool.
     """
 
-    xy_px: Tensor
-    scale_px: Tensor
-    angle_deg: Tensor
-    descriptors: Tensor
-    valid: Tensor
+    xy_px: Picture
+    scale_px: Picture
+    angle_deg: Picture
+    descriptors: Picture
+    valid: Picture
 
     def lafs(self, magnification: float = 6.0) -> Tensor:
-        """Return kornia's local affine frames, (B, N, 2, 3).
+        """Return kornia's local affine frames as a tensor (B, N, 2, 3).
 
         Args:
             magnification: Half the side of the described square in sigmas; kornia's SIFT uses 6.
@@ -64,9 +77,16 @@ class Features:
         """
         from kornia.feature import laf_from_center_scale_ori  # takes a second
 
-        scale = (magnification * self.scale_px)[..., None, None]
-        lafs: Tensor = laf_from_center_scale_ori(self.xy_px, scale, -self.angle_deg[..., None])
+        xy_px, scale_px, angle_deg = map(as_tensor, (self.xy_px, self.scale_px, self.angle_deg))
+        lafs: Tensor = laf_from_center_scale_ori(
+            xy_px, (magnification * scale_px)[..., None, None], -angle_deg[..., None]
+        )
         return lafs
+
+
+def fields_of(features: Features) -> tuple[Picture, ...]:
+    """The five fields, in their order."""
+    return features.xy_px, features.scale_px, features.angle_deg, features.descriptors, features.valid
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,13 +101,13 @@ class Matches:
         valid: (B, N) bool.
     """
 
-    train_index: Tensor
-    distance: Tensor
-    ratio: Tensor
-    valid: Tensor
+    train_index: Picture
+    distance: Picture
+    ratio: Picture
+    valid: Picture
 
-    def pairs(self, element: int = 0) -> Tensor:
-        """Return the accepted pairs of one element of the batch.
+    def pairs(self, element: int = 0) -> NDArray[np.int64]:
+        """Return the accepted pairs of one element of the batch, as an array.
 
         Args:
             element: Index in the batch.
@@ -95,5 +115,5 @@ class Matches:
         Returns:
             (M, 2) int64 slots (query, train).
         """
-        query = self.valid[element].nonzero()[:, 0]
-        return torch.stack([query, self.train_index[element, query]], dim=1)
+        query = np.flatnonzero(on_host(self.valid[element]))
+        return np.column_stack([query, on_host(self.train_index[element])[query]])

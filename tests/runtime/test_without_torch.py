@@ -1,4 +1,4 @@
-"""A flight by NCC on the CPU loads no torch: the rule that keeps it so, and flights that show it."""
+"""A flight on the CPU loads no torch: the rule that keeps it so, and flights that show it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 ENGINE = ROOT / "engine"
 SAY = "\nimport sys; print('TORCH', 'torch' in sys.modules)"
 FLIGHT = """
-import numpy as np, cv2
+import sys, numpy as np, cv2
 from engine import Budget, Camera, Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
 rng = np.random.default_rng(3)
 gray = cv2.GaussianBlur(rng.normal(128, 300, (500, 500)), (0, 0), 2.5).clip(0, 255).astype(np.uint8)
@@ -27,7 +27,7 @@ valid = np.ones(gray.shape, bool)
 valid[:150, :180] = False  # within the windows, so that some are masked
 site = OrthoMap.from_arrays(gray, [[0.5, 0, 500_000], [0, -0.5, 5_000_000]], "EPSG:32633", valid=valid)
 camera = Camera.from_fov(120, 120, 60.0)
-matcher = SceneMatcher(site, camera)
+matcher = SceneMatcher(site, camera, sys.argv[1])
 def taken(image, index):
     return Frame(image.copy(), index * 10**9, 0.5 * camera.focal_px, 0.0, 0.0, 0.0)
 def frame(index):
@@ -88,19 +88,20 @@ def test_modules_of_the_way_load_no_torch():
         "engine.matching.matcher",
         "engine.navigation.navigator",
         "engine.navigation.live",
-        "engine.matching.ncc",
+        "engine.matching.auto",
     )
     names += ("scenematch.runs.tracking", "scenematch.runs.mavlink_bridge", "scenematch.report.page")
     assert run("".join(f"import {name}\n" for name in names)) == ["TORCH", "False"]
 
 
-def test_a_flight_by_ncc_on_the_cpu_loads_no_torch():
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+def test_a_flight_on_the_cpu_loads_no_torch(method):
     """By the matcher and by the navigator, with a budget and without, masked, refused, and over the whole map."""
-    assert run(FLIGHT) == ["19", "TORCH", "False"]
+    assert run(FLIGHT, method) == ["19", "TORCH", "False"]
 
 
 @pytest.mark.slow
-def test_tracking_by_ncc_loads_no_torch(tmp_path):
+def test_tracking_loads_no_torch(tmp_path):
     folder = tmp_path / "flight"
     write_flight(folder, plan_flight(town=drawn_town(), frames=3))
     program = "import sys; from scenematch.cli.app import run; assert run(sys.argv[1:]) == 0"
@@ -108,7 +109,7 @@ def test_tracking_by_ncc_loads_no_torch(tmp_path):
         "map": folder / "map.tif", "surface": folder / "dsm.tif", "camera": folder / "camera.yaml",
         "frames": folder / "frames", "telemetry": folder / "telemetry.csv", "out": tmp_path / "out",
     }  # fmt: skip
-    words = ["--method=ncc", *(f"--{name}={value}" for name, value in given.items())]
+    words = ["--method=auto", *(f"--{name}={value}" for name, value in given.items())]
     assert run(program, "track", *words)[-2:] == ["TORCH", "False"]
     assert (tmp_path / "out" / "report.html").exists()
 

@@ -238,7 +238,7 @@ def quality(
     distance = np.linalg.norm(expected[:, None] - second.xy_px[0].numpy(), axis=2)
     limit = np.array(image.shape[::-1]) - 9
     inside = first.valid[0].numpy() & ((expected > 8) & (expected < limit)).all(1)
-    pairs = match(first, second).pairs().numpy()
+    pairs = match(first, second).pairs()
     good = distance[pairs[:, 0], pairs[:, 1]] < 3
     near = (distance < 2) & second.valid[0].numpy()
     return float(near[inside].any(1).mean()), float(good.mean()), float(good.sum())

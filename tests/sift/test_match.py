@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from engine.features import Features, match
-from engine.sift import matching as module
+from engine.sift import matching, matching_tensors
+from engine.sift.values import fields_of
 
 
 def described(count, seed, *, like=None):
@@ -48,7 +49,7 @@ def plainly(query, train, ratio, turn_deg, most_deg, scale, factor):
 @pytest.mark.parametrize("chunk", [7, 64, 4096])
 @pytest.mark.parametrize(("most_deg", "factor"), [(180.0, 1e9), (60.0, 1e9), (180.0, 1.5), (75.0, 2.0)])
 def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, chunk, most_deg, factor):
-    monkeypatch.setattr(module, "_TRAIN_CHUNK", chunk)
+    monkeypatch.setattr(matching, "TRAIN_CHUNK", chunk)
     query = described(60, 1)
     train = described(333, 2, like=query)
     found = match(
@@ -64,10 +65,10 @@ def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, chunk,
 def test_the_loops_find_what_the_tensor_ops_find(batch, most_deg, factor):
     query = described(50, 3)
     trains = [described(90, seed, like=query) for seed in range(batch)]
-    train = Features(*(torch.cat(values) for values in zip(*map(module._fields, trains), strict=True)))
+    train = Features(*(torch.cat(values) for values in zip(*map(fields_of, trains), strict=True)))
     limits = (20.0, most_deg, 1.2, factor)
-    got = tuple(map(torch.from_numpy, module._nearest_by_loops(query, train, limits)))
-    expected = module._nearest(query, train, limits)
+    found = matching._nearest_by_loops(matching._as_arrays(query), matching._as_arrays(train), limits)
+    got, expected = tuple(map(torch.from_numpy, found)), matching_tensors._nearest(query, train, limits)
     allowed = expected[0] > -2.0
     assert allowed.sum() > 20 * batch
     torch.testing.assert_close(got[0][allowed], expected[0][allowed])
@@ -94,7 +95,7 @@ def test_unknown_scales_count_only_where_they_are_limited():
     query = described(50, 3)
     train = described(90, 4, like=query)
     unknown = replace(query, scale_px=query.scale_px * torch.nan)
-    assert torch.equal(match(unknown, train, ratio=0.9).pairs(), match(query, train, ratio=0.9).pairs())
+    np.testing.assert_array_equal(match(unknown, train, ratio=0.9).pairs(), match(query, train, ratio=0.9).pairs())
     assert not match(unknown, train, ratio=0.9, max_scale_factor=1.5).valid.any()
 
 
