@@ -104,7 +104,15 @@ def placed(array: AnyArray, device: Device | torch.device) -> Picture:
 
 
 def all_placed(arrays: Sequence[AnyArray], device: Device | torch.device) -> Sequence[Picture]:
-    """Several arrays on the device, sent in one copy; see :func:`placed`."""
+    """Several arrays on the device, sent in one copy; see :func:`placed`.
+
+    Args:
+        arrays: of any shapes.
+        device: the device.
+
+    Returns:
+        As many, of the same shapes and types.
+    """
     if device.type == "cpu":
         return arrays
     from engine.runtime.tensors import upload
@@ -113,7 +121,14 @@ def all_placed(arrays: Sequence[AnyArray], device: Device | torch.device) -> Seq
 
 
 def all_on_host(pictures: Sequence[Picture]) -> Sequence[AnyArray]:
-    """Several pictures of one device as arrays, fetched in one copy; see :func:`on_host`."""
+    """Several pictures of one device as arrays, fetched in one copy; see :func:`on_host`.
+
+    Args:
+        pictures: of any shapes.
+
+    Returns:
+        As many, of the same shapes and types.
+    """
     if all(isinstance(picture, np.ndarray) for picture in pictures):
         return pictures
     from engine.runtime.tensors import download
