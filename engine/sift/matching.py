@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from engine.runtime.tensors import Tensor, torch
 from engine.sift.values import Features, Matches
 
 Floats = NDArray[np.float32]
-AnyArray = NDArray[Any]
 
 _TRAIN_CHUNK = 4096  # train slots compared at a time, to bound memory for a whole map
 _FAR = 1e30
@@ -26,13 +24,12 @@ def match(
     train: Features,
     *,
     ratio: float = 0.8,
-    mutual: bool = True,
     rotation_deg: float = 0.0,
     max_angle_diff_deg: float | None = None,
     scale: float = 1.0,
     max_scale_factor: float | None = None,
 ) -> Matches:
-    """Match descriptors by Euclidean distance, with Lowe's ratio test and a mutual test.
+    """Match descriptors by Euclidean distance, with Lowe's ratio test; each must be the other's nearest.
 
     Pairs that contradict the known rotation or scale have an infinite distance, all others sqrt(2 - 2 <q, t>).
 
@@ -40,7 +37,6 @@ def match(
         query: Features of B images, or of one for all of the train's.
         train: Features of B images, or of one for all of the query's.
         ratio: Upper bound, in (0, 1], on nearest over second nearest distance; 1 accepts all.
-        mutual: Require that the query is also the train's nearest.
         rotation_deg: Known angle of a train keypoint less that of its query.
         max_angle_diff_deg: Exclude pairs whose angles differ from ``rotation_deg`` by more.
         scale: Known scale of a train keypoint over that of its query.
@@ -52,46 +48,39 @@ def match(
     Raises:
         OptionError: The ratio is not in (0, 1].
     """
-    _check_ratio(ratio)
-    limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
-    if query.descriptors.device.type == "cpu":
-        return _by_loops(query, train, limits, ratio, mutual)
-    return _by_tensors(query, train, limits, ratio, mutual)
-
-
-def _check_ratio(ratio: float) -> None:
     if not 0 < ratio <= 1:
         raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
+    limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
+    two_nearest = _nearest_by_loops if query.descriptors.device.type == "cpu" else _nearest_by_tensors
+    with torch.inference_mode():
+        first, index, second, is_mutual = two_nearest(query, train, limits)
+        nearest, next_nearest = _distance(first), _distance(second)
+        # Two equal distances give a ratio of 1, even if rounding makes one of them 0.
+        quotient = (nearest.clamp_min(_ROUNDING) / next_nearest.clamp_min(_ROUNDING)).nan_to_num(1.0)
+        valid = nearest.isfinite() & (quotient <= ratio) & is_mutual
+    return Matches(index, nearest, quotient, valid)
+
+
+def _distance(cosine: Tensor) -> Tensor:
+    """Distance of unit vectors; infinite for a forbidden pair."""
+    return (2 - 2 * cosine).clamp_min_(0).sqrt_().masked_fill_(cosine < _FORBIDDEN, torch.inf)
 
 
 _Limits = tuple[float, float | None, float, float | None]  # rotation and its largest error, scale and its factor
+# For each query (B, N) the largest cosine, its slot, the second largest, and whether it is the slot's best.
+_Nearest = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 # -------------------------------------------------------------------------------------------------- tensor ops
 
 
-def _by_tensors(query: Features, train: Features, limits: _Limits, ratio: float, mutual: bool) -> Matches:
-    with torch.inference_mode():
-        first, index, second, is_mutual = _nearest(query, train, limits)
-        nearest, next_nearest = _distance(first), _distance(second)
-        # Two equal distances give a ratio of 1, even if rounding makes one of them 0.
-        quotient = (nearest.clamp_min(_ROUNDING) / next_nearest.clamp_min(_ROUNDING)).nan_to_num(1.0)
-        valid = nearest.isfinite() & (quotient <= ratio)
-    return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
-
-
-def _nearest(query: Features, train: Features, limits: _Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _nearest_by_tensors(query: Features, train: Features, limits: _Limits) -> _Nearest:
     """:func:`_two_nearest` over all train slots, by chunks that bound the memory."""
     found = []
     for start in range(0, max(1, train.valid.shape[1]), _TRAIN_CHUNK):
         first, index, second, is_mutual = _two_nearest(query, _slots(train, start, start + _TRAIN_CHUNK), limits)
         found.append((first, index + start, second, is_mutual))
     return found[0] if len(found) == 1 else _merged(found)
-
-
-def _distance(cosine: Tensor) -> Tensor:
-    """Distance of unit vectors; infinite for a forbidden pair."""
-    return (2 - 2 * cosine).clamp_min_(0).sqrt_().masked_fill_(cosine < _FORBIDDEN, torch.inf)
 
 
 def _slots(features: Features, start: int, end: int) -> Features:
@@ -124,8 +113,7 @@ def _forbid(
         cosine.sub_(excess.clamp_min_(0), alpha=_FAR)
 
 
-def _two_nearest(query: Features, train: Features, limits: _Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best."""
+def _two_nearest(query: Features, train: Features, limits: _Limits) -> _Nearest:
     cosine = query.descriptors @ train.descriptors.mT
     _forbid(cosine, query, train, *limits)
     if 0 in cosine.shape:
@@ -138,7 +126,7 @@ def _two_nearest(query: Features, train: Features, limits: _Limits) -> tuple[Ten
     return first[:, :, 0], index[:, :, 0], second, is_mutual
 
 
-def _merged(found: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _merged(found: list[_Nearest]) -> _Nearest:
     """The nearest over all chunks, and the second nearest: of the same chunk or the nearest of another."""
     first, index, second, is_mutual = (torch.stack(values) for values in zip(*found, strict=True))
     best = first.argmax(dim=0, keepdim=True)
@@ -149,22 +137,8 @@ def _merged(found: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -> tuple[Tensor,
 # -------------------------------------------------------------------------------------------------------- loops
 
 
-def _by_loops(query: Features, train: Features, limits: _Limits, ratio: float, mutual: bool) -> Matches:
+def _nearest_by_loops(query: Features, train: Features, limits: _Limits) -> _Nearest:
     """The same on the CPU: a matrix product by torch, and one pass over it."""
-    first, index, second, is_mutual = _nearest_by_loops(query, train, limits)
-    nearest, next_nearest = (
-        np.where(c < _FORBIDDEN, np.inf, np.sqrt(np.maximum(2 - 2 * c, 0))) for c in (first, second)
-    )
-    with np.errstate(invalid="ignore"):  # of two that are infinite
-        quotient = np.maximum(nearest, _ROUNDING) / np.maximum(next_nearest, _ROUNDING)
-    quotient = np.where(np.isnan(quotient), np.float32(1), quotient)
-    valid = np.isfinite(nearest) & (quotient <= ratio)
-    columns = (index, nearest, quotient, valid & is_mutual if mutual else valid)
-    return Matches(*map(torch.from_numpy, columns))
-
-
-def _nearest_by_loops(query: Features, train: Features, limits: _Limits) -> tuple[AnyArray, ...]:
-    """As :func:`_nearest`, in arrays."""
     from engine.kernels import nearest  # numba takes a while to import
 
     rotation_deg, max_angle_diff_deg, scale, max_scale_factor = limits
@@ -180,13 +154,12 @@ def _nearest_by_loops(query: Features, train: Features, limits: _Limits) -> tupl
         out = (first[n], index[n], second[n], is_mutual[n])
         for start in range(0, train.valid.shape[1], _TRAIN_CHUNK):
             end = start + _TRAIN_CHUNK
-            with torch.inference_mode():
-                cosine = torch.mm(train.descriptors[t, start:end], query.descriptors[q].T).float().numpy()
+            cosine = torch.mm(train.descriptors[t, start:end], query.descriptors[q].T).float().numpy()
             angles = np.ascontiguousarray(other[:, t, start:end])
             nearest.two_nearest(
                 cosine, np.ascontiguousarray(own[:, q]), angles, np.float32(least_cos), most_log, start, *out
             )
-    return first, index, second, is_mutual
+    return tuple(map(torch.from_numpy, (first, index, second, is_mutual)))  # type: ignore[return-value]
 
 
 def _angles_and_scales(features: Features, rotation_deg: float, scale: float, is_limited: bool) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from engine.runtime.tensors import Tensor, torch
+from engine.runtime.tensors import Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +16,6 @@ class SiftChoice:
         up_rad: angle of upright features, None the dominant gradient's.
         upsample: samples per pixel of the first octave.
         contrast_threshold: Lowe's.
-        root: RootSIFT.
         spread: cells along each side of a picture.
     """
 
@@ -24,7 +23,6 @@ class SiftChoice:
     up_rad: float | None
     upsample: int
     contrast_threshold: float
-    root: bool
     spread: int
 
 
@@ -49,25 +47,6 @@ class Features:
     descriptors: Tensor
     valid: Tensor
 
-    def lafs(self, magnification: float = 6.0) -> Tensor:
-        """Return kornia's local affine frames, (B, N, 2, 3).
-
-        Args:
-            magnification: Half the side of the described square in sigmas; kornia's SIFT uses 6.
-
-        Returns:
-            (B, N, 2, 3) affine matrices.
-
-        Convention:
-            The first two columns are the images of the patch's x and y axes, the third is the centre.
-            kornia's own angles turn the other way, so ``kornia.feature.get_laf_orientation`` gives -angle_deg.
-        """
-        from kornia.feature import laf_from_center_scale_ori  # takes a second
-
-        scale = (magnification * self.scale_px)[..., None, None]
-        lafs: Tensor = laf_from_center_scale_ori(self.xy_px, scale, -self.angle_deg[..., None])
-        return lafs
-
 
 @dataclass(frozen=True, slots=True)
 class Matches:
@@ -85,15 +64,3 @@ class Matches:
     distance: Tensor
     ratio: Tensor
     valid: Tensor
-
-    def pairs(self, element: int = 0) -> Tensor:
-        """Return the accepted pairs of one element of the batch.
-
-        Args:
-            element: Index in the batch.
-
-        Returns:
-            (M, 2) int64 slots (query, train).
-        """
-        query = self.valid[element].nonzero()[:, 0]
-        return torch.stack([query, self.train_index[element, query]], dim=1)

@@ -173,7 +173,7 @@ OPTIONS = {
     "usual": {},
     "upright": {"upright": True, "up_deg": 30.0},
     "not doubled": {"upsample": 1, "contrast_threshold": 0.005, "max_keypoints": 900},
-    "strongest": {"spread": 1, "root": False, "max_keypoints": 20},
+    "strongest": {"spread": 1, "max_keypoints": 20},
     "more slots than keypoints": {"max_keypoints": 4000},
 }
 
