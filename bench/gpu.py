@@ -1,4 +1,4 @@
-"""A GPU beside the CPU, in one table: time of one frame, throughput of batches, agreement, and copies.
+"""A GPU beside the CPU, in one table: time of one frame, agreement, and copies.
 
     python -m bench.gpu [--device auto|cuda|cpu] [--quick]
 
@@ -19,31 +19,28 @@ import torch
 from bench.inputs.scenes import flight, pair
 from bench.pages.text import table
 from engine import Fix, SceneMatcher
-from engine.ncc_fft import match_template, match_templates, prepare
+from engine.ncc_fft import match_template, prepare
 from engine.runtime.device import resolve, synchronise
 from engine.values import Peak
 
 PAIRS = [(425, 228), (512, 256), (1024, 256), (1024, 512)]  # window and template, px; the first is the paper's
-BATCH = 64
 ROUNDS, QUICK_ROUNDS = 300, 3
 EXCLUSION_PX = 11.0
-COLUMNS = ["task", "p50 ms", "p99 ms", "per s", "batch", "off the CPU's", "copies up", "copies down"]
+COLUMNS = ["task", "p50 ms", "p99 ms", "per s", "off the CPU's", "copies up", "copies down"]
 
 
 @dataclass(frozen=True)
 class Row:
-    """One task: times of single calls, tasks a second, the batch they come in, agreement, and copies per call."""
+    """One task: times of single calls, agreement, and copies per call."""
 
     task: str
     times_ms: list[float]
-    batch: int
     apart: str
     copies: tuple[int, int]
 
     def cells(self) -> list[str]:
         p50, p99 = np.percentile(self.times_ms, [50.0, 99.0])
-        rate = 1e3 * self.batch / float(np.mean(self.times_ms))
-        figures = [f"{p50:.3f}", f"{p99:.3f}", f"{rate:.0f}", f"{self.batch}"]
+        figures = [f"{p50:.3f}", f"{p99:.3f}", f"{1e3 / float(np.mean(self.times_ms)):.0f}"]
         return [self.task, *figures, self.apart, *map(str, self.copies)]
 
 
@@ -77,31 +74,20 @@ def directions(names: list[str]) -> tuple[int, int]:
     return sum("Memcpy HtoD" in name for name in names), sum("Memcpy DtoH" in name for name in names)
 
 
-def matches(size: tuple[int, int], device: torch.device, rounds: int, batch: int) -> list[Row]:
-    """NCC of one window with one template, and a batch of it."""
+def match(size: tuple[int, int], device: torch.device, rounds: int) -> Row:
+    """NCC of one window with one template."""
     picture, cut = (torch.from_numpy(part) for part in pair(*size))
     expected = match_template(prepare(picture), cut, exclusion_px=EXCLUSION_PX, exhaustive=True)
     search, pinned = prepare(picture.to(device)), cut.pin_memory() if device.type == "cuda" else cut
-    name, rows = f"NCC {size[1]} in {size[0]}", []
 
     def one() -> Peak:
         there = pinned.to(device, non_blocking=True)
         return match_template(search, there, exclusion_px=EXCLUSION_PX, exhaustive=True)
 
-    def many() -> list[Peak]:
-        there = torch.stack([pinned] * batch).to(device)
-        return match_templates([search] * batch, list(there), exclusion_px=EXCLUSION_PX)
-
-    rows.append(Row(name, timed(one, device, rounds), 1, apart([one()], expected), copies(one, device)))
-    times = timed(many, device, max(1, rounds // 10))
-    rows.append(Row(name, times, batch, apart(many(), expected), copies(many, device)))
-    return rows
-
-
-def apart(found: list[Peak], expected: Peak) -> str:
-    """The largest distances in pixels and in scores from the CPU's peak."""
-    pixels = max(float(np.hypot(peak.x - expected.x, peak.y - expected.y)) for peak in found)
-    return f"{pixels:.0e} px, {max(abs(peak.score - expected.score) for peak in found):.0e}"
+    found, name = one(), f"NCC {size[1]} in {size[0]}"
+    apart_px = float(np.hypot(found.x - expected.x, found.y - expected.y))
+    apart = f"{apart_px:.0e} px, {abs(found.score - expected.score):.0e}"
+    return Row(name, timed(one, device, rounds), apart, copies(one, device))
 
 
 def frames(method: str, device: torch.device, rounds: int) -> Row:
@@ -119,13 +105,13 @@ def frames(method: str, device: torch.device, rounds: int) -> Row:
         metres = max(metres, float(np.hypot(fix.east_m - expected.east_m, fix.north_m - expected.north_m)))
     turn = iter(range(10**9))
     times = timed(lambda: matcher.locate(*given[next(turn) % len(given)]), device, rounds)
-    return Row(f"locate, {method}", times, 1, f"{metres:.0e} m", copies(lambda: matcher.locate(*given[0]), device))
+    return Row(f"locate, {method}", times, f"{metres:.0e} m", copies(lambda: matcher.locate(*given[0]), device))
 
 
 def measure(device: torch.device, *, quick: bool) -> list[Row]:
     """All rows of the table."""
-    rounds, batch = (QUICK_ROUNDS, 3) if quick else (ROUNDS, BATCH)
-    rows = [row for size in PAIRS[: 1 if quick else None] for row in matches(size, device, rounds, batch)]
+    rounds = QUICK_ROUNDS if quick else ROUNDS
+    rows = [match(size, device, rounds) for size in PAIRS[: 1 if quick else None]]
     return [*rows, *(frames(method, device, rounds) for method in ("ncc", "sift"))]
 
 

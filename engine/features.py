@@ -1,8 +1,8 @@
 """Local features: a batched SIFT that detects, describes and matches arrays, or tensors on any torch device.
 
 The detector is Lowe's: extrema of differences of Gaussians over position and scale, refined by a quadratic.
-The descriptor is Lowe's 4 x 4 cells of 8 orientations. On a CPU both are compiled loops
-(:mod:`engine.sift.loops`), on a GPU kornia's tensor ops (:mod:`engine.sift.tensors`).
+The descriptor is Lowe's 4 x 4 cells of 8 orientations as RootSIFT: square roots of their shares. On a CPU both are
+compiled loops (:mod:`engine.sift.loops`), on a GPU kornia's tensor ops (:mod:`engine.sift.tensors`).
 
 Convention:
     Points are (x, y) with pixel centres at integers and the origin at the centre of the top-left pixel.
@@ -50,7 +50,6 @@ def sift(
     mask: Picture | None = None,
     upsample: int = 2,
     contrast_threshold: float = 0.02,
-    root: bool = True,
     spread: int = 6,
 ) -> Features:
     """Detect and describe at most ``max_keypoints`` SIFT features per image, spread over the image.
@@ -64,7 +63,6 @@ def sift(
         mask: (B, 1, H, W) bool, True where keypoints are allowed.
         upsample: Samples per image pixel of the first octave: 1, or 2. The scales are the same. kornia's: 2.
         contrast_threshold: Lowe's, as OpenCV counts it: a keypoint's DoG is at least a third of it.
-        root: Return RootSIFT (square roots of the L1-normalised descriptor), also of unit L2 norm.
         spread: Cells along each side of the image; keypoints beyond a cell's double share rank after all others. 1
             ranks by strength alone: contrast times the square root of scale.
 
@@ -79,7 +77,7 @@ def sift(
     _check_images(images, mask)
     _check_options(max_keypoints, up_deg, upsample, contrast_threshold, spread)
     choice = SiftChoice(
-        max_keypoints, math.radians(up_deg) if upright else None, int(upsample), contrast_threshold, root, spread
+        max_keypoints, math.radians(up_deg) if upright else None, int(upsample), contrast_threshold, spread
     )
     # Sums of values far from [0, 1] may overflow, and the loops use them as indices.
     pictures = as_float(images[:, 0], "float32")

@@ -7,7 +7,7 @@ Convention:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.kernels import coarse_to_fine
-from engine.kernels import ncc as kernels
-from engine.kernels.peaks import find_peak, peak_of
+from engine.kernels.peaks import find_peak
 from engine.kernels.search_levels import Search, prepare
 from engine.runtime.device import Picture, as_float, as_tensor, element_type, like, plain
 from engine.values import Peak
@@ -29,7 +28,6 @@ __all__ = [
     "Search",
     "find_peak",
     "match_template",
-    "match_templates",
     "ncc",
     "prepare",
     "surface",
@@ -49,7 +47,6 @@ def ncc(
     *,
     zero_mean: bool = True,
     search_valid: Given | None = None,
-    templates_valid: Given | None = None,
     min_overlap: float = 0.5,
 ) -> Given:
     """Scores in [-1, 1]: normalised cross-correlation of templates with every position in a window.
@@ -61,9 +58,7 @@ def ncc(
         templates: (B, T, h, w) with h <= H and w <= W, on the same device.
         zero_mean: subtract the means (OpenCV's ``TM_CCOEFF_NORMED``); False is equation 1 (``TM_CCORR_NORMED``).
         search_valid: (B, H, W) bool, or None: all. Invalid pixels are left out of all sums.
-        templates_valid: (B, T, h, w) bool, or None: all.
-        min_overlap: with masks, positions where less than this share of the template's valid pixels is on valid
-            map score -1.
+        min_overlap: with a mask, positions where less than this share of the template is on valid map score -1.
 
     Returns:
         (B, T, H-h+1, W-w+1), float64 if either input is float64, else float32. A perfect match scores 1, an
@@ -71,27 +66,25 @@ def ncc(
 
     Raises:
         ShapeError: the shapes do not fit each other.
-        DtypeError: an element type is not in the list above, or a mask is not bool.
-        OptionError: different devices, NaN or infinity, or masks without ``zero_mean``.
+        DtypeError: an element type is not in the list above, or the mask is not bool.
+        OptionError: different devices, NaN or infinity, or a mask without ``zero_mean``.
     """
     _check(search, templates)
     types = (element_type(search), element_type(templates))
-    if search_valid is not None or templates_valid is not None:
-        masks = _mask("search_valid", search, search_valid), _mask("templates_valid", templates, templates_valid)
+    if search_valid is not None:
+        _check_mask(search, search_valid)
         if not zero_mean:
-            raise OptionError("zero_mean: expected True with masks, got False")
+            raise OptionError("zero_mean: expected True with a mask, got False")
         if not 0.0 < min_overlap <= 1.0:
             raise OptionError(f"min_overlap: expected above 0 and at most 1, got {min_overlap}")
-        pictures = plain(search, masks[0], templates, masks[1])
-        scores = kernels.masked_ncc_surface(*pictures, min_overlap=min_overlap)
-    elif types[0] in _DOUBLE or types[1] in _DOUBLE:
-        scores = kernels.ncc_surface(
-            *(as_tensor(as_float(v, "float64")) for v in (search, templates)), zero_mean=zero_mean
-        )
+        pictures = plain(search, search_valid, templates)
+        scores = _masked_kernels(pictures[0]).ncc_surface(*pictures, min_overlap=min_overlap)
     else:
-        scores = kernels.ncc_surface(
-            *plain(as_float(search, "float32"), as_float(templates, "float32")), zero_mean=zero_mean
-        )
+        if types[0] in _DOUBLE or types[1] in _DOUBLE:
+            pictures = [as_tensor(as_float(v, "float64")) for v in (search, templates)]
+        else:
+            pictures = plain(*(as_float(v, "float32") for v in (search, templates)))
+        scores = _kernels(pictures[0]).ncc_surface(*pictures, zero_mean=zero_mean)
     found: Given = like(search, as_float(scores, "float64" if "float64" in types else "float32"))
     return found
 
@@ -114,19 +107,32 @@ def _check(search: Picture, templates: Picture) -> None:
         raise OptionError(f"templates: expected on {places[0]} like search, got {places[1]}")
 
 
-def _mask(name: str, picture: Picture, mask: Picture | None) -> Picture:
-    """The mask, or one that is all True if none was given."""
-    if mask is None:
-        return (
-            np.ones(picture.shape, bool)
-            if isinstance(picture, np.ndarray)
-            else as_tensor(picture).new_ones(picture.shape).bool()
-        )
+def _check_mask(search: Picture, mask: Picture) -> None:
     if element_type(mask) != "bool":
-        raise DtypeError(f"{name}: expected bool, got {mask.dtype}")
-    if mask.shape != picture.shape:
-        raise ShapeError(f"{name}: expected {tuple(picture.shape)}, got {tuple(mask.shape)}")
-    return mask
+        raise DtypeError(f"search_valid: expected bool, got {mask.dtype}")
+    if mask.shape != search.shape:
+        raise ShapeError(f"search_valid: expected {tuple(search.shape)}, got {tuple(mask.shape)}")
+
+
+def _kernels(picture: Picture) -> Any:
+    """The kernels of arrays, or those of tensors; torch and numba take a while to import."""
+    if isinstance(picture, np.ndarray):
+        from engine.kernels import blocks
+
+        return blocks
+    from engine.kernels import tensors
+
+    return tensors
+
+
+def _masked_kernels(picture: Picture) -> Any:
+    if isinstance(picture, np.ndarray):
+        from engine.kernels import masked_blocks
+
+        return masked_blocks
+    from engine.kernels import masked_tensors
+
+    return masked_tensors
 
 
 def surface(search: Search, templates: Given) -> Given:
@@ -142,13 +148,13 @@ def surface(search: Search, templates: Given) -> Given:
     Raises:
         ShapeError: the templates are not (T, h, w), are empty, or are larger than the map.
     """
-    if templates.ndim != 3 or 0 in templates.shape:
-        raise ShapeError(f"templates: expected (T, h, w) with no empty axis, got {tuple(templates.shape)}")
     _check_fit(search, templates)
     return next(surfaces(search, templates, group=templates.shape[0]))
 
 
 def _check_fit(search: Search, templates: Picture) -> None:
+    if templates.ndim != 3 or 0 in templates.shape:
+        raise ShapeError(f"templates: expected (T, h, w) with no empty axis, got {tuple(templates.shape)}")
     (H, W), (h, w) = search.image.shape, templates.shape[-2:]
     if h > H or w > W:
         raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
@@ -165,7 +171,9 @@ def surfaces(search: Search, templates: Given, *, group: int) -> Iterator[Given]
     Returns:
         Yields (group, H-h+1, W-w+1) float32; the last group holds the remainder of T.
     """
-    inverse_norms = kernels.inverse_norm(search.image, search.sums, *templates.shape[-2:])
+    kernels = _kernels(search.image)
+    known = search.image if search.sums is None else search.sums
+    inverse_norms = kernels.inverse_norm(known, *templates.shape[-2:])
     for first in range(0, len(templates), group):
         part = _of_kind(search, templates[first : first + group])
         found = kernels.prepared_surface(search.image, inverse_norms, part - part.mean((-2, -1), keepdims=True))
@@ -196,65 +204,9 @@ def match_template(search: Search, template: Picture, *, exclusion_px: float, ex
     Raises:
         ShapeError: the template is not (h, w), is empty, or is larger than the map.
     """
-    _check_template(search, template)
-    if not isinstance(search.image, np.ndarray):
-        return _peaks_on_device([search], [template], exclusion_px)[0]
-    (template,) = plain(template)
-    if not exhaustive:
-        found = coarse_to_fine.peak(search, template, exclusion_px)
+    _check_fit(search, template[None])
+    if isinstance(search.image, np.ndarray) and not exhaustive:
+        found = coarse_to_fine.peak(search, plain(template)[0], exclusion_px)
         if found is not None:
             return found
     return find_peak(surface(search, template[None])[0], exclusion_px=exclusion_px)
-
-
-def match_templates(
-    searches: Sequence[Search], templates: Sequence[Picture], *, exclusion_px: float
-) -> list[Peak]:
-    """The peaks of many templates, each in its own part of a map, with one copy from a GPU for all.
-
-    On a GPU pairs of equal shapes are matched in one batch.
-
-    Args:
-        searches: from :func:`prepare`, on one device.
-        templates: (h, w) float32 each, as many, on the same device.
-        exclusion_px: radius about a peak within which no rival is counted.
-
-    Returns:
-        The peaks as :func:`match_template` finds them, in the same order.
-
-    Raises:
-        ShapeError: there are not as many templates as parts of a map, or one of them does not fit its part.
-    """
-    if len(searches) != len(templates):
-        raise ShapeError(f"templates: expected {len(searches)} (searches), got {len(templates)}")
-    for search, template in zip(searches, templates, strict=True):
-        _check_template(search, template)
-    if not searches or isinstance(searches[0].image, np.ndarray):
-        pairs = zip(searches, templates, strict=True)
-        return [match_template(search, template, exclusion_px=exclusion_px) for search, template in pairs]
-    return _peaks_on_device(searches, templates, exclusion_px)
-
-
-def _check_template(search: Search, template: Picture) -> None:
-    if template.ndim != 2 or 0 in template.shape:
-        raise ShapeError(f"template: expected (h, w) with no empty axis, got {tuple(template.shape)}")
-    _check_fit(search, template[None])
-
-
-def _peaks_on_device(searches: Sequence[Search], templates: Sequence[Tensor], exclusion_px: float) -> list[Peak]:
-    """:func:`find_peak` of the surfaces, bit for bit; 28 numbers a surface are copied from the device, at once."""
-    from engine.kernels.peak_tensors import of_groups
-
-    groups: dict[tuple[tuple[int, ...], tuple[int, ...]], list[int]] = {}
-    for index, (search, template) in enumerate(zip(searches, templates, strict=True)):
-        groups.setdefault((search.image.shape, template.shape), []).append(index)
-    found = of_groups(
-        [[(searches[i].image, searches[i].sums, templates[i]) for i in members] for members in groups.values()],
-        exclusion_px,
-    )
-    peaks: dict[int, Peak] = {}
-    for (size, shape), members in groups.items():
-        width, height = size[1] - shape[1] + 1, size[0] - shape[0] + 1
-        for index in members:
-            peaks[index] = peak_of(found[len(peaks)], height, width)
-    return [peaks[index] for index in range(len(searches))]

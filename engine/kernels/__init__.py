@@ -1,4 +1,4 @@
-"""Kernels: tensor ops and compiled loops for NCC behind :mod:`engine.kernels.ncc`; compiled loops for the rest.
+"""Kernels: tensor ops and compiled loops for NCC behind :mod:`engine.ncc_fft`; compiled loops for the rest.
 
 Tests compare every kernel of NCC with :mod:`engine.kernels.reference`, which is slow, float64 and obvious.
 

@@ -46,10 +46,6 @@ def ncc_surface(search: FloatImage, templates: FloatImage, *, zero_mean: bool) -
     (B, H, W), (T, h, w) = search.shape, templates.shape[1:]
     windows, pictures = np.ascontiguousarray(search), np.ascontiguousarray(templates)
     out = np.empty((B, T, H - h + 1, W - w + 1), np.float32)
-    (ny, rows), (nx, columns) = _division(H - h + 1, h), _division(W - w + 1, w)
-
-    def one_pair(b: int) -> None:
-        _one_pair(out[b, 0], windows[b], pictures[b, 0], zero_mean, (rows, columns))
 
     def one_window(b: int) -> None:
         mean, energy = surface_loops.moments(windows[b], zero_mean)
@@ -59,7 +55,7 @@ def ncc_surface(search: FloatImage, templates: FloatImage, *, zero_mean: bool) -
         inverse_norms = surface_loops.inverse_norms(windows[b], mean, energy, h, w, zero_mean)
         correlate(out[b], windows[b], (mean, energy), inverse_norms, [model for model, _ in models])
 
-    in_parallel(one_pair if ny == nx == T == 1 else one_window, range(B))
+    in_parallel(one_window, range(B))
     return out
 
 
@@ -130,9 +126,7 @@ def correlate(
     (ny, rows), (nx, columns) = _division(height, h), _division(width, w)
     size, mean = (rows, columns), moments[0]
     if ny == nx == len(models) == 1:
-        packed, energy = _scratch("packed", (*size, 2)), moments[1]
-        surface_loops.pack(packed, window, mean, 1.0 / math.sqrt(energy) if energy > 0.0 else 0.0, models[0])
-        _finish_pair(out[0], packed, window, moments, inverse_norms, float(inverse_norms.max()), models[0])
+        _write_pair(out[0], window, moments, inverse_norms, models[0], size)
         return
 
     def prepared(index: int) -> _Block:
@@ -155,36 +149,22 @@ def correlate(
     in_parallel(one_template, range(len(models)))
 
 
-def _one_pair(
-    out: FloatImage, window: FloatImage, template: FloatImage, zero_mean: bool, size: tuple[int, int]
-) -> None:
-    """Write the scores of one template in a window of one block to ``out`` (H-h+1, W-w+1)."""
-    packed = _scratch("packed", (*size, 2))
-    moments, squares, model, inverse_norms, largest = surface_loops.packed_pair(
-        packed, window, template, zero_mean
-    )
-    _check_finite("search", moments[1])
-    _check_finite("templates", squares)
-    _finish_pair(out, packed, window, moments, inverse_norms, largest, model)
-
-
-def _finish_pair(
+def _write_pair(
     out: FloatImage,
-    packed: FloatImage,
     window: FloatImage,
     moments: tuple[float, float],
     inverse_norms: FloatImage,
-    largest: float,
     model: FloatImage,
+    size: tuple[int, int],
 ) -> None:
-    """The scores of two pictures of equal norm that :func:`surface_loops.pack` wrote, in one transform."""
+    """Write the scores of one template in a window of one block: both pictures in one complex transform."""
     mean, energy = moments
-    size = packed.shape[:2]
-    if _is_weak(energy, largest):
+    if _is_weak(energy, float(inverse_norms.max())):
         spectrum = _window_spectrum(window, mean, size, inverse_norms)
         _write_scores(out, spectrum, _spectrum(model, size, spectrum.dtype), inverse_norms)
         return
-    products = _scratch("products", size)
+    packed, products = _scratch("packed", (*size, 2)), _scratch("products", size)
+    surface_loops.pack(packed, window, mean, 1.0 / math.sqrt(energy) if energy > 0.0 else 0.0, model)
     cv2.dft(packed, packed)
     surface_loops.packed_product(products, packed)
     transform(products, cv2.DFT_INVERSE, out.shape[0])

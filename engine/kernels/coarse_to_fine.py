@@ -18,9 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels import ncc as kernels
+from engine.kernels.local import LocalScores
 from engine.kernels.peaks import FAR, NEAR, best_positions, fit_summit
 from engine.kernels.search_levels import COARSE_TEMPLATE_PX, MAX_HALVINGS, Search
+from engine.kernels.sums import halved
 from engine.values import Peak
 
 FloatImage = NDArray[np.float32]
@@ -160,7 +161,7 @@ def _levels(search: Search, template: FloatImage, min_overlap: float, max_loss: 
             break
         if H * W < _MIN_HALVED_PX or min(H - h, W - w) < 16:
             break
-        coarser = kernels.halved(model)
+        coarser = halved(model)
         if max_loss < 1.0 and _phase_loss(model, coarser) > max_loss:
             break
         parts.append(part.half)
@@ -182,9 +183,11 @@ def surfaces_over_nodata(
     Returns:
         Yields T surfaces (H-h+1, W-w+1).
     """
+    from engine.kernels import blocks  # numba takes a while to import
+
     assert search.counts is not None
     model = (templates.shape[1], templates.shape[2])
-    inverse_norms = kernels.inverse_norm(search.image, search.sums, *model)
+    inverse_norms = blocks.inverse_norm(search.image, *model)
     share = _share_on_map(search.counts, model, 1, inverse_norms.shape)
     for first in range(0, len(templates), group):
         part = templates[first : first + group]
@@ -194,11 +197,13 @@ def surfaces_over_nodata(
 
 def _coarse_scores(levels: _Levels) -> FloatImage:
     """Scores on the coarsest level; positions partly on nodata score about as at full resolution."""
+    from engine.kernels import blocks
+
     coarse, model = levels.parts[-1], levels.models[-1]
-    inverse_norms = kernels.inverse_norm(coarse.image, coarse.sums, *model.shape)
+    inverse_norms = blocks.inverse_norm(coarse.image, *model.shape)
     counts, (h, w), step = levels.parts[0].counts, levels.models[0].shape, levels.scale
     if counts is None:
-        return np.asarray(kernels.prepared_surface(coarse.image, inverse_norms, model[None])[0])
+        return np.asarray(blocks.prepared_surface(coarse.image, inverse_norms, model[None])[0])
     share = _share_on_map(counts, (h, w), step, inverse_norms.shape)
     # A position between those of the level has this much more of the template on the map at most.
     least = levels.min_overlap - step * (1.0 / h + 1.0 / w)
@@ -209,9 +214,11 @@ def _scores_by_share(
     part: Search, models: FloatImage, inverse_norms: FloatImage, share: FloatImage, least: float
 ) -> FloatImage:
     """Scores (T, H', W') divided by the share on the map; -1 where that is less than ``least``."""
+    from engine.kernels import blocks
+
     is_off = share < max(least, 1e-3)
     inverse_norms[is_off] = 0.0
-    scores: FloatImage = kernels.prepared_surface(part.image, inverse_norms, models)
+    scores = blocks.prepared_surface(part.image, inverse_norms, models)
     np.divide(scores, share, out=scores, where=(share < 1.0) & (scores > 0.0))
     scores[:, is_off] = -1.0
     return np.asarray(np.minimum(scores, np.float32(1.0), out=scores))
@@ -262,7 +269,7 @@ def _refined_candidates(
 
 def _phase_loss(fine: FloatImage, coarse: FloatImage) -> float:
     """Loss of a perfect match on the coarser of two levels if it lies between that level's pixels."""
-    between = kernels.halved(fine[1:, 1:]).ravel()
+    between = halved(fine[1:, 1:]).ravel()
     model = coarse[: (fine.shape[0] - 1) // 2, : (fine.shape[1] - 1) // 2].ravel()
     norm = math.sqrt(float(np.dot(between, between)) * float(np.dot(model, model)))
     return 1.0 - float(np.dot(between, model)) / norm if norm > 0.0 else 1.0
@@ -292,7 +299,7 @@ def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak 
     part, model, scale = levels.parts[0], levels.models[0], levels.scale
     dx, dy, _ = fit_summit(scores[y - 1 : y + 2, x - 1 : x + 2].astype(np.float64))
     y, x = round(scale * (y + dy)), round(scale * (x + dx))
-    scorer = kernels.LocalScores(part.image, model, (y, x), part.counts, levels.min_overlap)
+    scorer = LocalScores(part.image, model, (y, x), part.counts, levels.min_overlap)
     for uphill in range(_UPHILL_STEPS + 1):
         if not all(2 <= v <= n - 2 for v, n in zip((y, x), scorer.limits, strict=True)):
             return None, False

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from engine.kernels import blocks, surface_loops
 from engine.kernels.blocks import fast_side, transform
-from engine.kernels.sums import counts, counts_inside, integrals
+from engine.kernels.sums import check_finite, counts, counts_inside, integrals
 from engine.kernels.transform_sizes import FLAT_SHARE
 
 Array = NDArray[np.float64]
@@ -47,7 +47,11 @@ def ncc_surface(
 
     Returns:
         (B, T, H-h+1, W-w+1) in [-1, 1]: float32 if both pictures are, else float64.
+
+    Raises:
+        OptionError: NaN or infinity.
     """
+    check_finite(search=search, templates=templates)
     windows = zip(search, search_valid, templates, strict=True)
     return np.stack([_surfaces(*window, min_overlap) for window in windows])
 

@@ -7,24 +7,25 @@ their differences cancel, so all of it is in float64.
 
 from __future__ import annotations
 
+from engine.kernels.tensors import check_finite
 from engine.kernels.transform_sizes import FLAT_SHARE, fast_length
 from engine.runtime.tensors import Tensor, torch
 
 
-def ncc_surface(
-    search: Tensor, search_valid: Tensor, templates: Tensor, templates_valid: Tensor, *, min_overlap: float
-) -> Tensor:
-    """Zero-mean NCC over the pixels that are valid in both.
+def ncc_surface(search: Tensor, search_valid: Tensor, templates: Tensor, *, min_overlap: float) -> Tensor:
+    """Zero-mean NCC over the valid pixels of windows.
 
     Args:
         search: (B, H, W).
         search_valid: (B, H, W) bool.
         templates: (B, T, h, w).
-        templates_valid: (B, T, h, w) bool.
-        min_overlap: positions with a smaller share of the template's valid pixels in common score -1.
+        min_overlap: positions where a smaller share of the template lies on valid pixels score -1.
 
     Returns:
         (B, T, H-h+1, W-w+1) float64 in [-1, 1].
+
+    Raises:
+        OptionError: NaN or infinity.
     """
     (H, W), (h, w) = search.shape[-2:], templates.shape[-2:]
     size = (fast_length(H), fast_length(W))
@@ -34,7 +35,7 @@ def ncc_surface(
         return product[..., : H - h + 1, : W - w + 1]
 
     m, i, ii = (s[:, None] for s in _spectra(search, search_valid, size))
-    n, t, tt = _spectra(templates, templates_valid, size)
+    n, t, tt = _spectra(templates, torch.ones_like(templates, dtype=torch.bool), size)
     common = sums(m, n).round_()  # a count of pixels
     safe = common.clamp_min(1.0)
     sum_i, sum_t = sums(i, n), sums(m, t)
@@ -44,8 +45,9 @@ def ncc_surface(
     textured = (spread_i > FLAT_SHARE * ii[..., :1, :1].real) & (spread_t > FLAT_SHARE * tt[..., :1, :1].real)
     scores = numerator / (spread_i.clamp_min(0.0) * spread_t.clamp_min(0.0)).sqrt().clamp_min(1e-300)
     scores = torch.where(textured, scores, 0.0).clamp_(-1.0, 1.0)
-    enough = common >= min_overlap * templates_valid.sum(dim=(-2, -1))[..., None, None].clamp_min(1)
-    return torch.where(enough, scores, -1.0)
+    scores = torch.where(common >= max(min_overlap * (h * w), 1.0), scores, -1.0)
+    check_finite(search=search, templates=templates)  # last: the host waits for it
+    return scores
 
 
 def _spectra(picture: Tensor, valid: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -80,40 +78,23 @@ def find_peak(scores: Picture, *, exclusion_px: float) -> Peak:
     """
     if scores.ndim != 2 or 0 in scores.shape:
         raise ShapeError(f"scores: expected (H, W) with no empty axis, got {tuple(scores.shape)}")
-    if not isinstance(scores, np.ndarray) and scores.device.type != "cpu":
-        from engine.kernels.peak_tensors import of_surface
+    height, width = scores.shape
+    if isinstance(scores, np.ndarray) or scores.device.type == "cpu":
+        around = on_host(scores)
+        y, x = row, column = divmod(int(around.argmax()), width)
+        score, second = float(around[y, x]), _second_score(around, x, y, exclusion_px)
+    else:
+        from engine.kernels.tensors import peak_numbers
 
-        return peak_of(of_surface(scores, exclusion_px), *scores.shape)
-    values = on_host(scores)
-    y, x = divmod(int(values.argmax()), values.shape[1])
+        index, score, second, *near = peak_numbers(scores, exclusion_px)
+        y, x = divmod(int(index), width)
+        around, row, column = np.reshape(near, (5, 5)), 2, 2
     dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
-    r = min(2, x, y, values.shape[1] - 1 - x, values.shape[0] - 1 - y)
+    r = min(2, x, y, width - 1 - x, height - 1 - y)
     if r > 0:
-        dx, dy, curvature = fit_summit(values[y - r : y + r + 1, x - r : x + r + 1].astype(np.float64))
-    second = _second_score(values, x, y, exclusion_px)
-    return Peak(x + dx, y + dy, float(values[y, x]), second, curvature)
-
-
-def peak_of(summit: NDArray[np.float64], height: int, width: int) -> Peak:
-    """The peak of one surface.
-
-    Args:
-        summit: (28,) of :func:`engine.kernels.peak_tensors.summits`, on the CPU.
-        height: of the surface.
-        width: of the surface.
-
-    Returns:
-        Peak: that of :func:`find_peak`.
-    """
-    y, x = divmod(int(summit[0]), width)
-    dx, dy, curvature = 0.0, 0.0, np.zeros((2, 2))
-    side = math.isqrt(len(summit) - 3)
-    reach = side // 2
-    r = min(reach, x, y, width - 1 - x, height - 1 - y)
-    if r > 0:
-        inner = slice(reach - r, reach + r + 1)
-        dx, dy, curvature = fit_summit(summit[3:].reshape(side, side)[inner, inner])
-    return Peak(x + dx, y + dy, float(summit[1]), float(summit[2]), curvature)
+        patch = around[row - r : row + r + 1, column - r : column + r + 1]
+        dx, dy, curvature = fit_summit(patch.astype(np.float64))
+    return Peak(x + dx, y + dy, score, second, curvature)
 
 
 def _second_score(scores: NDArray[np.float32], x: int, y: int, exclusion_px: float) -> float:

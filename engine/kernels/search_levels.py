@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import DtypeError, ShapeError
-from engine.kernels import ncc as kernels
+from engine.kernels.sums import counts, halved
 from engine.runtime.device import Picture, element_type, plain
 
 # Coarse to fine: templates are halved while they stay at least this wide.
@@ -23,7 +23,7 @@ class Search:
     Attributes:
         image: (H, W) float32, its mean small against its standard deviation.
         half: the same part at half resolution, whose pixel (x, y) is the mean of 2 x 2 pixels from (2x, 2y);
-            None on the coarsest level.
+            None on the coarsest level, and on a GPU.
         sums: (2, H+1, W+1) float64 running sums of the picture and of its square on a GPU; None on the CPU, where
             the sums of a window take one pass.
         counts: (H+1, W+1) int32 running sums of its valid pixels; invalid ones are 0 in the picture. None if all
@@ -51,7 +51,7 @@ class Search:
 
 
 def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.bool_] | None = None) -> Search:
-    """Compute half-resolution levels, and on a GPU running sums.
+    """Compute half-resolution levels, or on a GPU running sums.
 
     Args:
         image: (H, W) float32, its mean small against its standard deviation.
@@ -59,7 +59,7 @@ def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.b
         valid: (H, W); None if all pixels are. The picture is 0 where they are not.
 
     Returns:
-        Search: with levels down to 48 x 48 pixels.
+        Search: on the CPU with levels down to 48 x 48 pixels.
 
     Raises:
         ShapeError: the picture is not (H, W), or is empty.
@@ -70,12 +70,11 @@ def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.b
     if element_type(image) != "float32":
         raise DtypeError(f"image: expected float32, got {image.dtype}")
     (image,) = plain(image)
-    image = np.ascontiguousarray(image) if isinstance(image, np.ndarray) else image.contiguous()
-    half = None
-    if halvings > 0 and min(image.shape) >= 2 * COARSE_TEMPLATE_PX:
-        half = prepare(kernels.halved(image), halvings=halvings - 1)
     if not isinstance(image, np.ndarray):
         from engine.kernels.tensors import integrals
 
-        return Search(image, half, sums=integrals(image))
-    return Search(image, half, counts=None if valid is None else kernels.counts(valid))
+        return Search(image.contiguous(), sums=integrals(image))
+    image, half = np.ascontiguousarray(image), None
+    if halvings > 0 and min(image.shape) >= 2 * COARSE_TEMPLATE_PX:
+        half = prepare(halved(image), halvings=halvings - 1)
+    return Search(image, half, counts=None if valid is None else counts(valid))

@@ -138,9 +138,9 @@ def _highest_bin(raw, smooth, histogram):
     return best + 0.5 * (left - right) / min(left - 2 * top + right, -1e-12)
 
 
-@compiled("(f4[::1], i8[:, ::1], f4[:, ::1], f4[::1], f4, f4[:, ::1], b1)")
-def descriptors(buffer, table, keypoints, angle, step, tent, root):
-    """Lowe's cells of 8 orientations, of unit L2 norm.
+@compiled("(f4[::1], i8[:, ::1], f4[:, ::1], f4[::1], f4, f4[:, ::1])")
+def descriptors(buffer, table, keypoints, angle, step, tent):
+    """Lowe's cells of 8 orientations as RootSIFT, of unit L2 norm.
 
     Args:
         buffer: (N,) float32 scale space.
@@ -149,7 +149,6 @@ def descriptors(buffer, table, keypoints, angle, step, tent, root):
         angle: (M,) float32 radians.
         step: spacing of the samples where the growth is 1, in pixels of the octave.
         tent: (cells, S) float32 weights of a row's samples in the cells.
-        root: whether to compute RootSIFT.
 
     Returns:
         (M, cells^2 * 8) float32, cells row by row.
@@ -178,26 +177,25 @@ def descriptors(buffer, table, keypoints, angle, step, tent, root):
                         for x in range(side):
                             columns[r, k, x] += weight * p[k, x]
         _pool(columns, tent, out[i])
-        _normalise(out[i], root)
+        _normalise(out[i])
     return out
 
 
 @inlined
-def _normalise(values, root):
-    """Unit L2 norm with entries bounded before (Lowe), and then the roots of shares for RootSIFT."""
+def _normalise(values):
+    """The roots of shares (RootSIFT), with entries bounded before (Lowe)."""
     bound, total = np.float32(_BOUND), np.float32(_LEAST)
     for k in range(values.size):
         total += values[k] * values[k]
     gain = np.float32(1) / np.float32(math.sqrt(total))
-    total, squares = np.float32(_LEAST), np.float32(_LEAST)
+    total = np.float32(_LEAST)
     for k in range(values.size):
         value = min(values[k] * gain, bound)
         values[k] = value
         total += value
-        squares += value * value
-    gain = np.float32(1) / np.float32(total if root else math.sqrt(squares))
+    gain = np.float32(1) / total
     for k in range(values.size):
-        values[k] = math.sqrt(values[k] * gain) if root else values[k] * gain
+        values[k] = math.sqrt(values[k] * gain)
 
 
 @inlined

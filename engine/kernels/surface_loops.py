@@ -196,27 +196,6 @@ def pack(out, window, mean, scale, model):
                 to[x, 1] = values[x]
 
 
-@compiled("(f4[:, :, ::1], f4[:, ::1], f4[:, ::1], b1)")
-def packed_pair(out, window, template, zero_mean):
-    """All that one template in one window needs before the transform, at once: on small windows calls cost most.
-
-    Returns:
-        Moments of the window, the template's sum of squares, the template scaled to 1, the patches' reciprocal
-        norms, and the largest of these; ``out`` as by :func:`pack`.
-    """
-    mean, energy = moments(window, zero_mean)
-    model, squares = unit(template, zero_mean)
-    norms, largest = (
-        inverse_norms(window, mean, energy, model.shape[0], model.shape[1], zero_mean),
-        np.float32(0.0),
-    )
-    for y in range(norms.shape[0]):
-        for x in range(norms.shape[1]):
-            largest = max(largest, norms[y, x])
-    pack(out, window, mean, 1.0 / math.sqrt(energy) if energy > 0.0 else 0.0, model)
-    return (mean, energy), squares, model, norms, largest
-
-
 @compiled("(f4[:, ::1], f4[:, :, ::1])")
 def packed_product(out, packed):
     """Spectrum of the correlation of two real pictures that were transformed as one complex picture.

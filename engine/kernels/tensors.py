@@ -44,12 +44,17 @@ def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor
 
     Returns:
         (B, T, H-h+1, W-w+1) of the same dtype, in [-1, 1]; 0 where patch or template is flat.
+
+    Raises:
+        OptionError: NaN or infinity.
     """
+    given = {"search": search, "templates": templates}
     if zero_mean:  # NCC is invariant to the window's mean, but without it the squares below stay small
         search = (search - search.mean(dim=(-2, -1), keepdim=True, dtype=torch.float64)).to(search.dtype)
         templates = templates - templates.mean(dim=(-2, -1), keepdim=True, dtype=torch.float64)
         templates = templates - templates.mean(dim=(-2, -1), keepdim=True)  # the rounding residue of a flat one
     scores = [_one_surface(picture, group, zero_mean) for picture, group in zip(search, templates, strict=True)]
+    check_finite(**given)  # last: the host waits for it
     return torch.stack(scores).to(search.dtype)
 
 
@@ -83,75 +88,48 @@ def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) ->
     Returns:
         (T, H-h+1, W-w+1) float32 in [-1, 1].
     """
-    return products(image, templates).mul_(inverse_norms).clamp_(-1.0, 1.0)
-
-
-def products(image: Tensor, templates: Tensor) -> Tensor:
-    """Numerators of :func:`prepared_surface`.
-
-    Args:
-        image: (H, W) float32, or (T, H, W) if every template has its own.
-        templates: (T, h, w) float32 of zero mean, scaled to a norm of 1 here.
-
-    Returns:
-        (T, H-h+1, W-w+1) float32.
-    """
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True).clamp_min_(_TINY)
-    return correlate(image, templates / norm)
+    return correlate(image, templates / norm).mul_(inverse_norms).clamp_(-1.0, 1.0)
 
 
-def peak(products: Tensor, inverse_norms: Tensor) -> tuple[Tensor, Tensor]:
-    """Maximum of every template's surface.
-
-    Args:
-        products: (T, H', W') float32 numerators.
-        inverse_norms: (H', W') float32, or (T, H', W').
-
-    Returns:
-        Score (T,) and flat index (T,) int64 in (H', W'), the lowest of equal ones; NaN counts as -1.
-    """
-    scores = _scores(products, inverse_norms).flatten(1)
-    index = scores.argmax(dim=1, keepdim=True)
-    return scores.gather(1, index)[:, 0], index[:, 0]
-
-
-def rival(products: Tensor, inverse_norms: Tensor, winner: Tensor, radius_squared: int) -> Tensor:
-    """Maximum of every template's surface outside a disc.
+def peak_numbers(scores: Tensor, exclusion_px: float) -> list[float]:
+    """The numbers that define a surface's peak, found on its device and copied at once.
 
     Args:
-        products: (T, H', W') float32 numerators.
-        inverse_norms: (H', W') float32, or (T, H', W').
-        winner: (T,) int64, the flat index of the disc's centre.
-        radius_squared: positions of at most this squared distance are inside, in squared pixels.
+        scores: (H', W'); NaN counts as -1.
+        exclusion_px: radius about the peak within which no rival is counted.
 
     Returns:
-        (T,) float32; -1 if nothing is outside.
+        28: flat index, the lowest of equal ones; score; the rival's score, -1 if there is none; and the 5 x 5
+        scores about the peak, those on the border repeated beyond it.
     """
-    height, width = products.shape[1:]
-    row, column = (winner // width)[:, None, None], (winner % width)[:, None, None]
-    dy = torch.arange(height, device=winner.device)[:, None] - row
-    dx = torch.arange(width, device=winner.device) - column
-    scores = _scores(products, inverse_norms)
-    return scores.masked_fill_(dy * dy + dx * dx <= radius_squared, -1.0).amax(dim=(1, 2))
-
-
-def _scores(products: Tensor, inverse_norms: Tensor) -> Tensor:
-    return (products * inverse_norms).nan_to_num_(nan=-1.0).clamp_(-1.0, 1.0)
+    with torch.inference_mode():
+        scores = scores.float().nan_to_num(nan=-1.0).clamp_(-1.0, 1.0)
+        height, width = scores.shape
+        index = scores.flatten().argmax(dim=0, keepdim=True)
+        row, column = index // width, index % width
+        dy, dx = (torch.arange(n, device=index.device) - at for n, at in ((height, row), (width, column)))
+        inside = dy.square()[:, None] + dx.square() <= math.floor(exclusion_px * exclusion_px)
+        rival = scores.masked_fill(inside, -1.0).amax()
+        near = torch.arange(-2, 3, device=index.device)
+        around = scores[(row + near).clamp(0, height - 1)[:, None], (column + near).clamp(0, width - 1)]
+        best = scores.flatten().gather(0, index)
+        return torch.cat([index.double(), best, rival[None], around.flatten()]).cpu().tolist()
 
 
 def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
     """Reciprocal norm about the mean of every patch.
 
     Args:
-        sums: (..., 2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
+        sums: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
         h: rows of a patch.
         w: columns of a patch.
 
     Returns:
-        (..., H-h+1, W-w+1) float32; 0 where a patch is flat.
+        (H-h+1, W-w+1) float32; 0 where a patch is flat.
     """
-    energy, squares = box_energy(sums, h, w), sums[..., 1, :, :]
-    floor = FLAT_SHARE * (squares[..., -1:, -1:] - squares[..., :1, :1])  # no less than the window's own energy
+    energy, squares = box_energy(sums, h, w), sums[1]
+    floor = FLAT_SHARE * (squares[-1, -1] - squares[0, 0])  # no less than the window's own energy
     return energy.masked_fill_(energy <= floor, torch.inf).float().rsqrt_()
 
 
@@ -159,24 +137,19 @@ def correlate(search: Tensor, templates: Tensor) -> Tensor:
     """Cross-correlation by the correlation theorem.
 
     Args:
-        search: (H, W) floating point, or (T, H, W) if every template has its own.
+        search: (H, W) floating point.
         templates: (T, h, w) of the same dtype.
 
     Returns:
         (T, H-h+1, W-w+1) sums of products.
     """
-    (H, W), (h, w) = search.shape[-2:], templates.shape[-2:]
-    rows, columns = fast_length(H), fast_length(W)
-    size = (rows, columns)
+    (H, W), (h, w) = search.shape, templates.shape[1:]
+    rows, columns = size = fast_length(H), fast_length(W)
     count = max(1, _CHUNK_NUMBERS // (2 * rows * (columns // 2 + 1)))
-    groups = templates.split(count)
-    if search.ndim == 2:
-        spectra = [torch.fft.rfft2(search, s=size)] * len(groups)
-    else:
-        spectra = [torch.fft.rfft2(group, s=size) for group in search.split(count)]
+    spectrum = torch.fft.rfft2(search, s=size)
     parts = [
         _inverse(spectrum * torch.fft.rfft2(group, s=size).conj(), H - h + 1, W - w + 1, columns)
-        for spectrum, group in zip(spectra, groups, strict=True)
+        for group in templates.split(count)
     ]
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
@@ -203,19 +176,6 @@ def integrals(image: Tensor) -> Tensor:
     return torch.stack([wide, wide.square()]).cumsum_(-1).cumsum_(-2)
 
 
-def halved(image: Tensor) -> Tensor:
-    """Means of 2 x 2 pixels.
-
-    Args:
-        image: (H, W) float32; an odd last row or column is left out.
-
-    Returns:
-        (H // 2, W // 2) float32.
-    """
-    height, width = image.shape[0] & ~1, image.shape[1] & ~1
-    return torch.nn.functional.avg_pool2d(image[None, None, :height, :width], 2)[0, 0]
-
-
 def box_sum(total: Tensor, h: int, w: int) -> Tensor:
     """Sums over every patch.
 
@@ -234,14 +194,13 @@ def box_energy(sums: Tensor, h: int, w: int) -> Tensor:
     """Sum of squares about the mean of every patch.
 
     Args:
-        sums: (..., 2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
+        sums: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
         h: rows of a patch.
         w: columns of a patch.
 
     Returns:
-        (..., H-h+1, W-w+1) float64.
+        (H-h+1, W-w+1) float64.
     """
-    both = box_sum(sums, h, w)
-    total, square = both[..., 0, :, :], both[..., 1, :, :]
+    total, square = box_sum(sums, h, w)
     energy: Tensor = square.addcmul_(total, total, value=-1.0 / (h * w))
     return energy

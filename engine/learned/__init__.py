@@ -10,7 +10,7 @@ from engine.runtime.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
     from engine.learned.keypoints import Extractor, Keypoints
-    from engine.learned.loading import load_disk_lightglue, load_loftr, load_matcher
+    from engine.learned.loading import load_matcher
     from engine.learned.matchers import KeypointMatcher, Loftr
     from engine.learned.pairs import PairMatcher
 
@@ -20,14 +20,12 @@ __all__ = [
     "Keypoints",
     "Loftr",
     "PairMatcher",
-    "load_disk_lightglue",
-    "load_loftr",
     "load_matcher",
 ]
 
 _NAMES = {
     "engine.learned.keypoints": "Extractor Keypoints",
-    "engine.learned.loading": "load_disk_lightglue load_loftr load_matcher",
+    "engine.learned.loading": "load_matcher",
     "engine.learned.matchers": "KeypointMatcher Loftr",
     "engine.learned.pairs": "PairMatcher",
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,81 +53,27 @@ def load_matcher(
             raise OptionError(f"weights: {weights.path}: expected {', '.join(KINDS)}, got tensors named {some}")
     kinds = sorted(str(weights.kind) for weights in files)
     if kinds == ["LoFTR"]:
-        return Loftr(_loftr(files[0], target), min_confidence)
+        return Loftr(fill(_kornia().LoFTR(pretrained=None), files[0], target), min_confidence)
     extractors = [weights for weights in files if weights.kind in _EXTRACTORS]
     matchers = [weights for weights in files if weights.kind == "LightGlue"]
     if len(extractors) != 1 or len(matchers) != 1 or len(files) != 2:
         raise OptionError(f"weights: expected the files of {_EXPECTED}, got {' and '.join(kinds)}")
-    return _keypoint_matcher(extractors[0], matchers[0], target, max_keypoints)
+    extractor, numbers = _extractor(extractors[0], target)
+    return KeypointMatcher(extractor, _lightglue(matchers[0], numbers, target), max_keypoints)
 
 
-def load_loftr(path: str | Path, *, device: str | torch.device = "auto", min_confidence: float = 0.5) -> Loftr:
-    """Build LoFTR with the weights of a local file.
-
-    Args:
-        path: a state dict, or a checkpoint that holds one.
-        device: "cpu", "cuda" or "auto".
-        min_confidence: in [0, 1]; matches below it are left out.
-
-    Raises:
-        OptionError: the file is missing, is not one of tensors, or does not fit the network.
-        DeviceError: the device is not there.
-    """
-    if not 0.0 <= min_confidence <= 1.0:
-        raise OptionError(f"min_confidence: expected a number in [0, 1], got {min_confidence}")
-    return Loftr(_loftr(read_weights(path), torch.device(devices.resolve(device))), min_confidence)
-
-
-def load_disk_lightglue(
-    disk: str | Path, lightglue: str | Path, *, device: str | torch.device = "auto", max_keypoints: int = 2048
-) -> KeypointMatcher:
-    """Build DISK and LightGlue with the weights of two local files.
-
-    Args:
-        disk: a state dict, or a checkpoint that holds one, of DISK.
-        lightglue: the same of LightGlue for DISK's descriptors.
-        device: "cpu", "cuda" or "auto".
-        max_keypoints: taken from each picture.
-
-    Raises:
-        OptionError: a file is missing, is not one of tensors, or does not fit its network.
-        DeviceError: the device is not there.
-    """
-    if max_keypoints < 2:
-        raise OptionError(f"max_keypoints: expected at least 2, got {max_keypoints}")
-    target = torch.device(devices.resolve(device))
-    detector = Disk(_disk(read_weights(disk), target))
-    return KeypointMatcher(detector, _lightglue(read_weights(lightglue), 128, target), max_keypoints)
-
-
-def _keypoint_matcher(
-    extractor: Weights, lightglue: Weights, device: torch.device, max_keypoints: int
-) -> KeypointMatcher:
-    build: dict[str, tuple[Callable[[nn.Module], Extractor], Callable[[Weights, torch.device], nn.Module]]] = {
-        "DISK": (Disk, _disk),
-        "ALIKED": (Aliked, _aliked),
-        "SuperPoint": (SuperPointKeypoints, _superpoint),
-    }
-    assert extractor.kind is not None  # checked by the caller
-    wrap, load = build[extractor.kind]
-    network = load(extractor, device)
-    numbers = {"DISK": 128, "SuperPoint": 256}.get(extractor.kind) or len(
-        extractor.tensors["desc_head.sf_conv.weight"]
-    )
-    return KeypointMatcher(wrap(network), _lightglue(lightglue, numbers, device), max_keypoints)
+def _extractor(weights: Weights, device: torch.device) -> tuple[Extractor, int]:
+    """The extractor of a file, and how many numbers its descriptors have."""
+    if weights.kind == "DISK":
+        return Disk(fill(_kornia().DISK(), weights, device)), 128
+    if weights.kind == "SuperPoint":
+        return SuperPointKeypoints(fill(SuperPoint(), weights, device)), 256
+    return Aliked(_aliked(weights, device)), len(weights.tensors["desc_head.sf_conv.weight"])
 
 
 def _kornia() -> Any:
     """Kornia's networks, which take a second to import."""
     return importlib.import_module("kornia.feature")
-
-
-def _loftr(weights: Weights, device: torch.device) -> nn.Module:
-    return fill(_kornia().LoFTR(pretrained=None), weights, device)
-
-
-def _disk(weights: Weights, device: torch.device) -> nn.Module:
-    return fill(_kornia().DISK(), weights, device)
 
 
 def _aliked(weights: Weights, device: torch.device) -> nn.Module:
@@ -141,10 +87,6 @@ def _aliked(weights: Weights, device: torch.device) -> nn.Module:
     return fill(_kornia().ALIKED(name, max_num_keypoints=1 << 16, detection_threshold=0.0), weights, device)
 
 
-def _superpoint(weights: Weights, device: torch.device) -> nn.Module:
-    return fill(SuperPoint(), weights, device)
-
-
 def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Module:
     """LightGlue for descriptors of this length, with its file's depth.
 
@@ -153,17 +95,14 @@ def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Modul
     """
     light_glue = _kornia().LightGlue
     tensors, unnamed = weights.tensors, None  # for named features kornia would fetch weights
-    projection, positions = tensors.get("input_proj.weight"), tensors.get("posenc.Wr.weight")
+    projection = tensors.get("input_proj.weight")
     taken = 256 if projection is None else int(projection.shape[-1])
-    if weights.kind == "LightGlue":
-        if positions is not None and positions.shape[-1] != 2:
-            what = (
-                "expected LightGlue for DISK, ALIKED or SuperPoint, got one whose keypoints have scales or shapes"
-            )
-            raise OptionError(f"weights: {weights.path}: {what}")
-        if taken != numbers:
-            what = f"expected LightGlue for descriptors of {numbers} numbers, got one for {taken}"
-            raise OptionError(f"weights: {weights.path}: {what}")
-    layers = 1 + max((int(n.split(".")[1]) for n in tensors if n.startswith("log_assignment.")), default=8)
+    if tensors["posenc.Wr.weight"].shape[-1] != 2:
+        what = "expected LightGlue for DISK, ALIKED or SuperPoint, got one whose keypoints have scales or shapes"
+        raise OptionError(f"weights: {weights.path}: {what}")
+    if taken != numbers:
+        what = f"expected LightGlue for descriptors of {numbers} numbers, got one for {taken}"
+        raise OptionError(f"weights: {weights.path}: {what}")
+    layers = 1 + max(int(n.split(".")[1]) for n in tensors if n.startswith("log_assignment."))
     settings: dict[str, Any] = {"features": unnamed, "input_dim": numbers, "n_layers": layers}
     return fill(light_glue(**settings), weights, device)

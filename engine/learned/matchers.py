@@ -22,7 +22,7 @@ from engine.runtime.tensors import Tensor, functional, nn, torch
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loftr:
-    """LoFTR as a :class:`engine.learned.PairMatcher`; see :func:`engine.learned.load_loftr`.
+    """LoFTR as a :class:`engine.learned.PairMatcher`; see :func:`engine.learned.load_matcher`.
 
     Attributes:
         network: takes image0 and image1, gives keypoints0, keypoints1 and confidence.
@@ -30,7 +30,7 @@ class Loftr:
     """
 
     network: nn.Module
-    min_confidence: float = 0.5
+    min_confidence: float
 
     def __call__(self, frame: Tensor, crop: Tensor) -> tuple[Tensor, Tensor]:
         """Match two pictures; see :class:`engine.learned.PairMatcher`."""
@@ -57,7 +57,7 @@ class KeypointMatcher:
 
     extractor: Extractor
     lightglue: nn.Module
-    max_keypoints: int = 2048
+    max_keypoints: int
 
     def __call__(self, frame: Tensor, crop: Tensor) -> tuple[Tensor, Tensor]:
         """Match two pictures; see :class:`engine.learned.PairMatcher`."""

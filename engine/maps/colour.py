@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.maps.grids import Array, Grid, warp_between
+from engine.maps.grids import Array, Grid, apply_affine
+from engine.maps.heights import part_grid
 from engine.maps.rasters import STRETCH_PERCENT, Source, map_errors, palette_of
 from engine.values import Window
 
@@ -29,56 +28,35 @@ def read_colour(source: Source, grid: Grid, window: Window, shape: tuple[int, in
     Raises:
         MapError: the file cannot be read.
     """
-    import cv2
+    from rasterio import Affine
+    from rasterio.enums import Resampling
+    from rasterio.vrt import WarpedVRT
 
     palette = palette_of(source.dataset)
     if source.dataset.count < 3 and palette is None:
         return None
-    xy = _file_pixels(source.grid, grid, window, shape)
-    limit = np.array([source.grid.width_px, source.grid.height_px])
-    low = np.clip(np.floor(xy.min(axis=(0, 1))) - 2, 0, limit - 1).astype(int)
-    high = np.clip(np.ceil(xy.max(axis=(0, 1))) + 3, low + 1, limit).astype(int)
-    # Read at about the resolution of the result, from an overview if the file has one.
-    shrink = max(1.0, float(np.sqrt(np.prod(high - low) / math.prod(shape))))
-    size = np.maximum(1, np.round((high - low) / shrink)).astype(int)
-    bands = _read(source, low, high - low, size, palette)
-    at = (xy - low + 0.5) * (size / (high - low)) - 0.5
-    colour = _stretched(np.ascontiguousarray(np.moveaxis(bands, 0, -1)))
-    return np.asarray(cv2.remap(colour, at.astype(np.float32), None, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE))
+    given, wanted = source.grid, part_grid(grid, window, shape)
+    view = {
+        "src_crs": given.crs.to_wkt(), "src_transform": Affine(*_by_corner(given)),
+        "crs": wanted.crs.to_wkt(), "transform": Affine(*_by_corner(wanted)),
+        "height": shape[0], "width": shape[1],
+        "resampling": Resampling.bilinear if palette is None else Resampling.nearest,
+    }  # fmt: skip
+    with map_errors("map", source.path), WarpedVRT(source.dataset, **view) as warped:
+        bands = warped.read([1, 2, 3] if palette is None else [1])
+    return _stretched(np.moveaxis(bands if palette is None else palette[:, bands[0]], 0, -1))
 
 
-def _file_pixels(of_file: Grid, grid: Grid, window: Window, shape: tuple[int, int]) -> Array:
-    """(h, w, 2) pixels of the file at the centres of the result's pixels."""
-    y, x = (
-        first + (np.arange(count) + 0.5) * length / count - 0.5
-        for first, length, count in zip(
-            (window.y0, window.x0), (window.height_px, window.width_px), shape, strict=True
-        )
-    )
-    return warp_between(grid, of_file)(np.stack(np.meshgrid(x, y), axis=-1))
-
-
-def _read(
-    source: Source, low: NDArray[np.intp], extent: NDArray[np.intp], size: NDArray[np.intp], palette: Rgb | None
-) -> NDArray[np.generic]:
-    """(3, h, w) bands of a part of the file, from (x, y) ``low``, resampled to ``size`` (x, y)."""
-    from rasterio.enums import Resampling
-    from rasterio.windows import Window as RasterWindow
-
-    part = RasterWindow(*(int(v) for v in (*low, *extent)))
-    how = Resampling.average if palette is None else Resampling.nearest
-    bands = [1] if palette is not None else [1, 2, 3]
-    with map_errors("map", source.path):
-        data = source.dataset.read(
-            bands, window=part, out_shape=(len(bands), int(size[1]), int(size[0])), resampling=how
-        )
-    return np.asarray(data if palette is None else palette[:, data[0]])
+def _by_corner(grid: Grid) -> Array:
+    """GDAL's affine (6,) of a grid, from the outer corner of its first pixel."""
+    corner = apply_affine(grid.pixel_to_crs, np.array([-0.5, -0.5]))
+    return np.column_stack([grid.pixel_to_crs[:, :2], corner]).ravel()
 
 
 def _stretched(colour: NDArray[np.generic]) -> Rgb:
     """Bands (h, w, 3) as uint8, all stretched alike."""
     if colour.dtype == np.uint8:
-        return np.asarray(colour, np.uint8)
+        return np.ascontiguousarray(colour, np.uint8)
     values = np.asarray(colour, np.float64)
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, STRETCH_PERCENT) if known.size else (0.0, 1.0)

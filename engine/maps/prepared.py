@@ -31,7 +31,7 @@ WHOLE_LEVEL_PX = 1 << 23
 """Levels of at most this many pixels are prepared as a whole."""
 MAX_REGION_PX = 6 << 20
 """Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 6 bytes, 11 with nodata,
-and on a GPU 27."""
+and on a GPU 20."""
 _HALVING_PX = 8  # windows begin on multiples of this within a region, so that three half-resolution levels fit
 
 

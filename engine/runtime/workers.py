@@ -12,22 +12,21 @@ import signal
 import sys
 import threading
 import time
-import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
-from engine.errors import BackendError, EngineError
+from engine.errors import BackendError
 
 T = TypeVar("T")
 
 _ALONE_S = 0.05  # of work in this process first
 _WORTH_S = 0.5  # of remaining work; less is done before workers would start
-_AHEAD = 2  # tasks per worker: while one result travels, it works on the next
-_Workers = dict[Connection, BaseProcess]
+_work: list[Callable[[int], Any]] = []  # in a worker, the task, which came by the fork: it need not be pickled
 
 
 def can_fork() -> bool:
@@ -82,29 +81,35 @@ def start_helper(work: Callable[[], None]) -> BaseProcess | None:
 
 def _by_workers(work: Callable[[int], T], tasks: range, workers: int) -> Iterator[T]:
     """The results of tasks in order; a task's exception is raised in its turn."""
-    started: _Workers = {}
+    fork = multiprocessing.get_context("fork")
+    pool = ProcessPoolExecutor(min(workers, len(tasks)), fork, _begin, (work,))
     try:
         with _forkable():
-            for _ in range(min(workers, len(tasks))):
-                _start(work, started)
-        waiting, results = iter(tasks), dict[int, tuple[T | None, Exception | None]]()
-        for pipe in [*started] * _AHEAD:
-            _hand_out(waiting, pipe)
-        for task in tasks:
-            while task not in results:
-                for pipe in cast("list[Connection]", wait([*started])):
-                    number, *result = _received(pipe, started)
-                    results[number] = (result[0], result[1])
-                    _hand_out(waiting, pipe)
-            value, error = results.pop(task)
-            if error is not None:
-                raise error
-            yield value  # type: ignore[misc]  # None only if that is the result
+            results = pool.map(_run, tasks)
+        yield from results
+    except BrokenProcessPool:
+        raise BackendError("workers: a process ended") from None
     finally:
-        for pipe, process in started.items():
-            process.kill()  # it may have inherited a handler of gentler signals
-            process.join()
-            pipe.close()
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin(work: Callable[[int], Any]) -> None:
+    """Make this process a worker, which ends with its parent, however that ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and ends us
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    _work[:] = [work]
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _run(task: int) -> Any:
+    return _work[0](task)
 
 
 @contextmanager
@@ -125,53 +130,3 @@ def _forkable() -> Iterator[None]:
         cv2.setNumThreads(threads[0])
         if torch is not None:
             torch.set_num_threads(threads[1])
-
-
-def _start(work: Callable[[int], Any], started: _Workers) -> None:
-    context = multiprocessing.get_context("fork")
-    ours, theirs = context.Pipe()
-    # A copy holds our ends of the pipes, too; closed there, a pipe ends when this process does.
-    process = context.Process(target=_serve, args=(work, theirs, [*started, ours]), daemon=True)
-    process.start()
-    theirs.close()
-    started[ours] = process
-
-
-def _serve(work: Callable[[int], Any], pipe: Connection, inherited: list[Connection]) -> None:
-    """The worker's process: tasks in, results out, until its parent ends it or is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and ends us
-    for end in inherited:
-        end.close()
-    try:
-        while True:
-            pipe.send(_result(work, pipe.recv()))
-    except (EOFError, ConnectionError):
-        return
-
-
-def _result(work: Callable[[int], T], task: int) -> tuple[int, T | None, Exception | None]:
-    try:
-        return task, work(task), None
-    except Exception as error:  # raised again by the parent
-        if not isinstance(error, EngineError):  # one line says it all
-            error.add_note(traceback.format_exc())
-        return task, None, error
-
-
-def _received(pipe: Connection, started: _Workers) -> tuple[int, Any, Exception | None]:
-    try:
-        received: tuple[int, Any, Exception | None] = pipe.recv()
-    except (EOFError, ConnectionError):
-        started[pipe].join()
-        raise BackendError(f"workers: a process ended with code {started[pipe].exitcode}") from None
-    return received
-
-
-def _hand_out(waiting: Iterator[int], pipe: Connection) -> None:
-    """Send the next task, if there is one; a worker that has ended shows when its result is awaited."""
-    task = next(waiting, None)
-    if task is not None:
-        try:
-            pipe.send(task)
-        except ConnectionError:
-            return

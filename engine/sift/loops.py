@@ -154,7 +154,7 @@ def _of_picture(image: Floats, mask: NDArray[np.bool_] | None, choice: SiftChoic
         angle_rad = dominant_angle(gaussians, keypoints, plan)
     else:
         angle_rad = np.full(len(keypoints), choice.up_rad, np.float32)
-    descriptors = describe(gaussians, keypoints, angle_rad, plan, root=choice.root)
+    descriptors = describe(gaussians, keypoints, angle_rad, plan)
     angle_deg = np.remainder(np.rad2deg(angle_rad), np.float32(360))
     return xy_px(keypoints, plan), scale_px(keypoints), angle_deg, descriptors
 
@@ -242,15 +242,14 @@ def dominant_angle(gaussians: Floats, keypoints: Floats, plan: LoopPlan) -> Floa
     )
 
 
-def describe(gaussians: Floats, keypoints: Floats, angle_rad: Floats, plan: LoopPlan, *, root: bool) -> Floats:
-    """4 x 4 cells of 8 orientations in the keypoints' frames.
+def describe(gaussians: Floats, keypoints: Floats, angle_rad: Floats, plan: LoopPlan) -> Floats:
+    """4 x 4 cells of 8 orientations in the keypoints' frames, as RootSIFT.
 
     Args:
         gaussians: (N,) levels.
         keypoints: (K, 6).
         angle_rad: (K,) from +x towards +y.
         plan: of their picture.
-        root: return RootSIFT.
 
     Returns:
         (K, 128) of unit L2 norm.
@@ -258,7 +257,7 @@ def describe(gaussians: Floats, keypoints: Floats, angle_rad: Floats, plan: Loop
     step = np.float32(CELL_SIGMAS / CELL_SAMPLES) * plan.first_sigma
     return _in_parts(
         lambda part: sift_descriptors.descriptors(
-            gaussians, plan.table, keypoints[slice(*part)], angle_rad[slice(*part)], step, tents(), root
+            gaussians, plan.table, keypoints[slice(*part)], angle_rad[slice(*part)], step, tents()
         ),
         threads.parts(len(keypoints), len(keypoints) // _POINTS_PER_THREAD),
     )

@@ -21,13 +21,12 @@ def match(
     train: Features,
     *,
     ratio: float = 0.8,
-    mutual: bool = True,
     rotation_deg: float = 0.0,
     max_angle_diff_deg: float | None = None,
     scale: float = 1.0,
     max_scale_factor: float | None = None,
 ) -> Matches:
-    """Match descriptors by Euclidean distance, with Lowe's ratio test and a mutual test.
+    """Match descriptors by Euclidean distance, with Lowe's ratio test; each must be the other's nearest.
 
     Pairs that contradict the known rotation or scale have an infinite distance, all others sqrt(2 - 2 <q, t>).
 
@@ -35,7 +34,6 @@ def match(
         query: Features of B images, or of one for all of the train's.
         train: Features of B images, or of one for all of the query's.
         ratio: Upper bound, in (0, 1], on nearest over second nearest distance; 1 accepts all.
-        mutual: Require that the query is also the train's nearest.
         rotation_deg: Known angle of a train keypoint less that of its query.
         max_angle_diff_deg: Exclude pairs whose angles differ from ``rotation_deg`` by more.
         scale: Known scale of a train keypoint over that of its query.
@@ -47,17 +45,15 @@ def match(
     Raises:
         OptionError: The ratio is not in (0, 1].
     """
-    _check_ratio(ratio)
-    limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
-    given = query.descriptors
+    if not 0 < ratio <= 1:
+        raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
+    limits, given = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor), query.descriptors
     if not isinstance(given, np.ndarray) and given.device.type != "cpu":
         from engine.sift.matching_tensors import match_tensors  # torch takes a while to import
 
-        return match_tensors(query, train, limits, ratio, mutual)
-    found = _by_loops(_as_arrays(query), _as_arrays(train), limits, ratio, mutual)
-    return Matches(
-        *(like(given, values) for values in (found.train_index, found.distance, found.ratio, found.valid))
-    )
+        return match_tensors(query, train, limits, ratio)
+    index, distance, quotient, valid = _by_loops(_as_arrays(query), _as_arrays(train), limits, ratio)
+    return Matches(*(like(given, values) for values in (index, distance, quotient, valid)))
 
 
 def _as_arrays(features: Features) -> Features:
@@ -66,16 +62,8 @@ def _as_arrays(features: Features) -> Features:
     return Features(xy_px, scale_px, angle_deg, descriptors, on_host(valid))
 
 
-def _check_ratio(ratio: float) -> None:
-    if not 0 < ratio <= 1:
-        raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
-
-
-# -------------------------------------------------------------------------------------------------------- loops
-
-
-def _by_loops(query: Features, train: Features, limits: Limits, ratio: float, mutual: bool) -> Matches:
-    """On the CPU: a matrix product, and one pass over it."""
+def _by_loops(query: Features, train: Features, limits: Limits, ratio: float) -> tuple[AnyArray, ...]:
+    """The four fields of the matches: a matrix product, and one pass over it."""
     first, index, second, is_mutual = _nearest_by_loops(query, train, limits)
     nearest, next_nearest = (
         np.where(c < FORBIDDEN, np.inf, np.sqrt(np.maximum(2 - 2 * c, 0))) for c in (first, second)
@@ -83,8 +71,7 @@ def _by_loops(query: Features, train: Features, limits: Limits, ratio: float, mu
     with np.errstate(invalid="ignore"):  # of two that are infinite
         quotient = np.maximum(nearest, ROUNDING) / np.maximum(next_nearest, ROUNDING)
     quotient = np.where(np.isnan(quotient), np.float32(1), quotient)
-    valid = np.isfinite(nearest) & (quotient <= ratio)
-    return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
+    return index, nearest, quotient, np.isfinite(nearest) & (quotient <= ratio) & is_mutual
 
 
 def _nearest_by_loops(query: Features, train: Features, limits: Limits) -> tuple[AnyArray, ...]:

@@ -10,15 +10,15 @@ from engine.sift.values import FORBIDDEN, ROUNDING, TRAIN_CHUNK, Features, Limit
 _FAR = 1e30
 
 
-def match_tensors(query: Features, train: Features, limits: Limits, ratio: float, mutual: bool) -> Matches:
+def match_tensors(query: Features, train: Features, limits: Limits, ratio: float) -> Matches:
     """The matches of features on a GPU; see :func:`engine.sift.matching.match`."""
     with torch.inference_mode():
         first, index, second, is_mutual = _nearest(query, train, limits)
         nearest, next_nearest = _distance(first), _distance(second)
         # Two equal distances give a ratio of 1, even if rounding makes one of them 0.
         quotient = (nearest.clamp_min(ROUNDING) / next_nearest.clamp_min(ROUNDING)).nan_to_num(1.0)
-        valid = nearest.isfinite() & (quotient <= ratio)
-    return Matches(index, nearest, quotient, valid & is_mutual if mutual else valid)
+        valid = nearest.isfinite() & (quotient <= ratio) & is_mutual
+    return Matches(index, nearest, quotient, valid)
 
 
 def _nearest(query: Features, train: Features, limits: Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:

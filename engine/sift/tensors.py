@@ -60,7 +60,7 @@ def find_features(images: Tensor, mask: Tensor | None, choice: SiftChoice) -> Fe
     Returns:
         Features on the pictures' device.
     """
-    network = _network(images.device, choice.root)
+    network = _network(images.device)
     with torch.inference_mode():
         slots = max(_MIN_EXTREMA, images[0].numel() // _PX_PER_EXTREMUM)
         detect = network.detector._detect_with_pyramid
@@ -74,11 +74,11 @@ def find_features(images: Tensor, mask: Tensor | None, choice: SiftChoice) -> Fe
 
 
 @lru_cache(maxsize=4)
-def _network(device: torch.device, root: bool) -> Any:
+def _network(device: torch.device) -> Any:
     from kornia.feature import SIFTFeatureScaleSpace  # takes a second
 
     # Calling the stages one by one describes only kept keypoints; kornia's version is pinned for this.
-    return SIFTFeatureScaleSpace(rootsift=root, device=device, descriptor_backend="pyramid").eval()
+    return SIFTFeatureScaleSpace(rootsift=True, device=device, descriptor_backend="pyramid").eval()
 
 
 def _on_edges(found: _Extrema, pyramid: list[Tensor]) -> Tensor:

@@ -3,15 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
-from engine.runtime.device import Picture, as_tensor, on_host
-
-if TYPE_CHECKING:
-    from engine.runtime.tensors import Tensor
+from engine.runtime.device import Picture
 
 Limits = tuple[float, float | None, float, float | None]
 """Rotation between matched keypoints and its largest error in degrees, ratio of their scales and its factor."""
@@ -29,7 +22,6 @@ class SiftChoice:
         up_rad: angle of upright features, None the dominant gradient's.
         upsample: samples per pixel of the first octave.
         contrast_threshold: Lowe's.
-        root: RootSIFT.
         spread: cells along each side of a picture.
     """
 
@@ -37,7 +29,6 @@ class SiftChoice:
     up_rad: float | None
     upsample: int
     contrast_threshold: float
-    root: bool
     spread: int
 
 
@@ -62,27 +53,6 @@ class Features:
     descriptors: Picture
     valid: Picture
 
-    def lafs(self, magnification: float = 6.0) -> Tensor:
-        """Return kornia's local affine frames as a tensor (B, N, 2, 3).
-
-        Args:
-            magnification: Half the side of the described square in sigmas; kornia's SIFT uses 6.
-
-        Returns:
-            (B, N, 2, 3) affine matrices.
-
-        Convention:
-            The first two columns are the images of the patch's x and y axes, the third is the centre.
-            kornia's own angles turn the other way, so ``kornia.feature.get_laf_orientation`` gives -angle_deg.
-        """
-        from kornia.feature import laf_from_center_scale_ori  # takes a second
-
-        xy_px, scale_px, angle_deg = map(as_tensor, (self.xy_px, self.scale_px, self.angle_deg))
-        lafs: Tensor = laf_from_center_scale_ori(
-            xy_px, (magnification * scale_px)[..., None, None], -angle_deg[..., None]
-        )
-        return lafs
-
 
 def fields_of(features: Features) -> tuple[Picture, ...]:
     """The five fields, in their order."""
@@ -105,15 +75,3 @@ class Matches:
     distance: Picture
     ratio: Picture
     valid: Picture
-
-    def pairs(self, element: int = 0) -> NDArray[np.int64]:
-        """Return the accepted pairs of one element of the batch, as an array.
-
-        Args:
-            element: Index in the batch.
-
-        Returns:
-            (M, 2) int64 slots (query, train).
-        """
-        query = np.flatnonzero(on_host(self.valid[element]))
-        return np.column_stack([query, on_host(self.train_index[element])[query]])

@@ -10,10 +10,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engine.kernels import ncc as kernels
+from engine import ncc_fft
 from engine.kernels import reference, tensors
 
-KERNELS = {"dispatch": kernels.ncc_surface, "tensors": tensors.ncc_surface}
+KERNELS = {"dispatch": ncc_fft.ncc, "tensors": tensors.ncc_surface}
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-9}
 
 

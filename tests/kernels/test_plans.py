@@ -39,6 +39,6 @@ def test_a_flight_of_many_window_sizes_plans_few_transforms(monkeypatch):
     assert len(sizes) > 50
     template = torch.rand(1, 48, 40, generator=torch.Generator().manual_seed(0))
     for height, width in sizes:
-        products = tensors.products(torch.zeros(height, width), template)
+        products = tensors.correlate(torch.zeros(height, width), template)
         assert products.shape == (1, height - 47, width - 39)
     assert len(plans) <= 24

@@ -14,11 +14,12 @@ import pytest
 from engine import Fix, MatcherOptions, NccOptions, NoFix, OrthoMap, SceneMatcher
 from engine.budget import Budget
 from engine.kernels import coarse_to_fine
-from engine.kernels import ncc as kernels
 from engine.kernels.coarse_to_fine import QuickLook
+from engine.kernels.local import LocalScores
 from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance
 from engine.kernels.search_levels import prepare
+from engine.kernels.sums import counts
 from engine.ncc_fft import ncc
 from engine.values import Reason
 from tests.support.ground import CAMERA, Ground
@@ -47,7 +48,7 @@ def drawn(seed, share, size=(420, 460), model=(110, 130), noise=10.0, detail_px=
     rng = np.random.default_rng([seed, round(100 * share)])
     gray, valid = texture(rng, size, detail_px), mask_of(rng, size, share)
     h, w = model
-    inside = kernels.counts(valid)
+    inside = counts(valid)
     inside = (inside[h:, w:] - inside[:-h, w:] - inside[h:, :-w] + inside[:-h, :-w]) >= MIN_OVERLAP * h * w
     y, x = rng.choice(np.argwhere(inside[8:-8, 8:-8])) + 8
     shown = gray[y : y + h, x : x + w] + rng.normal(0.0, noise, model)
@@ -66,7 +67,7 @@ def test_scores_at_a_few_places_are_those_of_the_masked_surface(share):
     surface = every_place(image, valid, template)
     model = template - template.mean()
     for j, i in ((y, x), (6, 6), (100, 105), (surface.shape[0] - 7, 40)):
-        scorer = kernels.LocalScores(search.image, model, (j, i), search.counts, MIN_OVERLAP)
+        scorer = LocalScores(search.image, model, (j, i), search.counts, MIN_OVERLAP)
         around = np.mgrid[j - 5 : j + 6, i - 5 : i + 6].reshape(2, -1)
         rows, columns = around[:, (around[0] < surface.shape[0]) & (around[1] < surface.shape[1])]
         np.testing.assert_allclose(scorer.at(rows, columns), surface[rows, columns], rtol=0, atol=2e-6)

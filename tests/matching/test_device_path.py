@@ -11,10 +11,10 @@ import torch
 import engine.runtime.device
 from bench.inputs.scenes import flight
 from engine import Fix, MatcherOptions, SceneMatcher, SiftOptions
-from engine.errors import OptionError, ShapeError
+from engine.errors import OptionError
 from engine.features import match, sift
 from engine.kernels.peaks import find_peak
-from engine.ncc_fft import match_template, match_templates, ncc, prepare
+from engine.ncc_fft import match_template, ncc, prepare
 from engine.runtime.tensors import download, upload
 from tests.support.pretended import DEVICE, Pretended, pretended_device
 
@@ -126,31 +126,6 @@ def test_shapes_on_the_device_do_not_depend_on_values():
     assert traces[0] == traces[1]
 
 
-SIZES = [((150, 131), (63, 50)), ((90, 131), (31, 50)), ((150, 131), (63, 50)), ((150, 131), (61, 50))]
-
-
-def test_a_batch_is_downloaded_once_and_matches_as_its_pairs_do():
-    images = [picture(*size, i) for i, (size, _) in enumerate(SIZES)]
-    templates = [cut(image, model, 9) for image, (_, model) in zip(images, SIZES, strict=True)]
-    with pretended_device() as crossings:
-        searches = [prepare(image.to(DEVICE)) for image in images]
-        there = [template.to(DEVICE) for template in templates]
-        alone = [match_template(s, t, exclusion_px=5.0) for s, t in zip(searches, there, strict=True)]
-        crossings.downloads.clear()
-        found = match_templates(searches, there, exclusion_px=5.0)
-        assert (crossings.downloads, crossings.waits) == ([SUMMIT * len(SIZES)], [])
-        assert match_templates([], [], exclusion_px=5.0) == []
-    on_cpu = match_templates([prepare(image) for image in images], templates, exclusion_px=5.0)
-    for one, other, third in zip(found, alone, on_cpu, strict=True):
-        assert_same_peak(one, other)
-        assert (one.x, one.y, one.score) == pytest.approx((third.x, third.y, third.score), abs=1e-3)
-
-
-def test_a_batch_needs_as_many_templates_as_parts():
-    with pytest.raises(ShapeError, match=r"^templates: expected 1 \(searches\), got 2$"):
-        match_templates([prepare(torch.rand(20, 20))], [torch.rand(5, 5)] * 2, exclusion_px=3.0)
-
-
 @pytest.mark.parametrize("zero_mean", [True, False])
 def test_the_surface_waits_for_the_check_of_its_arguments_alone(zero_mean):
     windows = torch.stack([picture(70, 81, i) for i in range(2)]) + 3.0
@@ -198,7 +173,7 @@ OPTIONS = {
     "usual": {},
     "upright": {"upright": True, "up_deg": 30.0},
     "not doubled": {"upsample": 1, "contrast_threshold": 0.005, "max_keypoints": 900},
-    "strongest": {"spread": 1, "root": False, "max_keypoints": 20},
+    "strongest": {"spread": 1, "max_keypoints": 20},
     "more slots than keypoints": {"max_keypoints": 4000},
 }
 

@@ -132,7 +132,7 @@ def test_keypoints_of_a_window_are_the_level_s_own_in_the_windows_pixels(ground,
         xy = torch.stack([x, y], dim=1).float()[order]
         return Keypoints(xy, image[y, x][order], image[y, x][order][:, None])
 
-    known = KeypointMap(site, KeypointMatcher(bright, Nearest()))
+    known = KeypointMap(site, KeypointMatcher(bright, Nearest(), 2048))
     window = Window(50, 70, 300, 260)
     found = known.find(window, 0, 1 << 20)
     picture = torch.from_numpy(site.gray(Window(0, 0, site.width_px, site.height_px), 0))[None, None] / 255.0

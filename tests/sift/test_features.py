@@ -12,6 +12,7 @@ from kornia import feature as kornia_feature
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.features import Features, chosen_backend, match, plans_created, prepare_plans, sift
 from engine.sift import loops
+from tests.support.matches import pairs_of
 
 LEVEL_RATIO = 2 ** (1 / 3)
 
@@ -222,7 +223,7 @@ def test_light_does_not_change_descriptors(backend):
     image = tensor(texture(120, 120))
     plain = sift(image, backend=backend)
     dim = sift(0.6 * image + 0.3, contrast_threshold=0.6 * 0.02, backend=backend)
-    pairs = match(plain, dim).pairs()
+    pairs = np.array(pairs_of(match(plain, dim)))
     assert len(pairs) > 0.9 * plain.valid.sum()
     gap = (plain.xy_px[0, pairs[:, 0]] - dim.xy_px[0, pairs[:, 1]]).norm(dim=1)
     assert (gap < 0.1).float().mean() > 0.99
@@ -238,7 +239,7 @@ def quality(
     distance = np.linalg.norm(expected[:, None] - second.xy_px[0].numpy(), axis=2)
     limit = np.array(image.shape[::-1]) - 9
     inside = first.valid[0].numpy() & ((expected > 8) & (expected < limit)).all(1)
-    pairs = match(first, second).pairs()
+    pairs = np.array(pairs_of(match(first, second))).reshape(-1, 2)
     good = distance[pairs[:, 0], pairs[:, 1]] < 3
     near = (distance < 2) & second.valid[0].numpy()
     return float(near[inside].any(1).mean()), float(good.mean()), float(good.sum())
@@ -299,15 +300,6 @@ def test_auto_is_compiled_on_the_cpu_and_kornia_elsewhere():
         chosen_backend("compiled", cuda)
 
 
-def test_lafs_are_kornias():
-    found = sift(tensor(texture(90, 90)), max_keypoints=30)
-    lafs, keep = found.lafs(), found.valid[0]
-    torch.testing.assert_close(kornia_feature.get_laf_center(lafs), found.xy_px)
-    torch.testing.assert_close(kornia_feature.get_laf_scale(lafs)[0, keep, 0, 0], 6 * found.scale_px[0, keep])
-    turn = kornia_feature.get_laf_orientation(lafs)[0, keep, 0] + found.angle_deg[0, keep]
-    assert ((turn + 180).remainder(360) - 180).abs().max() < 1e-3
-
-
 # What matches.
 
 
@@ -335,14 +327,12 @@ def pair() -> tuple[Features, Features]:
 @pytest.mark.parametrize("ratio", [0.8, 0.95])
 def test_matches_are_kornias(pair, ratio):
     query, train = pair
-    ours = match(query, train, ratio=ratio, mutual=False)
     for b in range(2):
-        _, theirs = kornia_feature.match_snn(query.descriptors[b], train.descriptors[b], ratio)
-        assert ours.pairs(b).tolist() == theirs.tolist()
-        _, theirs = kornia_feature.match_mnn(query.descriptors[b], train.descriptors[b])
-        assert sorted(match(query, train, ratio=1.0).pairs(b).tolist()) == sorted(theirs.tolist())
-        both = match(query, train, ratio=ratio).pairs(b).tolist()
-        assert both == [p for p in ours.pairs(b).tolist() if p in theirs.tolist()]
+        _, distinct = kornia_feature.match_snn(query.descriptors[b], train.descriptors[b], ratio)
+        _, mutual = kornia_feature.match_mnn(query.descriptors[b], train.descriptors[b])
+        assert sorted(pairs_of(match(query, train, ratio=1.0), b)) == sorted(mutual.tolist())
+        both = [pair for pair in distinct.tolist() if pair in mutual.tolist()]
+        assert pairs_of(match(query, train, ratio=ratio), b) == both
 
 
 def test_distances_are_those_of_the_pairs(pair):
@@ -360,15 +350,14 @@ def test_invalid_slots_never_match(pair):
     blind = features(train.descriptors, valid=none)
     assert not match(query, blind).valid.any()
     assert not match(blind, query).valid.any()
-    assert match(query, blind).pairs().shape == (0, 2)
+    assert pairs_of(match(query, blind)) == []
     one = none.clone()
     one[:, 10] = True
-    assert match(query, features(train.descriptors, valid=one)).pairs().tolist() == [[0, 10]]
+    assert pairs_of(match(query, features(train.descriptors, valid=one))) == [[0, 10]]
 
 
-@pytest.mark.parametrize("mutual", [False, True])
 @pytest.mark.parametrize("stored", [torch.float32, torch.float16], ids=str)
-def test_of_two_alike_neither_is_matched(mutual, stored):
+def test_of_two_alike_neither_is_matched(stored):
     """Nothing tells which of them is right, also where rounding puts one at 0 and the other a hair off."""
     rng = torch.Generator().manual_seed(4)
     descriptors = torch.rand(1, 300, 128, generator=rng) ** 2
@@ -376,14 +365,14 @@ def test_of_two_alike_neither_is_matched(mutual, stored):
     first = query.descriptors.to(stored).float()
     twice = torch.cat([first, torch.nextafter(first, torch.ones(()))], dim=1)
     twins = replace(features(twice), descriptors=twice)
-    found = match(query, twins, mutual=mutual)
+    found = match(query, twins)
     assert found.distance.max() < 0.02
     assert not found.valid.any()
     torch.testing.assert_close(found.ratio, torch.ones(1, 300), atol=0.1, rtol=0)
-    lone = match(query, replace(twins, valid=torch.arange(600)[None] < 300), mutual=mutual)
+    lone = match(query, replace(twins, valid=torch.arange(600)[None] < 300))
     assert lone.valid.all()
     assert lone.ratio.max() < 0.05
-    assert lone.pairs().tolist() == [[n, n] for n in range(300)]
+    assert pairs_of(lone) == [[n, n] for n in range(300)]
 
 
 def test_known_rotation_and_scale_leave_out_contradictions():

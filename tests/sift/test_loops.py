@@ -83,8 +83,8 @@ def test_the_strongest_are_those_of_the_reference(plan, both, spread, most):
     np.testing.assert_array_equal(loops.strongest(rows, plan, mask, most, spread), rows[kept])
 
 
-@pytest.mark.parametrize(("turn_rad", "root"), [(None, True), (0.0, False)], ids=["turned, root", "upright"])
-def test_angles_and_descriptors_are_those_of_the_reference(plan, both, turn_rad, root):
+@pytest.mark.parametrize("turn_rad", [None, 0.0], ids=["turned", "upright"])
+def test_angles_and_descriptors_are_those_of_the_reference(plan, both, turn_rad):
     _, _, buffer, rows = both
     rows, levels, sigma = rows[:20], shaped(buffer.astype(np.float64), plan), float(plan.first_sigma)
     pictures = [levels[int(row[5])][int(row[4])] for row in rows]
@@ -93,10 +93,9 @@ def test_angles_and_descriptors_are_those_of_the_reference(plan, both, turn_rad,
     assert (apart > 0.01).sum() <= 0.05 * len(apart)  # two peaks of one height
     turns = np.full(len(rows), turn_rad) if turn_rad is not None else expected
     described = [
-        reference.descriptor_of(p, row, sigma, turn, root=root)
-        for p, row, turn in zip(pictures, rows, turns, strict=True)
+        reference.descriptor_of(p, row, sigma, turn) for p, row, turn in zip(pictures, rows, turns, strict=True)
     ]
-    got = loops.describe(buffer, rows, turns.astype(np.float32), plan, root=root)
+    got = loops.describe(buffer, rows, turns.astype(np.float32), plan)
     np.testing.assert_allclose(got, np.array(described).reshape(-1, 128), atol=3e-4)
 
 

@@ -9,6 +9,7 @@ import torch
 from engine.features import Features, match
 from engine.sift import matching, matching_tensors
 from engine.sift.values import fields_of
+from tests.support.matches import pairs_of
 
 
 def described(count, seed, *, like=None):
@@ -57,7 +58,7 @@ def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, chunk,
     )
     expected = plainly(query, train, 0.9, 20.0, most_deg, 1.2, factor)
     assert len(expected) > 3
-    assert [tuple(pair) for pair in found.pairs().tolist()] == expected
+    assert [tuple(pair) for pair in pairs_of(found)] == expected
 
 
 @pytest.mark.parametrize(("most_deg", "factor"), [(None, None), (60.0, None), (None, 1.5), (75.0, 2.0)])
@@ -84,22 +85,22 @@ def test_the_loops_find_what_the_tensor_ops_find(batch, most_deg, factor):
 def test_features_of_another_precision_match_likewise(kind):
     query = described(50, 3)
     train = described(90, 4, like=query)
-    expected = match(query, train, ratio=0.9).pairs()
+    expected = pairs_of(match(query, train, ratio=0.9))
     assert len(expected) > 10
     cast = (replace(f, descriptors=f.descriptors.to(kind), scale_px=f.scale_px.to(kind)) for f in (query, train))
-    found = match(*cast, ratio=0.9).pairs()
-    assert len({tuple(p) for p in found.tolist()} ^ {tuple(p) for p in expected.tolist()}) <= 1
+    found = pairs_of(match(*cast, ratio=0.9))
+    assert len({tuple(p) for p in found} ^ {tuple(p) for p in expected}) <= 1
 
 
 def test_unknown_scales_count_only_where_they_are_limited():
     query = described(50, 3)
     train = described(90, 4, like=query)
     unknown = replace(query, scale_px=query.scale_px * torch.nan)
-    np.testing.assert_array_equal(match(unknown, train, ratio=0.9).pairs(), match(query, train, ratio=0.9).pairs())
+    assert pairs_of(match(unknown, train, ratio=0.9)) == pairs_of(match(query, train, ratio=0.9))
     assert not match(unknown, train, ratio=0.9, max_scale_factor=1.5).valid.any()
 
 
 def test_nothing_matches_a_map_without_features():
     empty = described(0, 3)
-    assert match(described(5, 1), empty).pairs().shape == (0, 2)
-    assert match(empty, described(5, 1)).pairs().shape == (0, 2)
+    assert pairs_of(match(described(5, 1), empty)) == []
+    assert pairs_of(match(empty, described(5, 1))) == []

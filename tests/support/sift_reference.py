@@ -130,7 +130,7 @@ def angle_of(level: Array, keypoint: Array, first_sigma: float) -> float:
     return (top + 0.5 * (left - right) / min(left - 2.0 * middle + right, -1e-12)) * math.tau / 36
 
 
-def descriptor_of(level: Array, keypoint: Array, first_sigma: float, turn: float, *, root: bool) -> Array:
+def descriptor_of(level: Array, keypoint: Array, first_sigma: float, turn: float) -> Array:
     """(128,): each gradient is shared by its two directions and by its four cells, bilinearly in the cells."""
     gx, gy = gradients(level, keypoint, first_sigma, turn, 12, 1.0)
     described = np.zeros((4, 4, 8))
@@ -148,12 +148,10 @@ def descriptor_of(level: Array, keypoint: Array, first_sigma: float, turn: float
                 for i in range(4):
                     tent = max(0.0, 1.0 - abs(v - (j - 1.5))) * max(0.0, 1.0 - abs(u - (i - 1.5)))
                     described[j, i] += weight * tent * shares
-    return normalised(described.ravel(), root=root)
+    return normalised(described.ravel())
 
 
-def normalised(descriptor: Array, *, root: bool) -> Array:
-    """Unit norm, entries bounded by 0.2 before the last; or the root of what sums to 1."""
+def normalised(descriptor: Array) -> Array:
+    """The root of what sums to 1, entries bounded by 0.2 before."""
     bounded = np.minimum(descriptor / max(np.linalg.norm(descriptor), 1e-12), 0.2)
-    if root:
-        return np.sqrt(bounded / max(bounded.sum(), 1e-12))
-    return bounded / max(np.linalg.norm(bounded), 1e-12)
+    return np.sqrt(bounded / max(bounded.sum(), 1e-12))
