@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
-
 from scenematch.cli import console, tables
 from scenematch.cli.options import (
     FlightOptions,
@@ -15,6 +13,7 @@ from scenematch.cli.options import (
     SettingsOption,
     StartOption,
     flight_options,
+    option,
     read_settings,
     with_options,
 )
@@ -26,11 +25,7 @@ def compare(
     out: OutOption,
     runs: Annotated[
         list[str] | None,
-        typer.Option(
-            "--run",
-            metavar="METHOD[/PROFILE]|FILE",
-            help="One run; repeat for more (default: the paper's Table I).",
-        ),
+        option("--run", "METHOD[/PROFILE]|FILE", "One run; repeat for more (default: the paper's Table I)."),
     ] = None,
     start: StartOption = None,
     settings: SettingsOption = None,
