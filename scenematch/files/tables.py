@@ -12,7 +12,7 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -110,6 +110,24 @@ class CsvRow:
         if value is None:
             raise self.error(column, bounds.text)
         return value
+
+
+def cells_of(cls: type[Any], row: CsvRow, bounds: Mapping[str, Bounds] = {}) -> dict[str, Any]:
+    """The cells of a row, each as the field of a dataclass that it fills.
+
+    Args:
+        cls: dataclass of texts and numbers; those that may be None are None if blank.
+        row: has a column for each field.
+        bounds: ranges by column.
+    """
+    readers: dict[str, Callable[[str], Any]] = {
+        "str": row.text,
+        "str | None": lambda name: row.values[name] or None,
+        "int | None": row.integer,
+        "bool | None": lambda name: {"true": True, "false": False}.get(row.values[name]),
+        "float | None": lambda name: row.number(name, bounds.get(name, ANY)),
+    }
+    return {each.name: readers[str(each.type)](each.name) for each in fields(cls)}
 
 
 def quoted(text: str) -> str:

@@ -71,16 +71,8 @@ def write_truth(path: str | Path, rows: Sequence[Truth]) -> None:
 
 def truth_from_telemetry(row: TelemetryRow, lat_deg: float, lon_deg: float, shift_ns: int = 0) -> Truth:
     """A row of telemetry as truth, with another position and its stamp shifted by ``shift_ns``."""
-    return Truth(
-        timestamp_ns=row.timestamp_ns + shift_ns,
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
-        alt_amsl_m=row.alt_amsl_m,
-        height_agl_m=row.height_agl_m,
-        roll_deg=row.roll_deg,
-        pitch_deg=row.pitch_deg,
-        heading_deg=row.heading_deg,
-    )
+    rest = {name: getattr(row, name) for name in _OPTIONAL}
+    return Truth(timestamp_ns=row.timestamp_ns + shift_ns, lat_deg=lat_deg, lon_deg=lon_deg, **rest)
 
 
 def interpolate_truth(
