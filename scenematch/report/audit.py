@@ -9,14 +9,13 @@ import numpy as np
 
 from engine.values import Window
 from scenematch.check.availability import SUITABLE, Audit, Flag, RouteAvailability
-from scenematch.report.figures import DPI, TRUTH
 
 if TYPE_CHECKING:
     from engine.orthomap import OrthoMap
 
 _MAX_MAP_PX = 1600  # longer side of the map as drawn; more is not visible
 _WIDTH_IN, _MAX_HEIGHT_IN = 9.0, 11.0
-_MAX_MARKS_PX = 7.0
+_DPI, _MAX_MARKS_PX = 130, 7.0
 # Distinct by shape, and by colours under all common colour vision deficiencies (Okabe and Ito).
 _MARKS = {
     Flag.FLAT: ("o", "#56B4E9", "flat, such as water"),
@@ -72,7 +71,7 @@ def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None =
     if ax.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     path = Path(path)
-    figure.savefig(path, dpi=DPI, facecolor="white")
+    figure.savefig(path, dpi=_DPI, facecolor="white")
     return path
 
 
@@ -110,7 +109,7 @@ def _draw_marks(ax: Any, audit: Audit) -> None:
 def _draw_route(ax: Any, route: RouteAvailability, scale: float) -> None:
     x, y = (route.xy_px + 0.5).T * scale
     ax.plot(x, y, color="white", linewidth=3.4, alpha=0.9, zorder=4)
-    ax.plot(x, y, color=TRUTH, linewidth=1.4, label="route", zorder=5)
+    ax.plot(x, y, color="#1a1a1a", linewidth=1.4, label="route", zorder=5)
     if route.stretches:
         poor = np.where(route.probability < SUITABLE, y, np.nan)
         ax.plot(x, poor, color="#D55E00", linewidth=4.0, label="poor stretch", zorder=6, solid_capstyle="round")

@@ -118,31 +118,32 @@ def _run_legend(tracks: Mapping[str, FinishedTrack]) -> list[tuple[str, str]]:
 
 
 def _charts(tracks: Mapping[str, FinishedTrack], data: Mapping[str, TrackPlotData]) -> list[Chart]:
-    """Error, error in sigmas, and latency over time, and the share of frames by error; those with data.
+    """Error, error in sigmas, and latency over time, and the share of frames by error and latency.
 
     Charts over time are left out if only some runs have timestamps.
     """
+    errors_m = [d.errors.distance_m for d in data.values()]
+    latencies_ms = [column(track.rows, "latency_ms") for track in tracks.values()]
+    shares = [_share_within("error", "m", errors_m), _share_within("latency", "ms", latencies_ms)]
     ends = [float(d.time[-1]) for d in data.values() if d.time.size]
     labels = {d.time_label for d in data.values() if d.time.size}
     if len(labels) > 1:  # seconds and frame numbers have no common axis
-        found = _cumulative([d.errors.distance_m for d in data.values()])
-        return [] if found is None else [found]
+        return [chart for chart in shares if chart is not None]
     if not ends or not max(ends):
         return []
     time: Limits = (0.0, max(ends))
     series = {
-        "Horizontal error (m)": [d.errors.distance_m for d in data.values()],
+        "Horizontal error (m)": errors_m,
         f"Horizontal error, in stated sigmas; {FALSE_SIGMAS:g} is the limit": [
             np.sqrt(d.errors.normalised_squared_errors) for d in data.values()
         ],
         "Stated sigma (m)": [np.sqrt(larger_variance_m2(d.errors.covariance_en_m2)) for d in data.values()],
-        "Latency (ms)": [column(track.rows, "latency_ms") for track in tracks.values()],
+        "Latency (ms)": latencies_ms,
     }
     (label,) = labels
     times = [d.time for d in data.values()]
     charts = [_over_time(what, label, time, times, values) for what, values in series.items()]
-    charts.append(_cumulative(next(iter(series.values()))))
-    return [chart for chart in charts if chart is not None]
+    return [chart for chart in charts + shares if chart is not None]
 
 
 def _over_time(
@@ -160,19 +161,23 @@ def _over_time(
     return what, area.svg(f"{what} over time", label, marks, timed=True)
 
 
-def _cumulative(errors_m: Sequence[Array]) -> Chart | None:
-    """Share of all frames, including refused ones, answered within a given error."""
-    known = np.concatenate(errors_m)
+def _share_within(name: str, unit: str, values: Sequence[Array]) -> Chart | None:
+    """Share of all frames, including refused ones, that were answered within a given error or latency.
+
+    A curve ends at the share that was answered: a method that answers few frames accurately ends low, one that
+    answers inaccurately rises late.
+    """
+    known = np.concatenate(values)
     known = known[np.isfinite(known)]
     if not known.size:
         return None
     top = 1.2 * float(np.percentile(known, 99))
     area = ChartArea((0.0, top), (0.0, 1.02))
     marks = []
-    for i, errors in enumerate(errors_m):
-        order = np.sort(errors[np.isfinite(errors) & (errors <= top)])
+    for i, series in enumerate(values):
+        order = np.sort(series[np.isfinite(series) & (series <= top)])
         x = np.concatenate([[0.0], np.repeat(order, 2), [top]])
-        y = np.concatenate([[0.0], np.repeat(np.arange(order.size + 1), 2)[1:]]) / max(1, errors.size)
+        y = np.concatenate([[0.0], np.repeat(np.arange(order.size + 1), 2)[1:]]) / max(1, series.size)
         marks.append(f'<g class="run{i}">{area.line(x, y, f"r{i}")}</g>')
-    what = "Share of all frames within an error"
-    return what, area.svg(what, "horizontal error (m)", marks, timed=False)
+    what = f"Share of all frames by {name}"
+    return what, area.svg(what, f"{name} ({unit})", marks, timed=False)

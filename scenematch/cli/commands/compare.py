@@ -34,11 +34,11 @@ def compare(
 ) -> None:
     """Compare methods or settings on one flight.
 
-    Tracks the flight once per run, each into its own folder, and compares the runs in one table and one chart.
+    Tracks the flight once per run, each into its own folder, and compares the runs in one table and on one page.
     --settings applies to all runs; a run's own file takes precedence.
     """
-    from scenematch.runs.comparison import CHART, parse_runs
     from scenematch.runs.comparison import compare as compare_runs
+    from scenematch.runs.comparison import parse_runs
     from scenematch.runs.reporting import COMPARISON
 
     given = read_settings(settings)
@@ -50,7 +50,6 @@ def compare(
     else:
         tables.print_comparison(results, str(flight.frames))
         console.say(f"written to {out}")
-    # The chart is always drawn; the page only if it has enough colours for the runs.
-    drawn = next((out / name for name in (COMPARISON, CHART) if (out / name).is_file()), out)
+    drawn = out / COMPARISON if (out / COMPARISON).is_file() else out
     following = f"track {flight_options(files, settings=settings, start=start)} --out out"
     console.next_step(following, as_json=as_json, hint=f"open {console.quoted(drawn)}")
