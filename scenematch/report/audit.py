@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from engine.values import Window
+from engine.window import level_crop
 from scenematch.check.availability import SUITABLE, Audit, Flag, RouteAvailability
+from scenematch.report.explain import level_within
 
 if TYPE_CHECKING:
     from engine.orthomap import OrthoMap
@@ -77,13 +79,8 @@ def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None =
 
 def _background(site: OrthoMap, part: Window) -> Any:
     """A part of the map in grey at the coarsest sufficient pyramid level; white where it has no data."""
-    level = 0
-    while level + 1 < site.levels and max(part.width_px, part.height_px) >> level > _MAX_MAP_PX:
-        level += 1
-    rows, columns = site.level_shape(level)
-    x0, y0 = min(part.x0 >> level, columns - 1), min(part.y0 >> level, rows - 1)
-    width, height = max(1, part.width_px >> level), max(1, part.height_px >> level)
-    shown = Window(x0, y0, min(width, columns - x0), min(height, rows - y0))
+    level = level_within(site, max(part.width_px, part.height_px), _MAX_MAP_PX)
+    shown = level_crop(site, part, level)
     gray = site.gray(shown, level)
     gray[~site.valid(shown, level)] = 255
     return gray

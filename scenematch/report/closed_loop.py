@@ -6,16 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from engine.geo import attitude_from_rotation
+from engine.geo import Array, attitude_from_rotation
 from engine.values import Fix
 from scenematch.files.tables import cell_text, write_table
 from scenematch.report.loop_record import SETTLING_S
 from scenematch.simulator.loop import LoopResult, LoopSample, Mode
 from scenematch.simulator.vehicle import START_NS
-
-Array = NDArray[np.float64]
 
 _COLUMNS = (
     "timestamp_ns", "mode", "healthy",

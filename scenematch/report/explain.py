@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import EngineError
+from engine.geo import Array
 from engine.matching.explanation import Explanation, PointMatches, ScoreSurface
 from engine.matching.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
@@ -22,7 +23,6 @@ from scenematch.files.notes import FrameNote
 from scenematch.files.track import TrackRow
 from scenematch.report.metrics import TrackErrors
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 MAX_FRAMES = 60
@@ -230,6 +230,14 @@ def _as_matched(frame: Frame, row: TrackRow, note: FrameNote, site: OrthoMap) ->
     return replace(
         frame, height_agl_m=height_m, heading_deg=note.heading_deg if heading_deg is None else heading_deg
     )
+
+
+def level_within(site: OrthoMap, longest_px: int, most_px: int) -> int:
+    """The finest pyramid level on which a side of the map has at most so many pixels, or the coarsest there is."""
+    level = 0
+    while longest_px >> level > most_px and level + 1 < site.levels:
+        level += 1
+    return level
 
 
 def draw_window(site: OrthoMap, window: Window) -> tuple[Image, float]:

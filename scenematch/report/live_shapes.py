@@ -10,11 +10,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from engine.geo import Array
 from engine.orthomap import OrthoMap
 from engine.values import Window
-from scenematch.report.explain import SIDE_PX
+from scenematch.report.explain import SIDE_PX, level_within
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 SIGMAS = 3.0
@@ -65,9 +65,7 @@ def blueprint(site: OrthoMap) -> Any:
 
 def map_mesh(site: OrthoMap) -> Any:
     """The map as a textured mesh on its ground, in metres east, north and up."""
-    level = 0
-    while max(site.level_shape(level)) > _MAX_MAP_PX and level + 1 < site.levels:
-        level += 1
+    level = level_within(site, max(site.level_shape(0)), _MAX_MAP_PX)
     rows, columns = site.level_shape(level)
     gray = site.gray(Window(0, 0, columns, rows), level)
     u, v = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(0.0, 1.0, _MESH_SIDE)]))

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.geo import Array
 from scenematch.files.tables import read_table
 from scenematch.simulator.vehicle import START_NS
-
-Array = NDArray[np.float64]
 
 _PLACES = tuple(f"{what}{axis}_m" for what in ("plan_", "true_", "") for axis in ("east", "north", "up"))
 SETTLING_S = 5.0

@@ -8,20 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.geo import Array
 from scenematch.report.charts import ChartArea, Limits, dots, line
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.metrics import FALSE_SIGMAS
 from scenematch.report.page_charts import Chart, column
 from scenematch.report.page_map import connected, draw_map, map_of_tracks
 from scenematch.report.page_parts import charts_with_axis, fill_page, map_with_legend, section, table
-from scenematch.report.page_tables import median_sigma_m
 from scenematch.report.plot_data import TrackPlotData, larger_variance_m2
 from scenematch.report.verdict import metres, verdict_of
-
-Array = NDArray[np.float64]
 
 MAX_RUNS = 6
 """The number of distinguishable colours."""
@@ -43,10 +40,7 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
     data = {name: track.plot_data() for name, track in tracks.items()}
     first = next(iter(tracks.values()))
     track_map = map_of_tracks(first.site, list(data.values()))
-    verdicts = {
-        name: verdict_of(track.summary, median_sigma_m(track.rows), track.summary["settings"].get("budget_ms"))
-        for name, track in tracks.items()
-    }
+    verdicts = {name: verdict_of(track.summary) for name, track in tracks.items()}
     truth = next((d.errors.truth_en_m for d in data.values() if np.isfinite(d.errors.truth_en_m).any()), None)
     true_path = np.empty((0, 2)) if truth is None else connected(track_map, truth)
     marks = [line(true_path, "halo"), *_run_marks(data, track_map), line(true_path, "truth")]
