@@ -20,6 +20,7 @@ from scenematch.bridges.mavlink_in import MAV_AUTOPILOTS, GnssFix
 from scenematch.bridges.packets import AUTOPILOT_COMPONENT
 from scenematch.bridges.parameters import MAX_DELAY_MS
 from scenematch.bridges.vehicle import ANGLE_VARIANCE, MOUNT_VARIANCE, NedOrigin, VehicleState, north_east_m
+from scenematch.files.quaternions import quaternion_wxyz
 
 MESSAGES = {
     "ardupilot": ("vision_position_estimate", "odometry", "gps_input"),
@@ -271,7 +272,7 @@ def _odometry(report: FixReport, firmware: str) -> Any:
         frame,
         mavlink.MAV_FRAME_BODY_FRD,
         *_ned(report, firmware),
-        _quaternion(*_angles(report)),
+        list(quaternion_wxyz(*_angles(report))),
         *velocity,
         *(nan, nan, nan),
         pose_covariance(report.fix, with_attitude=_measured_attitude(report) is not None),
@@ -290,18 +291,6 @@ def _body_velocity(velocity: GroundVelocity, vehicle: VehicleState) -> list[floa
     enu_mps = np.array([velocity.east_mps, velocity.north_mps, vehicle.up_velocity_mps or 0.0])
     rotation = enu_from_body(vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg)
     return [float(v) for v in rotation.T @ enu_mps]
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
-    """Quaternion w, x, y, z that rotates the body to north-east-down; angles in radians."""
-    cr, cp, cy = (math.cos(0.5 * v) for v in (roll, pitch, yaw))
-    sr, sp, sy = (math.sin(0.5 * v) for v in (roll, pitch, yaw))
-    return [
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    ]
 
 
 def _gps_input(report: FixReport, gps_id: int) -> Any:
