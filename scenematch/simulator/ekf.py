@@ -13,15 +13,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from engine.geo import chi_square, enu_from_body
+from engine.geo import Array, chi_square, enu_from_body
 from engine.values import Attitude, Fix
 from scenematch.simulator.quadrotor import GRAVITY, STEP_S, IdealImu, next_time_s
 from scenematch.simulator.rotations import cross_matrix, rotation
 from scenematch.simulator.sensors import SensorSuite
-
-Array = NDArray[np.float64]
 
 POSITION, VELOCITY, TURN, ACCEL, GYRO = (slice(k, k + 3) for k in range(0, 15, 3))
 BARO, COMPASS = 15, 16

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.geo import LocalFrame, wrap_difference_deg
+from engine.geo import Array, LocalFrame, wrap_difference_deg
 from engine.values import Attitude, Frame, Truth
 from scenematch.simulator.conditions import Condition
 from scenematch.simulator.light import Image
@@ -31,8 +31,6 @@ from scenematch.simulator.vehicle import (
     fly_waypoints,
     simulate_telemetry,
 )
-
-Array = NDArray[np.float64]
 
 NADIR_PITCH_DEG = -90.0
 """Pitch of a camera that looks straight down."""

@@ -23,7 +23,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.geo import attitude_from_rotation
+from engine.geo import Array, attitude_from_rotation
 from engine.navigation.navigator import Matcher, Navigator
 from engine.navigation.state import NavigatorState
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
@@ -54,7 +54,6 @@ __all__ = [
     "fly_closed_loop",
 ]
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 RenderCallback = Callable[[State], Image]
 """Returns the camera's picture at a state of the vehicle."""

@@ -6,14 +6,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.geo import wrap_heading_deg
+from engine.geo import Array, wrap_heading_deg
 from engine.values import check_positive
 from scenematch.simulator.quadrotor import STEP_S, IdealImu, State
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

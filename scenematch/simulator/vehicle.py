@@ -12,12 +12,9 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.geo import wrap_difference_deg
-
-Array = NDArray[np.float64]
+from engine.geo import Array, wrap_difference_deg
 
 GRAVITY_MPS2 = 9.80665
 COURSE_STEP_S = 0.01
