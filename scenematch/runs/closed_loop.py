@@ -20,7 +20,7 @@ from engine.orthomap import OrthoMap
 from engine.values import Frame, Truth
 from scenematch.files.notes import frame_note, write_notes
 from scenematch.files.track import track_row, write_track
-from scenematch.report.closed_loop import summarise_loop, write_loop_csv
+from scenematch.report.loop_record import summarise_loop, write_loop_csv
 from scenematch.runs.arguments import check_choice, check_device
 from scenematch.runs.evaluation import redraw
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder
