@@ -20,14 +20,13 @@ from engine.orthomap import OrthoMap
 from engine.runtime.garbage import no_collection
 from engine.runtime.realtime import Realtime, check_realtime, set_realtime
 from engine.values import Prior
-from scenematch.bridges.delay_memory import remember_delay
 from scenematch.bridges.links import parse_connection
 from scenematch.bridges.pictures import CapturedImage
 from scenematch.bridges.vehicle import NedOrigin
 from scenematch.runs.arguments import check_choice, check_device, check_unused, parse_position
 from scenematch.runs.bridge_files import BridgeFiles
 from scenematch.runs.checks import check_position
-from scenematch.runs.last_fix import LastFix, last_fix_file
+from scenematch.runs.last_fix import LastFix, last_fix_file, remember_delay
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
