@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -67,26 +67,18 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
 
 def _figures(tracks: Mapping[str, FinishedTrack]) -> str:
     """The table of figures of merit, one row per run."""
-    head = ("run", "method", "fixed", "median", "95 % below", "largest", "within 3 sigma", "NEES", "latency 95 %")
-
-    def cells(name: str, track: FinishedTrack) -> tuple[str, ...]:
-        summary = track.summary
-
-        def shown(key: str, form: Any) -> str:
-            return "-" if summary.get(key) is None else str(form(summary[key]))
-
-        p95_ms = summary["latency_ms"]["p95"]
-        return (
-            name,
-            track.method,
-            shown("availability", "{:.1%}".format),
-            *(shown(key, metres) for key in ("median_m", "r95_m", "max_m")),
-            shown("within_3_sigma", "{:.1%}".format),
-            shown("nees_mean", "{:.2f}".format),
-            "-" if p95_ms is None else f"{p95_ms:.1f} ms",
-        )
-
-    return table(head, [cells(name, track) for name, track in tracks.items()])
+    share = "{:.1%}".format
+    columns: dict[str, tuple[str, Callable[[float], str]]] = {
+        "fixed": ("availability", share), "median": ("median_m", metres), "95 % below": ("r95_m", metres),
+        "largest": ("max_m", metres), "within 3 sigma": ("within_3_sigma", share),
+        "NEES": ("nees_mean", "{:.2f}".format), "latency 95 %": ("p95", "{:.1f} ms".format),
+    }  # fmt: skip
+    rows = []
+    for name, track in tracks.items():
+        found = {**track.summary, **track.summary["latency_ms"]}
+        shown = ("-" if found.get(key) is None else form(found[key]) for key, form in columns.values())
+        rows.append((name, track.method, *shown))
+    return table(("run", "method", *columns), rows)
 
 
 def _run_marks(data: Mapping[str, TrackPlotData], track_map: Any) -> list[str]:
