@@ -47,7 +47,6 @@ class MavlinkOptions:
         firmware: ardupilot or px4.
         message: one of the firmware's :data:`MESSAGES`; empty for its default.
         max_sigma_m: upper bound of a fix's sigma; ArduPilot would clamp a larger one and trust the fix too much.
-        max_age_ms: upper bound of the time since capture; ArduPilot's estimator buffers no longer.
         gps_id: number of the receiver that GPS_INPUT emulates; 0 is the autopilot's first, 1 its second.
 
     Raises:
@@ -57,18 +56,15 @@ class MavlinkOptions:
     firmware: str = "ardupilot"
     message: str = ""
     max_sigma_m: float = 10.0
-    max_age_ms: float = MAX_DELAY_MS
     gps_id: int = 0
 
     def __post_init__(self) -> None:
-        check_positive(self, "max_sigma_m", "max_age_ms")
+        check_positive(self, "max_sigma_m")
         if self.firmware not in MAV_AUTOPILOTS:
             raise OptionError(f"firmware: expected one of {', '.join(MAV_AUTOPILOTS)}, got {self.firmware!r}")
         if self.message and self.message not in MESSAGES[self.firmware]:
             known = ", ".join(MESSAGES[self.firmware])
             raise OptionError(f"message: expected one of {known} for {self.firmware}, got {self.message!r}")
-        if self.max_age_ms > MAX_DELAY_MS:
-            raise OptionError(f"max_age_ms: expected at most {MAX_DELAY_MS:g}, got {self.max_age_ms:g}")
         if not 0 <= self.gps_id <= _MAX_GPS_ID:
             raise OptionError(f"gps_id: expected 0 to {_MAX_GPS_ID}, got {self.gps_id}")
         if self.gps_id and self.kind != "gps_input":
@@ -122,7 +118,7 @@ def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
         return "not finite"
     if fix.sigma_m > options.max_sigma_m:
         return "too uncertain"
-    if report.age_ms > options.max_age_ms:
+    if report.age_ms > MAX_DELAY_MS:  # ArduPilot's estimator buffers no longer
         return "too old"
     if options.needs_origin:
         if report.origin is None:

@@ -34,6 +34,7 @@ from scenematch.report.explain import (
     draw_surface,
     draw_window,
     match_again,
+    resized,
     stretch_contrast,
     window_pixels,
 )
@@ -47,7 +48,6 @@ from scenematch.report.live_shapes import (
     map_mesh,
     outline,
     padded,
-    resized,
 )
 
 Image = NDArray[np.uint8]

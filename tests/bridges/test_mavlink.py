@@ -276,7 +276,7 @@ def test_what_would_mislead_is_withheld(changes, message, why):
 
 @pytest.mark.parametrize(
     "values",
-    [{"firmware": "inav"}, {"message": "global_position_sensor"}, {"max_age_ms": 251.0}, {"max_sigma_m": 101.0}],
+    [{"firmware": "inav"}, {"message": "global_position_sensor"}, {"max_sigma_m": 101.0}],
 )
 def test_options_are_refused_in_one_line(values):
     with pytest.raises(OptionError, match=next(iter(values))):
