@@ -99,7 +99,18 @@ def picture_at(
 
 
 def truth_at(town: Town, origin: LocalFrame, timestamp_ns: int, position_m: Array, attitude: Attitude) -> Truth:
-    """The true pose of a vehicle at a position (3,) east, north and up in the local frame."""
+    """The true pose of a vehicle.
+
+    Args:
+        town: that it flies over.
+        origin: of the local east-north-up frame.
+        timestamp_ns: of the pose.
+        position_m: (3,) east, north and up in that frame.
+        attitude: of its body.
+
+    Returns:
+        Truth: with heights above the sea and above the ground below it.
+    """
     east, north, up = (float(v) for v in position_m)
     lat, lon = origin.geodetic_from_enu(east, north)
     return Truth(
