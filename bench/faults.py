@@ -18,18 +18,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench import RESULTS
 from bench.inputs.faults import Fault, FlightInputs, faults, load
 from bench.pages.text import rewrite, shown, table
 from engine import Fix, Navigator, Prior, SceneMatcher
+from engine.geo import Array
 from engine.navigation.telemetry_errors import Calibration
 from engine.runtime.threads import set_threads
 from scenematch.check import diagnose
 from scenematch.files.truth import interpolate_truth
 
-Array = NDArray[np.float64]
 BEGIN, END = "<!-- written by bench.faults -->", "<!-- end of what bench.faults writes -->"
 FALSE_M, FALSE_SIGMAS = 5.0, 3.0
 START_SIGMA_M = 15.0

@@ -27,13 +27,13 @@ from bench.inputs.scenes import mosaic
 from bench.pages.integrity import auc
 from bench.pages.text import machine, paragraph, table
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
+from engine.geo import Array
 from engine.matching.align import view_of
 from engine.runtime.threads import set_threads
 from engine.values import Attitude, Window
 from scenematch.check.availability import Audit, audit_site, regressors
 from scenematch.simulator import build_town
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 PAGE = RESULTS / "audit.md"

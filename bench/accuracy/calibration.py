@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.faults import Flown, fly, stamps_of, start_of
 from bench.inputs.faults import FlightInputs, late, lens, load, mounted, raised, turned
@@ -26,7 +25,6 @@ from engine.runtime.threads import set_threads
 from scenematch.check import Finding, diagnose
 from scenematch.files.truth import interpolate_truth
 
-Array = NDArray[np.float64]
 Measured = tuple[float, float]  # a value and its standard deviation
 CLOSE = 0.2  # of the error, within which it counts as recovered
 

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine import Camera, Frame, OrthoMap
+from engine.geo import Array
 from engine.matching.align import shrink, to_gray, view_of
 from engine.values import Window
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Descriptors = NDArray[np.float32]
 

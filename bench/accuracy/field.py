@@ -19,13 +19,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bench import RESULTS, SHARED
 from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
 from bench.accuracy.flights import MIDDLE, moved_to_middle
 from bench.pages import field
 from engine import Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
+from engine.geo import Array
 from engine.options import ACCEPT_ALL, LearnedOptions
 from engine.runtime.threads import set_threads
 from scenematch import FlightFiles, TrackSettings, track
@@ -34,8 +34,6 @@ from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
 from scenematch.runs.arguments import parse_position
 from scenematch.runs.inputs import FlightInputs, open_inputs
-
-Array = NDArray[np.float64]
 
 REAL = ("brighton", "seneca", "caliterra", "nust")
 DRAWN = {"gazebo-a1": 8, "gazebo-a2": 8, "gazebo-a1-evening": 8}

@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.accuracy.trials import Ground, Trial, prior_about, trial
 from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
@@ -24,7 +23,6 @@ from engine.options import NccOptions, PoseOptions, SiftOptions
 from engine.window import level_crop
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 
-Array = NDArray[np.float64]
 M = TypeVar("M", Ncc, Sift)
 
 METHODS = {"NCC": 0.5, "NCC, refined": 0.2, "SIFT": 0.2, "auto": 0.1}

@@ -19,16 +19,14 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench import SHARED
 from bench.accuracy.flights import recorded
 from engine import Camera, Fix, Frame, Navigator, OrthoMap, SceneMatcher, set_threads
+from engine.geo import Array
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import Motion, SensorNoise, build_town, plan_flight
 from scenematch.simulator.vehicle import simulate_telemetry
-
-Array = NDArray[np.float64]
 
 FRAMES = 6  # of a run
 RATE_HZ, SPEED_MPS = 5.0, 7.0

@@ -15,20 +15,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench import RESULTS, SHARED
 from bench.accuracy.flights import MIDDLE, Recorded, moved_to_middle, recorded
 from bench.pages.text import paragraph, rewrite, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
+from engine.geo import Array
 from engine.options import AssumedErrors, NccOptions, SiftOptions
 from engine.runtime.threads import set_threads
 from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import plan_flight
 from scenematch.simulator.town import EXACT
-
-Array = NDArray[np.float64]
 
 TOWNS = {
     "towns 21 to 26": [(seed, "noon") for seed in range(21, 27)],

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bench import SHARED
 from bench.accuracy.flights import MIDDLE, START_SIGMA_M, Recorded, moved_to_middle, recorded
@@ -32,6 +31,7 @@ from engine import (
     Reason,
     SceneMatcher,
 )
+from engine.geo import Array
 from engine.matching.align import to_gray
 from engine.matching.covariance import map_sigma_of
 from engine.navigation.motion import GroundMotion
@@ -39,8 +39,6 @@ from engine.navigation.odometry import NoMotion, VisualOdometry
 from engine.runtime.threads import set_threads
 from scenematch.report.metrics import Ground
 from scenematch.simulator import plan_flight
-
-Array = NDArray[np.float64]
 
 REPORTED, BUILT_IN = ("gazebo-a1", "nust"), "built-in"
 PERIOD_S = 5.0  # with matching, then without

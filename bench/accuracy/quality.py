@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from engine.geo import Array
+
 Gray = NDArray[np.uint8]
 
 REPEAT_PX, REPEAT_FACTOR = 1.5, 1.5

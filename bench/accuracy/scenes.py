@@ -18,13 +18,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bench import RESULTS
 from bench.accuracy.field import figures
 from bench.pages import scenes as page
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.geo import enu_from_body
+from engine.geo import Array, enu_from_body
 from engine.runtime.threads import set_threads
 from engine.values import Attitude, Truth
 from scenematch.files.track import TrackRow, track_row
@@ -33,8 +32,6 @@ from scenematch.simulator import FlightStyle, Town, build_town, plan_flight, ren
 from scenematch.simulator.flight import paper_camera
 from scenematch.simulator.render import grid_from_enu
 from scenematch.simulator.town import MAP_SENSOR
-
-Array = NDArray[np.float64]
 
 FIRST_SEED = 9100
 """No constant of the engine was fitted on towns from here on."""

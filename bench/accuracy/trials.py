@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from bench.accuracy.flights import MIDDLE, moved_to_middle, recorded
 from bench.inputs.farmland import farmland
 from engine import Camera, Fix, Frame, OrthoMap, Prior
-from engine.geo import enu_from_body
+from engine.geo import Array, enu_from_body
 from engine.values import Window
 from scenematch.simulator import plan_flight
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
 

@@ -19,9 +19,9 @@ from bench import SHARED
 from bench.accuracy.trials import NAIP_GSD_M, Ground, Trial, ground_quad_px, picture
 from bench.inputs.farmland import farmland, vintages
 from engine import Camera, Frame, OrthoMap, Prior
+from engine.geo import Array
 from engine.values import Window
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
 

@@ -12,17 +12,16 @@ from itertools import cycle, islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench import SHARED
 from bench.live.burden import hogs
 from bench.live.endless import GRACE_MS, PERCENTILES
 from engine import Budget, Camera, Fix, Frame, OrthoMap, Prior, SceneMatcher, set_realtime
+from engine.geo import Array
 from scenematch.files.flight import open_flight
 from scenematch.files.truth import read_truth
 from scenematch.report.metrics import WRONG_M
 
-Array = NDArray[np.float64]
 Row = dict[str, Any]
 FLIGHT = SHARED / "gazebo-a1"
 METHODS = ("auto", "ncc", "sift")

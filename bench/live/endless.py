@@ -13,14 +13,12 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine import Budget, Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
+from engine.geo import Array
 from engine.options import ACCEPT_ALL
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import plan_flight
-
-Array = NDArray[np.float64]
 
 RATE_HZ = 2.24
 DIVE_M, DIVE_S = 40.0, 50.0

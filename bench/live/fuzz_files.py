@@ -26,7 +26,7 @@ from engine.values import Frame, Prior
 from scenematch.files.export import WRITERS, pose_rows
 from scenematch.files.flight import _frame, open_flight
 from scenematch.files.logs.readers import open_log
-from scenematch.files.resampling import UTC_FROM_NS, telemetry_at, truth_from_log
+from scenematch.files.resampling import UTC_FROM_NS, rows_and_sources_at, truth_from_log
 from scenematch.files.ros.bags import read_bag_camera
 from scenematch.files.route import read_route
 from scenematch.files.telemetry import TelemetryRow, ground_amsl_m, read_telemetry, write_telemetry
@@ -59,7 +59,7 @@ def use_log(path: Path) -> None:
     begin, end = log.span_ns
     moments = sorted({begin, (begin + end) // 2, end})
     with suppress(EngineError):
-        rows, _ = telemetry_at(log, moments, [str(i) for i in range(len(moments))])
+        rows, _ = rows_and_sources_at(log, moments, [str(i) for i in range(len(moments))])
         use_rows(rows)
     for utc in (False, True):
         with suppress(EngineError):

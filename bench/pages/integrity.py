@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from bench.accuracy.judged import METHODS, SCORES, Row
 from bench.accuracy.trials import ANSWERABLE, SUITABLE, UNANSWERABLE, UNSUITABLE
 from bench.pages.text import paragraph, rewrite, table
+from engine.geo import Array
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 BEGIN, END = "<!-- bench.accuracy.integrity begins -->", "<!-- bench.accuracy.integrity ends -->"

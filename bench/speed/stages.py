@@ -19,17 +19,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench import SHARED
 from bench.inputs.faults import load
 from bench.live.endless import draw
 from bench.speed.peers import OpenCvStep
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
+from engine.geo import Array
 from engine.runtime.threads import set_threads
 from scenematch.files.truth import interpolate_truth
 
-Array = NDArray[np.float64]
 FRAMES, BLOCK, SKIPPED = 160, 20, 4  # in all, in turns, and at the start of a block whose caches are the peer's
 START_SIGMA_M = 10.0
 

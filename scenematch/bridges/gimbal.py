@@ -9,13 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.geo import attitude_from_rotation, enu_from_body
+from engine.geo import Array, attitude_from_rotation, enu_from_body
 from engine.values import Attitude
-
-Array = NDArray[np.float64]
+from scenematch.files.quaternions import rotation_of
 
 _FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # mount of a camera that looks ahead
 _EARTH_YAW = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
@@ -44,10 +42,11 @@ def from_device(q: list[float], flags: int, heading_deg: float) -> Array | None:
     Returns:
         (3, 3) from the gimbal's axes to east, north and up.
     """
-    if not all(map(math.isfinite, q)) or not 0.9 < math.hypot(*q) < 1.1:
+    norm = math.hypot(*q)
+    if not 0.9 < norm < 1.1:  # NaN fails too
         return None
     is_of_earth = bool(flags & _EARTH_YAW) or (bool(flags & _LOCKED_YAW) and not flags & _VEHICLE_YAW)
-    return enu_from_body(0.0, 0.0, 0.0 if is_of_earth else heading_deg) @ _rotation(q)
+    return enu_from_body(0.0, 0.0, 0.0 if is_of_earth else heading_deg) @ rotation_of(*(v / norm for v in q))
 
 
 def from_mount(roll_deg: float, pitch_deg: float, yaw_deg: float, heading_deg: float) -> Array | None:
@@ -55,15 +54,3 @@ def from_mount(roll_deg: float, pitch_deg: float, yaw_deg: float, heading_deg: f
     if not all(map(math.isfinite, (roll_deg, pitch_deg, yaw_deg))):
         return None
     return enu_from_body(roll_deg, pitch_deg, yaw_deg + heading_deg)
-
-
-def _rotation(q: list[float]) -> Array:
-    """(3, 3) of a quaternion w, x, y, z."""
-    w, x, y, z = np.asarray(q) / math.hypot(*q)
-    return np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )

@@ -163,24 +163,27 @@ class MavlinkTelemetry:
     def __init__(
         self, gimbal_mount: NDArray[np.float64] | None = None, bridge_component: int = BRIDGE_COMPONENT
     ) -> None:
-        self._bridge_component = bridge_component
+        self._bridge_component, self._gimbal_mount = bridge_component, gimbal_mount
         self._lock = threading.Lock()
-        self._clock = AutopilotClock()
-        self._gimbal_mount, self._holder = gimbal_mount, RecentValues(ANGLES)
-        self._attitude, self._velocity, self._vision = RecentValues(ANGLES), RecentValues(), RecentValues()
+        self.armed = False
+        self.firmware: int | None = None
+        self.heard_ns: int | None = None
+        self._reset()
+
+    def _reset(self) -> None:
+        """Know nothing but the last heartbeat."""
+        self._clock, self._stale_stamps = AutopilotClock(), 0
+        self._attitude, self._holder = RecentValues(ANGLES), RecentValues(ANGLES)
+        self._velocity, self._vision, self._down = RecentValues(), RecentValues(), RecentValues()
         self._range, self._clearance, self._relative = RecentValues(), RecentValues(), RecentValues()
-        self._alt_amsl, self._down = RecentValues(), RecentValues()
+        self._alt_amsl = RecentValues()
         self._unix_offset_ns: int | None = None
-        self._stale_stamps = 0
         self._has_velocity = True
         self._home_down_m = 0.0  # how far its home is below its origin
         self.origin: NedOrigin | None = None
         self.has_receiver: bool | None = None
         self.uptime_ms: int | None = None
         self.gnss: GnssFix | None = None
-        self.armed = False
-        self.firmware: int | None = None
-        self.heard_ns: int | None = None
 
     def update(self, message: Any, arrival_ns: int) -> None:
         """Process one message."""
@@ -290,17 +293,6 @@ class MavlinkTelemetry:
             self._reset()
             time_ns = self._clock.local_ns(remote_ns, arrival_ns)
         return time_ns
-
-    def _reset(self) -> None:
-        self._clock = AutopilotClock()
-        self.origin, self._unix_offset_ns, self._stale_stamps = None, None, 0
-        self.has_receiver, self.gnss, self.uptime_ms = None, None, None
-        self._has_velocity, self._home_down_m = True, 0.0
-        for series in (self._holder, self._attitude, self._velocity, self._range, self._clearance, self._relative):
-            series.clear()
-        self._vision.clear()
-        self._alt_amsl.clear()
-        self._down.clear()
 
     def _add_sample(self, message: Any, time_ns: int | None) -> None:
         if time_ns is None:

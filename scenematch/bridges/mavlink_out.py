@@ -20,6 +20,7 @@ from scenematch.bridges.mavlink_in import MAV_AUTOPILOTS, GnssFix
 from scenematch.bridges.packets import AUTOPILOT_COMPONENT
 from scenematch.bridges.parameters import MAX_DELAY_MS
 from scenematch.bridges.vehicle import ANGLE_VARIANCE, MOUNT_VARIANCE, NedOrigin, VehicleState, north_east_m
+from scenematch.files.quaternions import quaternion_wxyz
 
 MESSAGES = {
     "ardupilot": ("vision_position_estimate", "odometry", "gps_input"),
@@ -46,7 +47,6 @@ class MavlinkOptions:
         firmware: ardupilot or px4.
         message: one of the firmware's :data:`MESSAGES`; empty for its default.
         max_sigma_m: upper bound of a fix's sigma; ArduPilot would clamp a larger one and trust the fix too much.
-        max_age_ms: upper bound of the time since capture; ArduPilot's estimator buffers no longer.
         gps_id: number of the receiver that GPS_INPUT emulates; 0 is the autopilot's first, 1 its second.
 
     Raises:
@@ -56,18 +56,15 @@ class MavlinkOptions:
     firmware: str = "ardupilot"
     message: str = ""
     max_sigma_m: float = 10.0
-    max_age_ms: float = MAX_DELAY_MS
     gps_id: int = 0
 
     def __post_init__(self) -> None:
-        check_positive(self, "max_sigma_m", "max_age_ms")
+        check_positive(self, "max_sigma_m")
         if self.firmware not in MAV_AUTOPILOTS:
             raise OptionError(f"firmware: expected one of {', '.join(MAV_AUTOPILOTS)}, got {self.firmware!r}")
         if self.message and self.message not in MESSAGES[self.firmware]:
             known = ", ".join(MESSAGES[self.firmware])
             raise OptionError(f"message: expected one of {known} for {self.firmware}, got {self.message!r}")
-        if self.max_age_ms > MAX_DELAY_MS:
-            raise OptionError(f"max_age_ms: expected at most {MAX_DELAY_MS:g}, got {self.max_age_ms:g}")
         if not 0 <= self.gps_id <= _MAX_GPS_ID:
             raise OptionError(f"gps_id: expected 0 to {_MAX_GPS_ID}, got {self.gps_id}")
         if self.gps_id and self.kind != "gps_input":
@@ -121,7 +118,7 @@ def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
         return "not finite"
     if fix.sigma_m > options.max_sigma_m:
         return "too uncertain"
-    if report.age_ms > options.max_age_ms:
+    if report.age_ms > MAX_DELAY_MS:  # ArduPilot's estimator buffers no longer
         return "too old"
     if options.needs_origin:
         if report.origin is None:
@@ -271,7 +268,7 @@ def _odometry(report: FixReport, firmware: str) -> Any:
         frame,
         mavlink.MAV_FRAME_BODY_FRD,
         *_ned(report, firmware),
-        _quaternion(*_angles(report)),
+        list(quaternion_wxyz(*_angles(report))),
         *velocity,
         *(nan, nan, nan),
         pose_covariance(report.fix, with_attitude=_measured_attitude(report) is not None),
@@ -290,18 +287,6 @@ def _body_velocity(velocity: GroundVelocity, vehicle: VehicleState) -> list[floa
     enu_mps = np.array([velocity.east_mps, velocity.north_mps, vehicle.up_velocity_mps or 0.0])
     rotation = enu_from_body(vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg)
     return [float(v) for v in rotation.T @ enu_mps]
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
-    """Quaternion w, x, y, z that rotates the body to north-east-down; angles in radians."""
-    cr, cp, cy = (math.cos(0.5 * v) for v in (roll, pitch, yaw))
-    sr, sp, sy = (math.sin(0.5 * v) for v in (roll, pitch, yaw))
-    return [
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    ]
 
 
 def _gps_input(report: FixReport, gps_id: int) -> Any:

@@ -26,7 +26,7 @@ from engine.navigation.navigator import Navigator
 from engine.orthomap import OrthoMap
 from engine.values import Fix, Frame, NoFix, Prior
 from scenematch.bridges.ros_in import RESTART_NS, RosTelemetry, RosTopics
-from scenematch.bridges.ros_out import RosOptions, diagnostics, is_finite, pose, window_picture
+from scenematch.bridges.ros_out import FRAME_ID, RosOptions, diagnostics, is_finite, pose, window_picture
 from scenematch.files.ros.messages import ODOMETRY_TYPES, MessageFactory, image_from_message, stamp_ns
 
 _log = logging.getLogger("scenematch")
@@ -263,7 +263,7 @@ class RosBridge:
             self._diagnose(captured_ns, _WARN, f"no fix: {reason}", values)
         if result.window is not None and self._node.has_subscribers("window"):
             crop = window_picture(self._site, result.window, result if isinstance(result, Fix) else None)
-            self._node.publish("window", self._node.messages.image(captured_ns, self._options.frame_id, crop))
+            self._node.publish("window", self._node.messages.image(captured_ns, FRAME_ID, crop))
         if self._watch is not None:
             self._watch(answer)
 

@@ -19,6 +19,8 @@ from scenematch.files.ros.messages import MessageFactory
 FIRMWARES = ("none", "ardupilot", "px4")
 """Consumers of the pose: an autopilot behind MAVROS has its own projection and use of covariances."""
 
+FRAME_ID = "map"
+"""Frame of the poses, which are east-north-up about the origin."""
 _UNKNOWN_ANGLE_VARIANCE = math.pi**2
 _UNKNOWN_HEIGHT_M2 = 1e6
 _MAX_VIEW_PX = 640  # longer side of the window's image
@@ -26,10 +28,9 @@ _MAX_VIEW_PX = 640  # longer side of the window's image
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RosOptions:
-    """Frame, origin and consumer of the poses.
+    """Origin and consumer of the poses.
 
     Attributes:
-        frame_id: frame of the poses, which are east-north-up about the origin.
         firmware: one of :data:`FIRMWARES`.
         origin: origin of the poses; None for the map's. For an autopilot it must be its estimator's.
 
@@ -37,7 +38,6 @@ class RosOptions:
         OptionError: the firmware is unknown.
     """
 
-    frame_id: str = "map"
     firmware: str = "none"
     origin: NedOrigin | None = None
 
@@ -82,7 +82,7 @@ def pose(
     plain = messages.make("geometry_msgs/msg/Pose", position=point, orientation=orientation)
     return messages.make(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
-        header=messages.header(captured_ns, options.frame_id),
+        header=messages.header(captured_ns, FRAME_ID),
         pose=messages.make("geometry_msgs/msg/PoseWithCovariance", pose=plain, covariance=covariance.ravel()),
     )
 

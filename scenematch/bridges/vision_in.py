@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.geo import enu_from_body
+from engine.geo import Array, enu_from_body
 from scenematch.bridges.packets import AUTOPILOT_COMPONENT
 from scenematch.files.velocities import velocity_sigma_mps
-
-Array = NDArray[np.float64]
 
 _OVER_GROUND = (mavlink.MAV_FRAME_LOCAL_NED,)
 _OF_BODY = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)  # the latter is its former name

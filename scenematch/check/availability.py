@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from engine.camera import Camera
+from engine.geo import Array
 from engine.orthomap import OrthoMap
 from scenematch.check.plan import AuditOptions, AuditPlan, MapPart, plan_audit, sample_route
 from scenematch.check.self_match import SelfMatchStatistics, measure_self_match
-
-Array = NDArray[np.float64]
 
 SUITABLE = 0.5
 """Probability of a fix at and above which a cell counts as suitable."""

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.camera import Camera
+from engine.geo import Array
 from engine.matching.covariance import map_sigma_of
 from engine.navigation.odds import position_of
 from engine.orthomap import OrthoMap
@@ -18,8 +18,6 @@ from scenematch.check.causes import findings, is_known
 from scenematch.check.contradictions import contradictions
 from scenematch.check.findings import Diagnosis, Finding, TelemetrySeries
 from scenematch.check.sightings import sight
-
-Array = NDArray[np.float64]
 
 LOOKED_AT = 16
 _SPEED_MPS = 5.0  # growth of a position's uncertainty with the time to the nearest known one

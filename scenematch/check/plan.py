@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from engine.camera import Camera
 from engine.errors import OptionError
+from engine.geo import Array
 from engine.matching.align import GroundView, rectify, view_of
 from engine.options import NccOptions
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Window, check_positive
 from engine.window import level_for
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Larger templates take longer and change little, so the audit then uses a coarser level.

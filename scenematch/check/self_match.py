@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels.peaks import fit_summit
+from engine.geo import Array
 from engine.kernels.scores import enhance
 from engine.maps.prepared import PreparedMap
 from engine.matching.covariance import score_sigma
@@ -27,7 +27,6 @@ from engine.values import Window
 from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 from scenematch.check.plan import AuditPlan
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Pictures = NDArray[np.float32]
 
@@ -51,7 +50,6 @@ class SelfMatchStatistics:
         texture: deviation of the grey levels from their neighbourhood's mean.
         rival: highest NCC of the unchanged patch outside its exclusion zone.
         stability: NCC of the patch with itself, blurred, rotated and scaled a little.
-        sharpness: curvature of the unchanged peak along its flattest direction, per square pixel.
         score: NCC of the changed patch at its own position, in sigmas.
         lead: ``score`` minus its best rival, in sigmas.
         other_score: ``score`` of a patch of another date's map, unchanged; NaN without one.
@@ -61,7 +59,6 @@ class SelfMatchStatistics:
     texture: Array
     rival: Array
     stability: Array
-    sharpness: Array
     score: Array
     lead: Array
     other_score: Array
@@ -121,7 +118,6 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px:
         _texture(gray),
         rivals[0],
         own[1],
-        _sharpness(scores[0], x, y),
         own[changed].mean() / sigma,
         leads[changed].mean() / sigma,
         *([np.nan] * 2 if other is None else [own[-1] / sigma, leads[-1] / sigma]),
@@ -179,15 +175,6 @@ def _own_and_rivals(scores: Pictures, x: int, y: int, exclusion_px: float) -> tu
     outside = down * down + across * across > max(exclusion_px, _NEAR_PX) ** 2
     rivals = np.where(outside, scores, -1.0).max(axis=(1, 2))
     return near.max(axis=(1, 2)).astype(np.float64), rivals.astype(np.float64)
-
-
-def _sharpness(scores: Pictures, x: int, y: int) -> float:
-    """Curvature of the score along the flattest direction, negated; 0 at the edge of the surface."""
-    r = min(2, x, y, scores.shape[1] - 1 - x, scores.shape[0] - 1 - y)
-    if r <= 0:
-        return 0.0
-    curvature = fit_summit(scores[y - r : y + r + 1, x - r : x + r + 1].astype(np.float64))[2]
-    return max(0.0, float(-np.linalg.eigvalsh(curvature)[-1]))
 
 
 def _seen_on(other: OrthoMap, plan: AuditPlan, extent: Window) -> Gray | None:

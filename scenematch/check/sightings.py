@@ -8,16 +8,13 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.geo import wrap_heading_deg
+from engine.geo import Array, wrap_heading_deg
 from engine.matching.matcher import SceneMatcher
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, Frame, Prior
-
-Array = NDArray[np.float64]
 
 _ENOUGH_SHARE = 0.25  # of the pictures; with fewer, the search continues
 _LEAST = 4

@@ -24,125 +24,89 @@ if TYPE_CHECKING:
 INPUT, MAP, OUTPUT, EXPERT = "Input", "Map", "Output", "Expert"
 """Panels of the help."""
 
-MapOption = Annotated[
-    Path,
-    typer.Option("--map", metavar="FILE", help="GeoTIFF, or a picture with a world file.", rich_help_panel=MAP),
-]
-SurfaceOption = Annotated[
-    Path | None,
-    typer.Option("--surface", metavar="FILE", help="Surface model, a GeoTIFF of heights.", rich_help_panel=MAP),
-]
+
+def option(name: str, metavar: str, text: str, panel: str | None = None, **limits: Any) -> Any:
+    """An option with a value, in a panel of the help; ``limits`` such as ``min`` are typer's."""
+    return typer.Option(name, metavar=metavar, help=text, rich_help_panel=panel, **limits)
+
+
+def flag(name: str, text: str, panel: str | None = None) -> Any:
+    """An option without a value."""
+    return typer.Option(name, help=text, rich_help_panel=panel)
+
+
+MapOption = Annotated[Path, option("--map", "FILE", "GeoTIFF, or a picture with a world file.", MAP)]
+SurfaceOption = Annotated[Path | None, option("--surface", "FILE", "Surface model, a GeoTIFF of heights.", MAP)]
 FramesOption = Annotated[
-    Path,
-    typer.Option(
-        "--frames",
-        metavar="DIR|VIDEO|BAG",
-        help="Folder of pictures, a video, or a ROS bag.",
-        rich_help_panel=INPUT,
-    ),
+    Path, option("--frames", "DIR|VIDEO|BAG", "Folder of pictures, a video, or a ROS bag.", INPUT)
 ]
 CameraOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--camera",
-        metavar="FILE",
-        help="Calibration file (default: from the bag, the topic or EXIF).",
-        rich_help_panel=INPUT,
-    ),
+    Path | None, option("--camera", "FILE", "Calibration file (default: from the bag, the topic or EXIF).", INPUT)
 ]
 HfovOption = Annotated[
-    float | None,
-    typer.Option(
-        "--hfov-deg",
-        metavar="DEG",
-        help="Horizontal field of view, instead of --camera.",
-        rich_help_panel=INPUT,
-    ),
+    float | None, option("--hfov-deg", "DEG", "Horizontal field of view, instead of --camera.", INPUT)
 ]
 MountOption = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--mount",
-        metavar="NAME",
-        help="nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.",
-        rich_help_panel=INPUT,
+        "NAME",
+        "nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.",
+        INPUT,
     ),
 ]
 TelemetryOption = Annotated[
     Path | None,
-    typer.Option(
+    option(
         "--telemetry",
-        metavar="FILE",
-        help="telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the video's .SRT, or EXIF).",
-        rich_help_panel=INPUT,
+        "FILE",
+        "telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the video's .SRT, or EXIF).",
+        INPUT,
     ),
 ]
 TruthOption = Annotated[
     Path | None,
-    typer.Option(
-        "--truth",
-        metavar="FILE",
-        help="truth.csv, a log or photographs (default: truth.csv beside the telemetry).",
-        rich_help_panel=INPUT,
-    ),
+    option("--truth", "FILE", "truth.csv, a log or photographs (default: truth.csv beside the telemetry).", INPUT),
 ]
 CorrectOption = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
         "--correct",
-        metavar="NAME=VALUE",
-        help="Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.",
-        rich_help_panel=INPUT,
+        "NAME=VALUE",
+        "Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.",
+        INPUT,
     ),
 ]
 StartOption = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--start",
-        metavar="LAT,LON[,SIGMA_M]",
-        help="Where the flight begins (default: the telemetry's first position, or anywhere on the map).",
-        rich_help_panel=INPUT,
+        "LAT,LON[,SIGMA_M]",
+        "Where the flight begins (default: the telemetry's first position, or anywhere on the map).",
+        INPUT,
     ),
 ]
 MethodOption = Annotated[
     str | None,
-    typer.Option(
-        "--method", metavar="auto|ncc|sift|learned", help="auto: ncc and sift, each checking the other (default)."
-    ),
+    option("--method", "auto|ncc|sift|learned", "auto: ncc and sift, each checking the other (default)."),
 ]
 DeviceOption = Annotated[
-    str | None,
-    typer.Option(
-        "--device",
-        metavar="auto|cpu|cuda",
-        help="Device to compute on (default: auto).",
-        rich_help_panel=EXPERT,
-    ),
+    str | None, option("--device", "auto|cpu|cuda", "Device to compute on (default: auto).", EXPERT)
 ]
 SettingsOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--settings",
-        metavar="FILE|NAME=VALUE",
-        help="Settings as `doctor --settings` lists them; repeatable.",
-        rich_help_panel=EXPERT,
-    ),
+    option("--settings", "FILE|NAME=VALUE", "Settings as `doctor --settings` lists them; repeatable.", EXPERT),
 ]
-OutOption = Annotated[
-    Path,
-    typer.Option("--out", metavar="DIR", help="Output folder to create.", rich_help_panel=OUTPUT),
-]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing results.", rich_help_panel=OUTPUT)]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="Results as JSON on standard output.", rich_help_panel=OUTPUT)
-]
+OutOption = Annotated[Path, option("--out", "DIR", "Output folder to create.", OUTPUT)]
+ForceOption = Annotated[bool, flag("--force", "Replace existing results.", OUTPUT)]
+JsonOption = Annotated[bool, flag("--json", "Results as JSON on standard output.", OUTPUT)]
 RerunOption = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
         "--rerun",
-        metavar="FILE.rrd|HOST:PORT",
-        help="Record the live view to a file, or show it in a running rerun viewer; repeat for both.",
-        rich_help_panel=OUTPUT,
+        "FILE.rrd|HOST:PORT",
+        "Record the live view to a file, or show it in a running rerun viewer; repeat for both.",
+        OUTPUT,
     ),
 ]
 

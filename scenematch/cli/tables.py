@@ -11,8 +11,16 @@ from scenematch.cli import console
 if TYPE_CHECKING:
     from scenematch.runs.map_audit import MapAudit
 
-COLUMNS = ("RMS m", "p50 ms", "p95 ms", "fixed", "false", "NEES", "up m")
-"""Columns of a table of runs, after the name."""
+_RUN = (
+    ("RMS m", "rms_m", "{:.2f}"),
+    ("p50 ms", "p50", "{:.1f}"),
+    ("p95 ms", "p95", "{:.1f}"),
+    ("fixed", "availability", "{:.1%}"),
+    ("false", "false_fixes", "{}"),
+    ("NEES", "nees_mean", "{:.2f}"),
+    ("up m", "height_rms_m", "{:.2f}"),
+)
+"""Columns of a table of runs, after the name: head, figure, form."""
 _SUMMARY = (
     ("frames", "frames", "{}"),
     ("fixes", "fixes", "{}"),
@@ -66,7 +74,7 @@ def _stated(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 def print_comparison(results: Mapping[str, Mapping[str, Any]], title: str) -> None:
     """The table, one row per run."""
     rows = [(name, *_cells(summary)) for name, summary in results.items()]
-    console.print_table(title, ("run", *COLUMNS), rows)
+    console.print_table(title, ("run", *(head for head, *_ in _RUN)), rows)
 
 
 def print_paper_table(results: Mapping[str, Mapping[str, Any]], seed: int) -> None:
@@ -79,25 +87,13 @@ def print_paper_table(results: Mapping[str, Mapping[str, Any]], seed: int) -> No
         for run, what in ((f"{method}-paper", "paper's recipe"), (f"{method}-engine", "scenematch")):
             rows.append((f"{method.upper()}, {what}", *_cells(results[run])))
     title = f"Built-in flight {seed}, {results['ncc-engine']['frames']} frames"
-    console.print_table(title, ("Table I", *COLUMNS), rows)
+    console.print_table(title, ("Table I", *(head for head, *_ in _RUN)), rows)
 
 
-def _cells(summary: Mapping[str, Any]) -> tuple[str, ...]:
-    """The figures of :data:`COLUMNS`; a dash if unknown."""
-    latency = summary["latency_ms"]
-
-    def shown(value: float | None, form: str) -> str:
-        return "-" if value is None else form.format(value)
-
-    return (
-        shown(summary.get("rms_m"), "{:.2f}"),
-        shown(latency["p50"], "{:.1f}"),
-        shown(latency["p95"], "{:.1f}"),
-        shown(summary.get("availability"), "{:.1%}"),
-        shown(summary.get("false_fixes"), "{}"),
-        shown(summary.get("nees_mean"), "{:.2f}"),
-        shown(summary.get("height_rms_m"), "{:.2f}"),
-    )
+def _cells(summary: Mapping[str, Any]) -> list[str]:
+    """The figures of a run; a dash if unknown."""
+    found = {**summary, **summary["latency_ms"]}
+    return ["-" if found.get(key) is None else form.format(found[key]) for _, key, form in _RUN]
 
 
 def print_audit(result: MapAudit, title: str) -> None:

@@ -24,6 +24,7 @@ from engine.maps.rasters import open_source, vertical_datum
 from scenematch.fetch.grid import reason_of
 from scenematch.fetch.place import Bounds
 from scenematch.fetch.urls import PLACEHOLDER, check_url, shown, user_agent
+from scenematch.files.geotiff import write_geotiff
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -246,30 +247,12 @@ def write_heights(heights: Heights, out: Path, tags: Mapping[str, object]) -> No
     Raises:
         MapError: it cannot be written.
     """
-    import rasterio
-    from rasterio.errors import RasterioError
-    from rasterio.transform import Affine
-
-    height, width = heights.heights_m.shape
-    profile: dict[str, Any] = {
-        "driver": "GTiff",
-        "dtype": "float32",
-        "count": 1,
-        "width": width,
-        "height": height,
-        "nodata": NODATA,
-        "crs": rasterio.CRS.from_wkt(heights.crs.to_wkt()),
-        "transform": Affine(heights.step[0], 0.0, heights.corner[0], 0.0, -heights.step[1], heights.corner[1]),
-        "tiled": True,
-        "compress": "deflate",
-        "predictor": 3,
-    }
+    (x, y), (right, down) = heights.corner, heights.step
+    affine = [[right, 0.0, x + 0.5 * right], [0.0, -down, y - 0.5 * down]]
     part = out.with_name(f"{out.name}.part")
     try:
-        with rasterio.open(part, "w", **profile) as file:
-            file.write(np.nan_to_num(heights.heights_m, nan=NODATA), 1)
-            file.update_tags(**{name: str(value) for name, value in tags.items()})
+        write_geotiff(part, np.nan_to_num(heights.heights_m, nan=NODATA), affine, heights.crs, NODATA, tags=tags)
         os.replace(part, out)
-    except (RasterioError, OSError) as error:
+    except (MapError, OSError):
         part.unlink(missing_ok=True)
-        raise MapError(f"{out}: cannot be written: {str(error).splitlines()[0]}") from None
+        raise

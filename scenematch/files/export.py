@@ -17,8 +17,8 @@ from xml.sax.saxutils import escape
 
 from engine.errors import TelemetryError
 from scenematch.files.notes import FrameNote
+from scenematch.files.quaternions import quaternion_xyzw
 from scenematch.files.resampling import UTC_FROM_NS
-from scenematch.files.ros.messages import quaternion_xyzw
 from scenematch.files.tables import cell_text
 from scenematch.files.track import TrackRow
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -105,20 +105,11 @@ class Flight:
 
 
 def _frame(image: NDArray[np.uint8], row: TelemetryRow) -> Frame:
-    return Frame(
-        image,
-        timestamp_ns=row.timestamp_ns,
-        height_agl_m=row.height_agl_m,
-        heading_deg=row.heading_deg,
-        roll_deg=row.roll_deg,
-        pitch_deg=row.pitch_deg,
-        east_velocity_mps=row.east_velocity_mps,
-        north_velocity_mps=row.north_velocity_mps,
-        height_sigma_m=row.height_sigma_m,
-        heading_sigma_deg=row.heading_sigma_deg,
-        tilt_sigma_deg=row.tilt_sigma_deg,
-        velocity_sigma_mps=row.velocity_sigma_mps,
-    )
+    return Frame(image, **{name: getattr(row, name) for name in _SHARED})
+
+
+_SHARED = [each.name for each in fields(Frame) if each.name in TelemetryRow.__dataclass_fields__]
+"""What a frame and a row of telemetry both hold."""
 
 
 def open_flight(
@@ -248,23 +239,12 @@ def write_flight_folder(
 def _telemetry_row(name: str, frame: Frame, prior: Prior | None) -> TelemetryRow:
     if frame.timestamp_ns is None:
         raise TelemetryError(f"{name}: timestamp_ns: expected a stamp to write into telemetry.csv, got None")
-    return TelemetryRow(
-        timestamp_ns=frame.timestamp_ns,
-        frame=name,
-        height_agl_m=frame.height_agl_m,
-        heading_deg=None if frame.heading_deg is None else wrap_heading_deg(frame.heading_deg),
-        roll_deg=frame.roll_deg,
-        pitch_deg=frame.pitch_deg,
-        east_velocity_mps=frame.east_velocity_mps,
-        north_velocity_mps=frame.north_velocity_mps,
-        height_sigma_m=frame.height_sigma_m,
-        heading_sigma_deg=frame.heading_sigma_deg,
-        tilt_sigma_deg=frame.tilt_sigma_deg,
-        velocity_sigma_mps=frame.velocity_sigma_mps,
-        lat_deg=prior.lat_deg if prior else None,
-        lon_deg=prior.lon_deg if prior else None,
-        sigma_m=prior.sigma_m if prior else None,
-    )
+    known: dict[str, Any] = {each: getattr(frame, each) for each in _SHARED}
+    if frame.heading_deg is not None:
+        known["heading_deg"] = wrap_heading_deg(frame.heading_deg)
+    if prior is not None:
+        known |= {"lat_deg": prior.lat_deg, "lon_deg": prior.lon_deg, "sigma_m": prior.sigma_m}
+    return TelemetryRow(frame=name, **known)
 
 
 def _write_image(path: Path, frame: Frame) -> None:

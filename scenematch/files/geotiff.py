@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from engine.errors import DtypeError, MapError, OptionError, ShapeError
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 _DTYPES = ("uint8", "uint16", "int16", "float32", "float64")
 
@@ -18,7 +21,7 @@ def write_geotiff(
     path: str | Path,
     array: NDArray[Any],
     pixel_to_crs: ArrayLike,
-    crs_epsg: int,
+    crs: int | CRS,
     nodata: float | None = None,
     *,
     tags: Mapping[str, object] | None = None,
@@ -33,7 +36,7 @@ def write_geotiff(
         path: the file, overwritten if it exists.
         array: (H, W) or (H, W, 3) of uint8, uint16, int16, float32 or float64.
         pixel_to_crs: (2, 3) affine transform to units of the CRS.
-        crs_epsg: EPSG code of the CRS.
+        crs: EPSG code of the CRS, or the CRS.
         nodata: the value of pixels without data, or None.
         tags: metadata items, such as :data:`engine.maps.rasters.GEOREFERENCE_TAG`.
 
@@ -54,14 +57,14 @@ def write_geotiff(
         raise OptionError(f"pixel_to_crs: expected a finite, invertible affine transform, got {affine.tolist()}")
     corner = affine.copy()
     corner[:, 2] -= 0.5 * (affine[:, 0] + affine[:, 1])
-    _write(Path(path), array if array.ndim == 3 else array[:, :, None], corner, crs_epsg, nodata, tags or {})
+    _write(Path(path), array if array.ndim == 3 else array[:, :, None], corner, crs, nodata, tags or {})
 
 
 def _write(
     path: Path,
     bands: NDArray[Any],
     corner: NDArray[np.float64],
-    crs_epsg: int,
+    crs: int | CRS,
     nodata: float | None,
     tags: Mapping[str, object],
 ) -> None:
@@ -87,7 +90,8 @@ def _write(
     if bands.shape[2] == 3:
         profile["photometric"] = "RGB"
     try:
-        with rasterio.open(path, "w", crs=rasterio.CRS.from_epsg(crs_epsg), **profile) as file:
+        known = rasterio.CRS.from_epsg(crs) if isinstance(crs, int) else rasterio.CRS.from_wkt(crs.to_wkt())
+        with rasterio.open(path, "w", crs=known, **profile) as file:
             file.write(np.moveaxis(bands, 2, 0))
             if tags:
                 file.update_tags(**{name: str(value) for name, value in tags.items()})

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from engine.values import Fix, NoFix
-from scenematch.files.tables import cell_text, read_table, write_table
+from scenematch.files.tables import cell_text, cells_of, read_table, write_table
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,17 +104,5 @@ def read_notes(path: str | Path) -> list[FrameNote]:
     Raises:
         TelemetryError: the file cannot be read, or a cell is not what its column holds.
     """
-    return [
-        FrameNote(
-            frame=csv_row.text("frame"),
-            state=csv_row.text("state"),
-            window_x0_px=csv_row.integer("window_x0_px"),
-            window_y0_px=csv_row.integer("window_y0_px"),
-            heading_deg=csv_row.number("heading_deg"),
-            stage=csv_row.values["stage"] or None,
-            confidence=csv_row.number("confidence"),
-            detail=csv_row.values["detail"] or None,
-            **{name: csv_row.number(name) for name in _LATER},
-        )
-        for csv_row in read_table(path, [name for name in COLUMNS if name not in _LATER], _LATER)
-    ]
+    required = [name for name in COLUMNS if name not in _LATER]
+    return [FrameNote(**cells_of(FrameNote, csv_row)) for csv_row in read_table(path, required, _LATER)]

@@ -8,7 +8,6 @@ Convention:
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -187,9 +186,9 @@ def interpolate(series: TimeSeries, stamps_ns: Stamps, *, is_angle: bool = False
     return np.where(known, result, np.nan)
 
 
-def telemetry_at(
+def rows_and_sources_at(
     log: FlightLog, stamps_ns: Sequence[int], names: Sequence[str]
-) -> tuple[list[TelemetryRow], dict[str, int]]:
+) -> tuple[list[TelemetryRow], list[str]]:
     """Interpolate a log at the frames' capture times.
 
     Args:
@@ -198,19 +197,11 @@ def telemetry_at(
         names: (N,) names of the frames.
 
     Returns:
-        One row per frame with its stamp as given, and the number of frames whose height comes from each source.
+        One row per frame with its stamp as given, and the source of each row's height; empty if it is unknown.
 
     Raises:
         TelemetryError: no frame lies within the log, or UTC cannot be converted to the log's clock.
     """
-    rows, sources = rows_and_sources_at(log, stamps_ns, names)
-    return rows, dict(Counter(source for source in sources if source))
-
-
-def rows_and_sources_at(
-    log: FlightLog, stamps_ns: Sequence[int], names: Sequence[str]
-) -> tuple[list[TelemetryRow], list[str]]:
-    """As :func:`telemetry_at`, with the source of each row's height; empty if it is unknown."""
     times_ns = np.asarray(stamps_ns, np.int64) + log.clock_shift_ns(int(stamps_ns[0]))
     start_ns, end_ns = log.span_ns
     if not ((times_ns >= start_ns - END_HOLD_NS) & (times_ns <= end_ns + END_HOLD_NS)).any():
@@ -277,7 +268,7 @@ def truth_from_log(log: FlightLog, *, utc: bool) -> list[Truth]:
     times_ns = log.series["lat_deg"].stamps_ns
     shift_ns = -log.clock_shift_ns(UTC_FROM_NS) if utc else 0
     names = [str(i) for i in range(len(times_ns))]
-    rows, _ = telemetry_at(log, [int(stamp_ns) for stamp_ns in times_ns], names)
+    rows, _ = rows_and_sources_at(log, [int(stamp_ns) for stamp_ns in times_ns], names)
     return [
         truth_from_telemetry(row, row.lat_deg, row.lon_deg, shift_ns)
         for row in rows

@@ -81,25 +81,6 @@ def merged(values: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]
     return out
 
 
-def read_settings(path: Path, cls: type[Options]) -> Options:
-    """Read options from a settings file; missing keys keep their defaults.
-
-    Args:
-        path: the file.
-        cls: dataclass of the options.
-
-    Raises:
-        OptionError: the file is not TOML, a key is unknown, or a value has the wrong type or range; the message
-            names the file, the key and the closest known key.
-        OSError: the file cannot be read.
-    """
-    values = read_values(path)
-    try:
-        return options_from_mapping(cls, values)
-    except OptionError as error:
-        raise OptionError(f"{path}: {error}") from None
-
-
 def changed(options: Any, within: str = "") -> dict[str, Any]:
     """Settings that differ from their defaults, by dotted name ("ncc.errors.map_m")."""
     defaults = type(options)()

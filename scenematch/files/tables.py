@@ -12,7 +12,7 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -112,6 +112,24 @@ class CsvRow:
         return value
 
 
+def cells_of(cls: type[Any], row: CsvRow, bounds: Mapping[str, Bounds] = {}) -> dict[str, Any]:
+    """The cells of a row, each as the field of a dataclass that it fills.
+
+    Args:
+        cls: dataclass of texts and numbers; those that may be None are None if blank.
+        row: has a column for each field.
+        bounds: ranges by column.
+    """
+    readers: dict[str, Callable[[str], Any]] = {
+        "str": row.text,
+        "str | None": lambda name: row.values[name] or None,
+        "int | None": row.integer,
+        "bool | None": lambda name: {"true": True, "false": False}.get(row.values[name]),
+        "float | None": lambda name: row.number(name, bounds.get(name, ANY)),
+    }
+    return {each.name: readers[str(each.type)](each.name) for each in fields(cls)}
+
+
 def quoted(text: str) -> str:
     """Quote a piece of a file for a message: short, on one line."""
     return repr(text) if len(text) <= 40 else repr(text[:40]) + "..."
@@ -124,7 +142,7 @@ def read_table(
     *,
     instead: Mapping[str, Sequence[str]] = {},
     names: Mapping[str, str] = {},
-    advice: Callable[[str, Sequence[str]], str] | None = None,
+    hint: str = "",
 ) -> Iterator[CsvRow]:
     """Read the rows of a CSV file with a header.
 
@@ -134,7 +152,7 @@ def read_table(
         optional: columns that it may contain.
         instead: for a required column, optional ones that can replace it.
         names: the file's column names, if they differ from ours.
-        advice: returns what to add to the message about a missing required column, given the file's columns.
+        hint: what to add to the message about a missing required column.
 
     Yields:
         One :class:`CsvRow` per row that is not blank, with all of ``required`` and ``optional`` as keys.
@@ -148,7 +166,7 @@ def read_table(
         with path.open(encoding="utf-8-sig", newline="") as file:
             delimiter = _delimiter(file)
             reader = csv.reader(file, delimiter=delimiter)
-            columns = _Header(path, _names(reader), names).columns(required, optional, instead, advice)
+            columns = _Header(path, _names(reader), names).columns(required, optional, instead, hint)
             marks = None if delimiter == "," else _Marks(path)
             for row in reader:
                 if any(cell.strip() for cell in row):
@@ -201,7 +219,7 @@ class _Header:
         required: Sequence[str],
         optional: Sequence[str],
         instead: Mapping[str, Sequence[str]],
-        advice: Callable[[str, Sequence[str]], str] | None,
+        hint: str,
     ) -> _Columns:
         """The positions of the columns in a row."""
         if not any(self.found):
@@ -211,11 +229,8 @@ class _Header:
         index = {column: self._place(column) for column in (*required, *optional)}
         for column in required:
             if all(index[name] is None for name in (column, *instead.get(column, ()))):
-                more = advice(column, self.found) if advice is not None else ""
-                raise TelemetryError(
-                    f"{self.path}: line 1: lacks the column {column}{more}; "
-                    f"its columns are {quoted(','.join(self.found))}"
-                )
+                its = f"its columns are {quoted(','.join(self.found))}{hint}"
+                raise TelemetryError(f"{self.path}: line 1: lacks the column {column}; {its}")
         return _Columns(len(self.found), index)
 
     def _place(self, column: str) -> int | None:

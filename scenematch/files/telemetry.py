@@ -15,7 +15,6 @@ from pathlib import Path
 from engine.errors import TelemetryError
 from engine.geo import wrap_heading_deg
 from engine.values import Prior
-from scenematch.files.column_names import advice, question
 from scenematch.files.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
 from scenematch.files.tables import (
     ANY,
@@ -129,6 +128,7 @@ _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(
 _REQUIRED = ("timestamp_ns", "frame")
 COLUMNS = (*STAMP_COLUMNS, "frame", *_BOUNDS)
 """All columns that telemetry.csv may have."""
+_HINT = "; [telemetry_columns] of the settings names those that are ours"
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ def open_telemetry(
         TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
     """
     optional = (*STAMP_COLUMNS[1:], *_BOUNDS)
-    csv_rows = list(read_table(path, _REQUIRED, optional, instead=OTHER_STAMPS, names=names, advice=advice))
+    csv_rows = list(read_table(path, _REQUIRED, optional, instead=OTHER_STAMPS, names=names, hint=_HINT))
     stamps = read_stamps(csv_rows)
     rows: list[TelemetryRow] = []
     line_of_frame: dict[str, int] = {}
@@ -183,9 +183,10 @@ def open_telemetry(
         rows.append(row)
     if not rows:
         raise TelemetryError(f"{path}: expected one row per frame, got a header and no rows")
-    asked = question(read_header(path), names, tuple(_BOUNDS))
-    remarks = [stamps.remark, None if asked is None else f"{Path(path).name}: {asked}"]
-    return Telemetry(rows, [remark for remark in remarks if remark is not None])
+    read = {names.get(ours, ours) for ours in COLUMNS}
+    unread = ", ".join(name for name in read_header(path) if name and name not in read)
+    remarks = [stamps.remark, unread and f"{Path(path).name}: columns that are not read: {unread}{_HINT}"]
+    return Telemetry(rows, [remark for remark in remarks if remark])
 
 
 def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:

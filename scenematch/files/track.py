@@ -12,7 +12,7 @@ from typing import TextIO
 
 from engine.errors import TelemetryError
 from engine.values import Fix, NoFix, Reason
-from scenematch.files.tables import LONGITUDE, NOT_NEGATIVE, QUARTER_TURN, CsvRow, cell_text, read_table
+from scenematch.files.tables import LONGITUDE, NOT_NEGATIVE, QUARTER_TURN, CsvRow, cell_text, cells_of, read_table
 
 __all__ = ["TrackRow", "TrackWriter", "read_track", "track_row", "write_track"]
 
@@ -70,6 +70,9 @@ class TrackRow:
 COLUMNS = tuple(f.name for f in fields(TrackRow))
 """The header of track.csv."""
 _POSITION = ("lat_deg", "lon_deg", "east_m", "north_m", "sigma_east_m", "sigma_north_m", "covariance_en_m2")
+_BOUNDS = {"lat_deg": QUARTER_TURN, "lon_deg": LONGITUDE} | dict.fromkeys(
+    ("sigma_east_m", "sigma_north_m", "latency_ms"), NOT_NEGATIVE
+)
 _DECIMALS = {"lat_deg": 9, "lon_deg": 9, "covariance_en_m2": 6} | dict.fromkeys(
     ("east_m", "north_m", "up_m", "latency_ms"), 3
 )
@@ -177,34 +180,14 @@ def read_track(path: str | Path) -> list[TrackRow]:
 
 
 def _row(csv_row: CsvRow) -> TrackRow:
-    status, reason = csv_row.text("status"), csv_row.values["reason"] or None
+    status, reason = csv_row.text("status"), csv_row.values["reason"]
     if status not in ("fix", "no_fix"):
         raise csv_row.error("status", "fix or no_fix")
-    if reason is not None and reason not in {known.value for known in Reason}:
+    if reason and reason not in {known.value for known in Reason}:
         raise csv_row.error("reason", "a known reason or nothing")
     if csv_row.values["deadline_met"] not in ("", "true", "false"):
         raise csv_row.error("deadline_met", "true, false or nothing")
     for column in _POSITION:
         if status == "fix" and not csv_row.values[column]:
             raise csv_row.error(column, "a number, since the row is a fix")
-    met = {"true": True, "false": False}.get(csv_row.values["deadline_met"])
-    return TrackRow(
-        timestamp_ns=csv_row.integer("timestamp_ns"),
-        frame=csv_row.text("frame"),
-        status=status,
-        reason=reason,
-        lat_deg=csv_row.number("lat_deg", QUARTER_TURN),
-        lon_deg=csv_row.number("lon_deg", LONGITUDE),
-        east_m=csv_row.number("east_m"),
-        north_m=csv_row.number("north_m"),
-        up_m=csv_row.number("up_m"),
-        sigma_east_m=csv_row.number("sigma_east_m", NOT_NEGATIVE),
-        sigma_north_m=csv_row.number("sigma_north_m", NOT_NEGATIVE),
-        covariance_en_m2=csv_row.number("covariance_en_m2"),
-        score=csv_row.number("score"),
-        method=csv_row.values["method"] or None,
-        window_width_px=csv_row.integer("window_width_px"),
-        window_height_px=csv_row.integer("window_height_px"),
-        latency_ms=csv_row.number("latency_ms", NOT_NEGATIVE),
-        deadline_met=met,
-    )
+    return TrackRow(**cells_of(TrackRow, csv_row, _BOUNDS))

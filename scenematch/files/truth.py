@@ -71,27 +71,16 @@ def write_truth(path: str | Path, rows: Sequence[Truth]) -> None:
 
 def truth_from_telemetry(row: TelemetryRow, lat_deg: float, lon_deg: float, shift_ns: int = 0) -> Truth:
     """A row of telemetry as truth, with another position and its stamp shifted by ``shift_ns``."""
-    return Truth(
-        timestamp_ns=row.timestamp_ns + shift_ns,
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
-        alt_amsl_m=row.alt_amsl_m,
-        height_agl_m=row.height_agl_m,
-        roll_deg=row.roll_deg,
-        pitch_deg=row.pitch_deg,
-        heading_deg=row.heading_deg,
-    )
+    rest = {name: getattr(row, name) for name in _OPTIONAL}
+    return Truth(timestamp_ns=row.timestamp_ns + shift_ns, lat_deg=lat_deg, lon_deg=lon_deg, **rest)
 
 
-def interpolate_truth(
-    rows: Sequence[Truth], timestamp_ns: int, max_gap_ns: int = MAX_TRUTH_GAP_NS
-) -> Truth | None:
+def interpolate_truth(rows: Sequence[Truth], timestamp_ns: int) -> Truth | None:
     """Interpolate truth linearly at a time; headings and longitudes along the shorter arc.
 
     Args:
         rows: truth in the order of time.
         timestamp_ns: the time, on the same clock.
-        max_gap_ns: largest interval between two rows that is interpolated.
 
     Returns:
         The truth, with None for values that either neighbour lacks; None outside the rows and in gaps.
@@ -103,7 +92,7 @@ def interpolate_truth(
         return None
     a, b = rows[after - 1], rows[after]
     gap_ns = b.timestamp_ns - a.timestamp_ns
-    if gap_ns > max_gap_ns:
+    if gap_ns > MAX_TRUTH_GAP_NS:
         return None
     fraction = (timestamp_ns - a.timestamp_ns) / gap_ns
     heading_deg = _between_angles(a.heading_deg, b.heading_deg, fraction)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.geo import Array
 from engine.values import Fix, Frame, NoFix
 
-Array = NDArray[np.float64]
 AttitudeRow = tuple[float, float, float, float, float]
 """Time in seconds; roll and pitch of the telemetry; roll and pitch of the fix, NaN where unknown; in degrees."""
 

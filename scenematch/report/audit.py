@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from engine.values import Window
+from engine.window import level_crop
 from scenematch.check.availability import SUITABLE, Audit, Flag, RouteAvailability
-from scenematch.report.figures import DPI, TRUTH
+from scenematch.report.explain import level_within
 
 if TYPE_CHECKING:
     from engine.orthomap import OrthoMap
 
 _MAX_MAP_PX = 1600  # longer side of the map as drawn; more is not visible
 _WIDTH_IN, _MAX_HEIGHT_IN = 9.0, 11.0
-_MAX_MARKS_PX = 7.0
+_DPI, _MAX_MARKS_PX = 130, 7.0
 # Distinct by shape, and by colours under all common colour vision deficiencies (Okabe and Ito).
 _MARKS = {
     Flag.FLAT: ("o", "#56B4E9", "flat, such as water"),
@@ -72,19 +73,14 @@ def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None =
     if ax.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     path = Path(path)
-    figure.savefig(path, dpi=DPI, facecolor="white")
+    figure.savefig(path, dpi=_DPI, facecolor="white")
     return path
 
 
 def _background(site: OrthoMap, part: Window) -> Any:
     """A part of the map in grey at the coarsest sufficient pyramid level; white where it has no data."""
-    level = 0
-    while level + 1 < site.levels and max(part.width_px, part.height_px) >> level > _MAX_MAP_PX:
-        level += 1
-    rows, columns = site.level_shape(level)
-    x0, y0 = min(part.x0 >> level, columns - 1), min(part.y0 >> level, rows - 1)
-    width, height = max(1, part.width_px >> level), max(1, part.height_px >> level)
-    shown = Window(x0, y0, min(width, columns - x0), min(height, rows - y0))
+    level = level_within(site, max(part.width_px, part.height_px), _MAX_MAP_PX)
+    shown = level_crop(site, part, level)
     gray = site.gray(shown, level)
     gray[~site.valid(shown, level)] = 255
     return gray
@@ -110,7 +106,7 @@ def _draw_marks(ax: Any, audit: Audit) -> None:
 def _draw_route(ax: Any, route: RouteAvailability, scale: float) -> None:
     x, y = (route.xy_px + 0.5).T * scale
     ax.plot(x, y, color="white", linewidth=3.4, alpha=0.9, zorder=4)
-    ax.plot(x, y, color=TRUTH, linewidth=1.4, label="route", zorder=5)
+    ax.plot(x, y, color="#1a1a1a", linewidth=1.4, label="route", zorder=5)
     if route.stretches:
         poor = np.where(route.probability < SUITABLE, y, np.nan)
         ax.plot(x, poor, color="#D55E00", linewidth=4.0, label="poor stretch", zorder=6, solid_capstyle="round")

@@ -10,7 +10,8 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from engine.geo import Array
+
 Limits = tuple[float, float]
 
 WIDTH, HEIGHT = 720.0, 236.0

@@ -13,13 +13,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from engine.geo import LocalFrame
+from engine.geo import Array, LocalFrame
 from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
-
-Array = NDArray[np.float64]
 
 MAX_STEP_S = 5.0
 """Longest step that counts; in longer ones the velocity's own error dominates."""

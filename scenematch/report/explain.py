@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import EngineError
+from engine.geo import Array
 from engine.matching.explanation import Explanation, PointMatches, ScoreSurface
 from engine.matching.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
@@ -22,7 +23,6 @@ from scenematch.files.notes import FrameNote
 from scenematch.files.track import TrackRow
 from scenematch.report.metrics import TrackErrors
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 MAX_FRAMES = 60
@@ -64,27 +64,25 @@ class SliderFrame:
     images: list[SliderImage]
 
 
-def choose_frames(rows: Sequence[TrackRow], errors: TrackErrors, max_frames: int = MAX_FRAMES) -> list[int]:
+def choose_frames(rows: Sequence[TrackRow], errors: TrackErrors) -> list[int]:
     """Select the frames to show: fixes beyond three sigmas first, then refusals, then evenly spaced others.
 
     Args:
         rows: the track.
         errors: of the track.
-        max_frames: upper bound of their number.
 
     Returns:
         Indices of rows, ascending.
     """
-    if len(rows) <= max_frames:
+    if len(rows) <= MAX_FRAMES:
         return list(range(len(rows)))
-    remarkable = max_frames * _MAX_REMARKABLE // MAX_FRAMES
     refused, beyond = np.array([not row.fixed for row in rows]), errors.beyond
     chosen: list[int] = []
     for kind, limit in (
-        (beyond, remarkable),
-        (refused, remarkable),
-        (~refused & ~beyond, max_frames),
-        (refused | beyond, max_frames),
+        (beyond, _MAX_REMARKABLE),
+        (refused, _MAX_REMARKABLE),
+        (~refused & ~beyond, MAX_FRAMES),
+        (refused | beyond, MAX_FRAMES),
     ):
         left = np.setdiff1d(np.flatnonzero(kind), chosen)
         chosen += _evenly_spaced(left, limit - len(chosen))
@@ -125,6 +123,21 @@ def explain_frames(
     return [SliderFrame(i, drawer.images(i, flight.read(i), rows[i], notes[i])) for i in chosen]
 
 
+def jpeg_bytes(image: Image, quality: int) -> bytes:
+    """An image (H, W) grey or (H, W, 3) RGB as JPEG."""
+    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    data: bytes = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    return data
+
+
+def resized(image: Image, side_px: int) -> Image:
+    """Resize an image so that its longer side is ``side_px``."""
+    scale = side_px / max(image.shape[:2])
+    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+    interpolation = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
+
+
 def jpeg_data_uri(image: Image, max_bytes: int = _MAX_BYTES) -> str:
     """Encode an image as a data URI, with the highest JPEG quality that fits ``max_bytes``.
 
@@ -132,9 +145,8 @@ def jpeg_data_uri(image: Image, max_bytes: int = _MAX_BYTES) -> str:
         image: (H, W) grey or (H, W, 3) RGB, uint8.
         max_bytes: upper bound of the JPEG, unless the lowest quality exceeds it.
     """
-    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     for quality in _QUALITIES:
-        data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        data = jpeg_bytes(image, quality)
         if len(data) <= max_bytes:
             break
     return "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
@@ -232,6 +244,14 @@ def _as_matched(frame: Frame, row: TrackRow, note: FrameNote, site: OrthoMap) ->
     )
 
 
+def level_within(site: OrthoMap, longest_px: int, most_px: int) -> int:
+    """The finest pyramid level on which a side of the map has at most so many pixels, or the coarsest there is."""
+    level = 0
+    while longest_px >> level > most_px and level + 1 < site.levels:
+        level += 1
+    return level
+
+
 def draw_window(site: OrthoMap, window: Window) -> tuple[Image, float]:
     """Draw a window of the map.
 
@@ -265,10 +285,7 @@ def _mark(xy_px: Array, name: str) -> str:
 
 def _slider_image(image: Image, caption: str, alt: str) -> SliderImage:
     """Encode an image, reduced to the size that is shown."""
-    scale = min(1.0, SIDE_PX / max(image.shape[:2]))
-    if scale < 1.0:
-        size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    image = resized(image, min(SIDE_PX, max(image.shape[:2])))
     return SliderImage(jpeg_data_uri(image), image.shape[1], image.shape[0], caption, alt)
 
 

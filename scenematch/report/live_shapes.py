@@ -10,11 +10,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from engine.geo import Array
 from engine.orthomap import OrthoMap
 from engine.values import Window
-from scenematch.report.explain import SIDE_PX
+from scenematch.report.explain import SIDE_PX, jpeg_bytes, level_within
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 SIGMAS = 3.0
@@ -65,9 +65,7 @@ def blueprint(site: OrthoMap) -> Any:
 
 def map_mesh(site: OrthoMap) -> Any:
     """The map as a textured mesh on its ground, in metres east, north and up."""
-    level = 0
-    while max(site.level_shape(level)) > _MAX_MAP_PX and level + 1 < site.levels:
-        level += 1
+    level = level_within(site, max(site.level_shape(0)), _MAX_MAP_PX)
     rows, columns = site.level_shape(level)
     gray = site.gray(Window(0, 0, columns, rows), level)
     u, v = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(0.0, 1.0, _MESH_SIDE)]))
@@ -121,17 +119,7 @@ def closed_polyline(points: Array) -> Array:
 
 def jpeg(image: Image) -> Any:
     """An image (H, W) grey or (H, W, 3) RGB as JPEG."""
-    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
-    return rr.EncodedImage(contents=data, media_type="image/jpeg")
-
-
-def resized(image: Image, side_px: int) -> Image:
-    """Resize an image so that its longer side is ``side_px``."""
-    scale = side_px / max(image.shape[:2])
-    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    interpolation = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
-    return np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
+    return rr.EncodedImage(contents=jpeg_bytes(image, 80), media_type="image/jpeg")
 
 
 def padded(image: Image, width_px: int = SIDE_PX) -> Image:

@@ -18,6 +18,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from engine.errors import BackendError
+from engine.geo import Array
 from engine.matching.explanation import Explanation
 from engine.matching.matcher import SceneMatcher
 from engine.navigation.live import Answer
@@ -33,6 +34,7 @@ from scenematch.report.explain import (
     draw_surface,
     draw_window,
     match_again,
+    resized,
     stretch_contrast,
     window_pixels,
 )
@@ -46,10 +48,8 @@ from scenematch.report.live_shapes import (
     map_mesh,
     outline,
     padded,
-    resized,
 )
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 PICTURES = ("rectified", "window", "window/found", "window/fix", "surface", "surface/peak", "matches")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scenematch.files.track import TrackRow
 from scenematch.report.charts import ChartArea, line
@@ -14,8 +13,6 @@ from scenematch.report.page_charts import Chart
 from scenematch.report.page_map import TrackMap, connected
 from scenematch.report.plot_data import TrackPlotData
 from scenematch.report.verdict import metres
-
-Array = NDArray[np.float64]
 
 LOOP_LEGEND = [
     ("plan", '<path d="M0 7h22" class="line plan"/>'),

@@ -15,12 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.geo import LocalFrame
+from engine.geo import Array, LocalFrame
 from engine.values import Truth
 from scenematch.files.track import TrackRow
 from scenematch.files.truth import interpolate_truth
-
-Array = NDArray[np.float64]
 
 WRONG_M = 10.0
 """A fix with a larger error is wrong, whatever its stated sigma."""

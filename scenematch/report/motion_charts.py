@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from engine.geo import Array
 from engine.values import Truth
 from scenematch.files.notes import FrameNote
 from scenematch.files.telemetry import TelemetryRow
@@ -15,8 +15,6 @@ from scenematch.report.charts import ChartArea, Limits
 from scenematch.report.metrics import truth_per_row
 from scenematch.report.page_charts import Chart, column
 from scenematch.report.plot_data import TrackPlotData
-
-Array = NDArray[np.float64]
 
 _ANGLES = {"roll_deg": "Roll", "pitch_deg": "Pitch", "heading_deg": "Heading"}
 _AXES = ("east", "north")

@@ -16,7 +16,7 @@ from scenematch.report.page_charts import draw_charts
 from scenematch.report.page_frames import draw_slider, frame_data
 from scenematch.report.page_map import TrackMap, draw_map, map_of_tracks, track_marks
 from scenematch.report.page_parts import CROSS, charts_with_axis, fill_page, map_with_legend, section
-from scenematch.report.page_tables import draw_inputs, draw_refusals, draw_segments, draw_tiles, median_sigma_m
+from scenematch.report.page_tables import draw_inputs, draw_refusals, draw_segments, draw_tiles
 from scenematch.report.plot_data import TrackPlotData
 from scenematch.report.verdict import verdict_of
 
@@ -34,7 +34,7 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
     """
     plot_data, settings = track.plot_data(), track.summary["settings"]
     track_map = map_of_tracks(track.site, [plot_data], _view_px(track))
-    verdict = verdict_of(track.summary, median_sigma_m(track.rows), settings.get("budget_ms"))
+    verdict = verdict_of(track.summary)
     sentences = [verdict.accuracy, *([loop_sentence(track.loop)] if track.loop else []), verdict.latency]
     segments = draw_segments(track.summary)
     body = [

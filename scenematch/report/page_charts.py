@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from engine.geo import Array
 from scenematch.files.notes import FrameNote
 from scenematch.files.track import TrackRow
 from scenematch.report.charts import ChartArea, Limits, dots
 from scenematch.report.metrics import FALSE_SIGMAS
 from scenematch.report.plot_data import TrackPlotData, larger_variance_m2
 
-Array = NDArray[np.float64]
 Chart = tuple[str, str]
 """Caption and SVG."""
 

@@ -10,14 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.geo import Array
 from engine.orthomap import OrthoMap
 from engine.values import Window
 from engine.window import level_crop
 from scenematch.report.charts import crosses, dots, line, ticks
-from scenematch.report.explain import jpeg_data_uri
+from scenematch.report.explain import jpeg_data_uri, level_within
 from scenematch.report.plot_data import TrackPlotData
-
-Array = NDArray[np.float64]
 
 _MAX_MAP_PX = 1500  # longer side as drawn
 _MAP_BYTES = 900_000
@@ -89,9 +88,7 @@ def map_of_tracks(site: OrthoMap, tracks: Sequence[TrackPlotData], view_px: floa
         high = low + span
     x0, y0 = (int(v) for v in low)
     width, height = (int(v) for v in np.ceil(high) - [x0, y0])
-    level = 0
-    while max(width, height) >> level > _MAX_MAP_PX and level + 1 < site.levels:
-        level += 1
+    level = level_within(site, max(width, height), _MAX_MAP_PX)
     return TrackMap(site, Window(x0, y0, width, height), level)
 
 

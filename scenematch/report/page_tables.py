@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 
 from engine.values import Reason
-from scenematch.files.track import TrackRow
 from scenematch.report.explain import SliderFrame
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.page_parts import table
@@ -25,16 +24,6 @@ _FACTS = {
     "log_offset_s": "log offset (s)", "truth": "truth", "method": "method", "profile": "profile",
     "device": "device", "start": "start", "budget_ms": "budget (ms)",
 }  # fmt: skip
-
-
-def median_sigma_m(rows: Sequence[TrackRow]) -> float | None:
-    """Median over fixes of the larger stated sigma, in metres; None without fixes."""
-    sigmas = [
-        max(row.sigma_east_m, row.sigma_north_m)
-        for row in rows
-        if row.sigma_east_m is not None and row.sigma_north_m is not None
-    ]
-    return float(np.median(sigmas)) if sigmas else None
 
 
 def draw_tiles(track: FinishedTrack) -> list[tuple[str, str]]:
@@ -54,10 +43,9 @@ def draw_tiles(track: FinishedTrack) -> list[tuple[str, str]]:
                 ("within 1 stated sigma; 39.3 % if consistent", f"{summary['within_1_sigma']:.1%}"),
                 ("NEES: 2 is consistent, less cautious, more overconfident", f"{summary['nees_mean']:.2f}"),
             ]
-    elif (sigma_m := median_sigma_m(track.rows)) is not None:
+    elif (sigma_m := summary["stated_sigma_median_m"]) is not None:
         tiles.append(("stated by the fixes, not measured: median sigma", metres(sigma_m)))
-        if (p95_m := summary.get("stated_sigma_p95_m")) is not None:
-            tiles.append(("stated, not measured: 95 % of the sigmas below", metres(p95_m)))
+        tiles.append(("stated, not measured: 95 % of the sigmas below", metres(summary["stated_sigma_p95_m"])))
         if (motion := summary.get("motion_consistency")) is not None:
             every = f"{motion['steps']} steps of {motion['interval_s']:.2g} s"
             tiles += [

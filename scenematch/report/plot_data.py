@@ -8,12 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.geo import LocalFrame
+from engine.geo import Array, LocalFrame
 from engine.values import Truth
 from scenematch.files.track import TrackRow
 from scenematch.report.metrics import Ground, TrackErrors, errors_en_m, height_pairs_m
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.geo import Array
 from scenematch.report.charts import ChartArea, Limits, dots, line
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.metrics import FALSE_SIGMAS
 from scenematch.report.page_charts import Chart, column
 from scenematch.report.page_map import connected, draw_map, map_of_tracks
 from scenematch.report.page_parts import charts_with_axis, fill_page, map_with_legend, section, table
-from scenematch.report.page_tables import median_sigma_m
 from scenematch.report.plot_data import TrackPlotData, larger_variance_m2
 from scenematch.report.verdict import metres, verdict_of
-
-Array = NDArray[np.float64]
 
 MAX_RUNS = 6
 """The number of distinguishable colours."""
@@ -43,10 +40,7 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
     data = {name: track.plot_data() for name, track in tracks.items()}
     first = next(iter(tracks.values()))
     track_map = map_of_tracks(first.site, list(data.values()))
-    verdicts = {
-        name: verdict_of(track.summary, median_sigma_m(track.rows), track.summary["settings"].get("budget_ms"))
-        for name, track in tracks.items()
-    }
+    verdicts = {name: verdict_of(track.summary) for name, track in tracks.items()}
     truth = next((d.errors.truth_en_m for d in data.values() if np.isfinite(d.errors.truth_en_m).any()), None)
     true_path = np.empty((0, 2)) if truth is None else connected(track_map, truth)
     marks = [line(true_path, "halo"), *_run_marks(data, track_map), line(true_path, "truth")]
@@ -73,26 +67,18 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
 
 def _figures(tracks: Mapping[str, FinishedTrack]) -> str:
     """The table of figures of merit, one row per run."""
-    head = ("run", "method", "fixed", "median", "95 % below", "largest", "within 3 sigma", "NEES", "latency 95 %")
-
-    def cells(name: str, track: FinishedTrack) -> tuple[str, ...]:
-        summary = track.summary
-
-        def shown(key: str, form: Any) -> str:
-            return "-" if summary.get(key) is None else str(form(summary[key]))
-
-        p95_ms = summary["latency_ms"]["p95"]
-        return (
-            name,
-            track.method,
-            shown("availability", "{:.1%}".format),
-            *(shown(key, metres) for key in ("median_m", "r95_m", "max_m")),
-            shown("within_3_sigma", "{:.1%}".format),
-            shown("nees_mean", "{:.2f}".format),
-            "-" if p95_ms is None else f"{p95_ms:.1f} ms",
-        )
-
-    return table(head, [cells(name, track) for name, track in tracks.items()])
+    share = "{:.1%}".format
+    columns: dict[str, tuple[str, Callable[[float], str]]] = {
+        "fixed": ("availability", share), "median": ("median_m", metres), "95 % below": ("r95_m", metres),
+        "largest": ("max_m", metres), "within 3 sigma": ("within_3_sigma", share),
+        "NEES": ("nees_mean", "{:.2f}".format), "latency 95 %": ("p95", "{:.1f} ms".format),
+    }  # fmt: skip
+    rows = []
+    for name, track in tracks.items():
+        found = {**track.summary, **track.summary["latency_ms"]}
+        shown = ("-" if found.get(key) is None else form(found[key]) for key, form in columns.values())
+        rows.append((name, track.method, *shown))
+    return table(("run", "method", *columns), rows)
 
 
 def _run_marks(data: Mapping[str, TrackPlotData], track_map: Any) -> list[str]:
@@ -118,31 +104,32 @@ def _run_legend(tracks: Mapping[str, FinishedTrack]) -> list[tuple[str, str]]:
 
 
 def _charts(tracks: Mapping[str, FinishedTrack], data: Mapping[str, TrackPlotData]) -> list[Chart]:
-    """Error, error in sigmas, and latency over time, and the share of frames by error; those with data.
+    """Error, error in sigmas, and latency over time, and the share of frames by error and latency.
 
     Charts over time are left out if only some runs have timestamps.
     """
+    errors_m = [d.errors.distance_m for d in data.values()]
+    latencies_ms = [column(track.rows, "latency_ms") for track in tracks.values()]
+    shares = [_share_within("error", "m", errors_m), _share_within("latency", "ms", latencies_ms)]
     ends = [float(d.time[-1]) for d in data.values() if d.time.size]
     labels = {d.time_label for d in data.values() if d.time.size}
     if len(labels) > 1:  # seconds and frame numbers have no common axis
-        found = _cumulative([d.errors.distance_m for d in data.values()])
-        return [] if found is None else [found]
+        return [chart for chart in shares if chart is not None]
     if not ends or not max(ends):
         return []
     time: Limits = (0.0, max(ends))
     series = {
-        "Horizontal error (m)": [d.errors.distance_m for d in data.values()],
+        "Horizontal error (m)": errors_m,
         f"Horizontal error, in stated sigmas; {FALSE_SIGMAS:g} is the limit": [
             np.sqrt(d.errors.normalised_squared_errors) for d in data.values()
         ],
         "Stated sigma (m)": [np.sqrt(larger_variance_m2(d.errors.covariance_en_m2)) for d in data.values()],
-        "Latency (ms)": [column(track.rows, "latency_ms") for track in tracks.values()],
+        "Latency (ms)": latencies_ms,
     }
     (label,) = labels
     times = [d.time for d in data.values()]
     charts = [_over_time(what, label, time, times, values) for what, values in series.items()]
-    charts.append(_cumulative(next(iter(series.values()))))
-    return [chart for chart in charts if chart is not None]
+    return [chart for chart in charts + shares if chart is not None]
 
 
 def _over_time(
@@ -160,19 +147,23 @@ def _over_time(
     return what, area.svg(f"{what} over time", label, marks, timed=True)
 
 
-def _cumulative(errors_m: Sequence[Array]) -> Chart | None:
-    """Share of all frames, including refused ones, answered within a given error."""
-    known = np.concatenate(errors_m)
+def _share_within(name: str, unit: str, values: Sequence[Array]) -> Chart | None:
+    """Share of all frames, including refused ones, that were answered within a given error or latency.
+
+    A curve ends at the share that was answered: a method that answers few frames accurately ends low, one that
+    answers inaccurately rises late.
+    """
+    known = np.concatenate(values)
     known = known[np.isfinite(known)]
     if not known.size:
         return None
     top = 1.2 * float(np.percentile(known, 99))
     area = ChartArea((0.0, top), (0.0, 1.02))
     marks = []
-    for i, errors in enumerate(errors_m):
-        order = np.sort(errors[np.isfinite(errors) & (errors <= top)])
+    for i, series in enumerate(values):
+        order = np.sort(series[np.isfinite(series) & (series <= top)])
         x = np.concatenate([[0.0], np.repeat(order, 2), [top]])
-        y = np.concatenate([[0.0], np.repeat(np.arange(order.size + 1), 2)[1:]]) / max(1, errors.size)
+        y = np.concatenate([[0.0], np.repeat(np.arange(order.size + 1), 2)[1:]]) / max(1, series.size)
         marks.append(f'<g class="run{i}">{area.line(x, y, f"r{i}")}</g>')
-    what = "Share of all frames within an error"
-    return what, area.svg(what, "horizontal error (m)", marks, timed=False)
+    what = f"Share of all frames by {name}"
+    return what, area.svg(what, f"{name} ({unit})", marks, timed=False)

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.geo import Array
 from scenematch.files.track import TrackRow
 from scenematch.report.metrics import TrackErrors
-
-Array = NDArray[np.float64]
 
 LENGTHS_M = (10.0, 50.0, 100.0, 500.0, 1000.0)
 DURATIONS_S = (1.0, 10.0, 30.0, 60.0, 300.0)

@@ -48,21 +48,19 @@ class Verdict:
     latency: str
 
 
-def verdict_of(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float | None) -> Verdict:
+def verdict_of(summary: Mapping[str, Any]) -> Verdict:
     """The verdict on a track, preceded by the diagnosis of the inputs, if there was one.
 
     Args:
-        summary: figures of merit by :func:`scenematch.report.metrics.summarise`.
-        sigma_m: median of the sigmas that the fixes state, or None without fixes.
-        budget_ms: latency budget of each frame, or None.
+        summary: figures of merit by :func:`scenematch.report.metrics.summarise`, and the run's settings.
     """
-    verdict = _judged(summary, sigma_m, budget_ms)
-    found = summary.get("settings", {}).get("diagnosis") or {}
+    settings = summary.get("settings", {})
+    verdict, found = _judged(summary, settings.get("budget_ms")), settings.get("diagnosis") or {}
     said = [f"{sentence[:1].upper()}{sentence[1:]}." for sentence in found.values()]
     return replace(verdict, accuracy=" ".join([*said, verdict.accuracy]))
 
 
-def _judged(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float | None) -> Verdict:
+def _judged(summary: Mapping[str, Any], budget_ms: float | None) -> Verdict:
     """The verdict from the figures of merit alone."""
     frames, fixes = summary["frames"], summary["fixes"]
     fixed = f"{fixes} of {frames} frames fixed"
@@ -73,6 +71,7 @@ def _judged(summary: Mapping[str, Any], sigma_m: float | None, budget_ms: float 
         text = f"None of {frames} frames fixed; most were refused as {_main_reason(summary)}."
         return Verdict("bad", text, late)
     if not summary.get("scored_fixes"):
+        sigma_m = summary["stated_sigma_median_m"]
         stated = "" if sigma_m is None else f"; half of them state a sigma below {metres(sigma_m)}"
         text = f"{fixed}{stated}. Without truth their accuracy is unknown, and whether the map is where it says."
         return Verdict("open", text, late)

@@ -17,11 +17,10 @@ from engine.matching import CLASSICAL
 from engine.matching.matcher import SceneMatcher
 from engine.navigation.state import NavigatorState
 from engine.orthomap import OrthoMap
-from engine.values import Frame, Prior, Truth
-from scenematch.files.flight import write_flight_folder
+from engine.values import Frame, Truth
 from scenematch.files.notes import frame_note, write_notes
 from scenematch.files.track import track_row, write_track
-from scenematch.report.closed_loop import summarise_loop, write_loop_csv
+from scenematch.report.loop_record import summarise_loop, write_loop_csv
 from scenematch.runs.arguments import check_choice, check_device
 from scenematch.runs.evaluation import redraw
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder
@@ -30,15 +29,15 @@ from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.record import RunRecord
 from scenematch.runs.results import LOOP, NOTES, SUMMARY, TRACK
-from scenematch.runs.simulation import FOLDER_OWNED, LOOP_OWNED, START_SIGMA_M, WorldSettings
+from scenematch.runs.simulation import FOLDER_OWNED, LOOP_OWNED, WorldSettings, write_folder
 from scenematch.simulator import FlightStyle, Town, picture_at
 from scenematch.simulator.faults import FAULT_KINDS, Fault
-from scenematch.simulator.flight import NADIR_PITCH_DEG, grid_at
+from scenematch.simulator.flight import NADIR_PITCH_DEG, truth_at
 from scenematch.simulator.light import Image
 from scenematch.simulator.loop import ClosedLoop
 from scenematch.simulator.pilot import plan_rounds
 from scenematch.simulator.quadrotor import State
-from scenematch.simulator.town import EXACT, generator
+from scenematch.simulator.town import generator
 from scenematch.simulator.vehicle import START_NS
 
 if TYPE_CHECKING:  # rerun is optional
@@ -191,37 +190,15 @@ def _write_folder(
     """Fly, and write the folder meanwhile: pictures, telemetry from the filter, truth, camera and map."""
     start = flight.flown.start_m
     lat, lon = site.frame.geodetic_from_enu(start[0], start[1])
-    write_flight_folder(
-        out,
-        frames=((_name(k), frame) for k, frame in enumerate(frames)),
-        truth=_truth_rows(flight, town, site),
-        camera=camera,
-        ortho_rgb=town.ortho,
-        pixel_to_crs=town.pixel_to_crs,
-        crs_epsg=town.crs_epsg,
-        surface_m=town.surface_m,
-        start=Prior(lat_deg=float(lat), lon_deg=float(lon), sigma_m=START_SIGMA_M),
-        georeference_sigma_m=EXACT,
-        slope_sigma_deg=EXACT,
-    )
+    named = ((_name(k), frame) for k, frame in enumerate(frames))
+    write_folder(out, town, camera, named, _truth_rows(flight, town, site), float(lat), float(lon))
 
 
 def _truth_rows(flight: ClosedLoop, town: Town, site: OrthoMap) -> Iterator[Truth]:
     """The true positions, ten per second; available after the flight."""
     for row in flight.flown.record:
-        east, north, up = (float(v) for v in row.truth.position_m)
-        lat, lon = site.frame.geodetic_from_enu(east, north)
-        attitude = row.truth.attitude
-        yield Truth(
-            timestamp_ns=START_NS + round(row.time_s * 1e9),
-            lat_deg=float(lat),
-            lon_deg=float(lon),
-            alt_amsl_m=town.datum_amsl_m + up,
-            height_agl_m=up - town.world.ground_at(grid_at(town, site.frame, row.truth.position_m)),
-            roll_deg=attitude.roll_deg,
-            pitch_deg=attitude.pitch_deg,
-            heading_deg=attitude.heading_deg,
-        )
+        stamp_ns = START_NS + round(row.time_s * 1e9)
+        yield truth_at(town, site.frame, stamp_ns, row.truth.position_m, row.truth.attitude)
 
 
 def _record(

@@ -1,4 +1,4 @@
-"""Compare methods, profiles or settings on one flight: a folder for each run, one table and one chart."""
+"""Compare methods, profiles or settings on one flight: a folder for each run, one table and one page."""
 
 from __future__ import annotations
 
@@ -7,21 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from engine.errors import OptionError, require
+from engine.errors import OptionError
 from engine.matching import METHODS
-from scenematch.files.logs.readers import open_truth
-from scenematch.files.track import read_track
-from scenematch.report.comparison import draw_comparison
 from scenematch.report.runs_page import MAX_RUNS
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder
 from scenematch.runs.inputs import FlightFiles, open_inputs
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.reporting import COMPARISON, draw_together
-from scenematch.runs.results import TRACK
 from scenematch.runs.settings import TrackSettings, load_settings
 from scenematch.runs.tracking import track
 
-TABLE, CHART = "table.json", "comparison.png"
+TABLE = "table.json"
 DEFAULT_RUNS = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")
 """The default runs: the paper's Table I."""
 
@@ -86,27 +82,18 @@ def compare(
 
     Returns:
         The summaries by name, which ``table.json`` holds too.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed; it draws the chart.
     """
-    require("matplotlib", "desk")
     out, runs = Path(out), parse_runs() if runs is None else runs
     check_folder(out, force)
     for name in runs:
         check_folder(out / name, force)
     inputs = open_inputs(files, list(runs.values()), progress=progress)
-    prepare_folder(out, force, (TABLE, CHART, COMPARISON))
+    prepare_folder(out, force, (TABLE, COMPARISON))
     results = {
         name: track(files, out / name, settings, force=force, inputs=inputs, diagnosis=False, progress=progress)
         for name, settings in runs.items()
     }
     (out / TABLE).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
-    tracks = {name: read_track(out / name / TRACK) for name in runs}
-    path = files.find_truth()
-    first = next(iter(tracks.values()))
-    truth = open_truth(path, first[0].timestamp_ns if first else None) if path is not None else None
-    draw_comparison(out / CHART, tracks, truth)
-    if 2 <= len(runs) <= MAX_RUNS:
+    if len(runs) <= MAX_RUNS:  # the page has no colours for more
         draw_together(out / COMPARISON, {name: out / name for name in runs}, progress=progress)
     return results

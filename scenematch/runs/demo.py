@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from engine.errors import require
 from scenematch.runs.arguments import check_device
-from scenematch.runs.comparison import CHART, TABLE, compare, parse_runs
+from scenematch.runs.comparison import TABLE, compare, parse_runs
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.simulation import write_flight
@@ -15,7 +14,7 @@ from scenematch.simulator import plan_flight
 
 PAPER_TABLE = {"ncc": (2.4, 40.0), "sift": (2.1, 121.0)}
 """Table I of the paper: RMS error in metres and execution time in milliseconds."""
-OWNED = (TABLE, CHART, "flight/frames/[0-9]*.jpg")
+OWNED = (TABLE, "flight/frames/[0-9]*.jpg")
 
 
 def run_demo(
@@ -39,11 +38,7 @@ def run_demo(
 
     Returns:
         The summaries by the name of their run, such as "ncc-paper".
-
-    Raises:
-        MissingExtraError: matplotlib is not installed; it draws the chart.
     """
-    require("matplotlib", "desk")
     out = Path(out)
     check_device(device)
     check_folder(out, force)

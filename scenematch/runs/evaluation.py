@@ -14,6 +14,7 @@ from scenematch.files.settings import nested, options_from_mapping
 from scenematch.files.track import TrackRow, read_track
 from scenematch.report.metrics import Ground
 from scenematch.report.page_frames import shows_frames
+from scenematch.runs.cameras import CameraInput
 from scenematch.runs.folders import StrPath
 from scenematch.runs.inputs import FlightFiles, open_run_truth
 from scenematch.runs.map_input import MapInput
@@ -113,23 +114,7 @@ def recorded_files(record: RunRecord) -> FlightFiles:
     """
     if record.frames is None:
         raise TelemetryError("the record of the run lacks its frames")
-    return FlightFiles.from_flat(
-        map=record.map,
-        surface=record.surface,
-        camera=record.camera,
-        frames=record.frames,
-        telemetry=record.telemetry,
-        frame_stamps=record.frame_stamps,
-        log_offset_s=record.log_offset_s or 0.0,
-        image_topic=record.image_topic,
-        odometry_topic=record.odometry_topic,
-        every=record.every or 1,
-        map_sigma_m=record.map_sigma_m,
-        map_bounds=record.map_bounds,
-        map_crs=record.map_crs,
-        hfov_deg=record.hfov_deg,
-        mount=record.mount,
-        camera_pitch_deg=record.camera_pitch_deg,
-        scale_calibration=record.scale_calibration,
-        corrections=Corrections.from_facts(record.corrections),
-    )
+    names = {each.name for kind in (MapInput, CameraInput, FlightFiles) for each in fields(kind)} - {"truth"}
+    values = {name: getattr(record, name) for name in names & {each.name for each in fields(RunRecord)}}
+    unset = {"log_offset_s": record.log_offset_s or 0.0, "every": record.every or 1}
+    return FlightFiles.from_flat(**values | unset | {"corrections": Corrections.from_facts(record.corrections)})

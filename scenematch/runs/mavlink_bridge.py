@@ -20,14 +20,14 @@ from engine.orthomap import OrthoMap
 from engine.runtime.garbage import no_collection
 from engine.runtime.realtime import Realtime, check_realtime, set_realtime
 from engine.values import Prior
-from scenematch.bridges.delay_memory import remember_delay
 from scenematch.bridges.links import parse_connection
+from scenematch.bridges.parameters import MAX_DELAY_MS
 from scenematch.bridges.pictures import CapturedImage
 from scenematch.bridges.vehicle import NedOrigin
 from scenematch.runs.arguments import check_choice, check_device, check_unused, parse_position
 from scenematch.runs.bridge_files import BridgeFiles
 from scenematch.runs.checks import check_position
-from scenematch.runs.last_fix import LastFix, last_fix_file
+from scenematch.runs.last_fix import LastFix, last_fix_file, remember_delay
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
@@ -234,7 +234,7 @@ def run_mavlink_bridge(
     with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
-                connection, make_navigator, outgoing, start, settings.live_options(outgoing.max_age_ms),
+                connection, make_navigator, outgoing, start, settings.live_options(MAX_DELAY_MS),
                 origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
                 check_gnss=link.check_gnss, resumed=resumed is not None, system_id=link.system_id,
                 component_id=link.component_id, key=key, watch=watcher, on_sent=last_fix.keep,

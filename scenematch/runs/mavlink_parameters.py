@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import require
-from scenematch.bridges.delay_memory import measured_delay_ms
 from scenematch.bridges.parameters import ParameterOptions, parameter_file
 from scenematch.runs.folders import StrPath, check_file
+from scenematch.runs.last_fix import measured_delay_ms
 from scenematch.runs.mavlink_bridge import MavlinkSettings
 
 _DEFAULT_DELAY_MS = 100

@@ -14,12 +14,6 @@ from scenematch.files.corrections import Corrections
 
 PATHS = ("map", "surface", "camera", "frames", "telemetry", "truth", "frame_stamps")
 """The files of a record."""
-_TEXTS = ("map", "method", "profile")
-_TEXTS_OR_NONE = (
-    "surface", "camera", "frames", "telemetry", "truth", "frame_stamps", "image_topic", "odometry_topic",
-    "device", "start", "map_bounds", "map_crs", "mount", "surface_datum",
-)  # fmt: skip
-_NUMBERS_OR_NONE = ("log_offset_s", "map_sigma_m", "hfov_deg", "camera_pitch_deg", "budget_ms", "ground_amsl_m")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,25 +94,12 @@ class RunRecord:
     more: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._check(_TEXTS, "a text", _is_text)
-        self._check(_TEXTS_OR_NONE, "a text or null", lambda value: value is None or _is_text(value))
-        self._check(("ground_m",), "a number", _is_number)
-        self._check(_NUMBERS_OR_NONE, "a number or null", lambda value: value is None or _is_number(value))
-        self._check(("every",), "a whole number above 0, or null", _is_count_or_none)
-        self._check(("origin",), "lat_deg and lon_deg on the Earth", _is_place)
-        self._check(("heights",), "counts by source", lambda value: _is_table(value, int))
-        self._check(("changed",), "settings by name", lambda value: _is_table(value, object))
-        self._check(("attitude",), "a table or null", lambda value: value is None or _is_table(value, object))
-        self._check(("diagnosis",), "sentences or null", lambda value: value is None or _is_table(value, str))
-
-        self._check(("scale_calibration",), "true or false", lambda value: isinstance(value, bool))
-        self._check(("corrections",), "corrections of the telemetry or null", _are_corrections)
-
-    def _check(self, names: tuple[str, ...], expected: str, holds: Callable[[object], bool]) -> None:
-        for name in names:
-            value = getattr(self, name)
-            if not holds(value):
-                raise TelemetryError(f"{name}: expected {expected}, got {_shown(value)}")
+        for each in fields(self):
+            value, (kind, _, none) = getattr(self, each.name), str(each.type).partition(" | ")
+            expected, holds = _TABLES.get(each.name) or _KINDS[kind]
+            if not (holds(value) or (none and value is None)):
+                or_null = " or null" if none else ""
+                raise TelemetryError(f"{each.name}: expected {expected}{or_null}, got {_shown(value)}")
 
     def facts(self) -> dict[str, Any]:
         """The record as JSON values."""
@@ -148,8 +129,6 @@ def read_record(path: Path) -> RunRecord:
 
 
 def _are_corrections(value: object) -> bool:
-    if value is None:
-        return True
     try:
         Corrections.from_facts(value)
     except (EngineError, TypeError, AttributeError):
@@ -165,10 +144,6 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _is_count_or_none(value: object) -> bool:
-    return value is None or (isinstance(value, int) and not isinstance(value, bool) and value >= 1)
-
-
 def _is_place(value: object) -> bool:
     if not isinstance(value, Mapping):
         return False
@@ -179,6 +154,23 @@ def _is_place(value: object) -> bool:
 
 def _is_table(value: object, kind: type) -> bool:
     return isinstance(value, Mapping) and all(isinstance(each, kind) for each in value.values())
+
+
+_KINDS: dict[str, tuple[str, Callable[[object], bool]]] = {
+    "str": ("a text", _is_text),
+    "float": ("a number", _is_number),
+    "int": ("a whole number above 0", lambda value: type(value) is int and value >= 1),
+    "bool": ("true or false", lambda value: isinstance(value, bool)),
+}
+"""What a field holds, in words and as a test, by its type."""
+_TABLES: dict[str, tuple[str, Callable[[object], bool]]] = {
+    "origin": ("lat_deg and lon_deg on the Earth", _is_place),
+    "corrections": ("corrections of the telemetry", _are_corrections),
+    "heights": ("counts by source", lambda value: _is_table(value, int)),
+    "diagnosis": ("sentences", lambda value: _is_table(value, str)),
+    **dict.fromkeys(("changed", "attitude", "more"), ("a table", lambda value: _is_table(value, object))),
+}
+"""The same of tables, by name."""
 
 
 def _shown(value: object) -> str:

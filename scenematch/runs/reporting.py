@@ -10,14 +10,13 @@ from engine.orthomap import OrthoMap
 from scenematch.files.logs.readers import open_truth
 from scenematch.files.track import read_track
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.metrics import Ground, errors_en_m, summarise
+from scenematch.report.metrics import Ground
 from scenematch.report.runs_page import MAX_RUNS, write_runs_page
-from scenematch.report.segments import segment_errors
 from scenematch.runs.evaluation import open_recorded_map, redraw
 from scenematch.runs.folders import StrPath, check_file
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.record import read_record
-from scenematch.runs.results import PAGE, SUMMARY, TRACK
+from scenematch.runs.results import PAGE, SUMMARY, TRACK, figures_of
 
 COMPARISON = "comparison.html"
 """Default name of the page on several runs."""
@@ -94,7 +93,5 @@ def _finished(folder: Path, site: OrthoMap) -> FinishedTrack:
     start_ns = rows[0].timestamp_ns if rows else None
     truth = None if record.truth is None else open_truth(Path(record.truth), start_ns)
     ground = Ground(record.ground_m, record.ground_amsl_m)
-    summary = summarise(rows, truth, frame=site.frame, ground=ground)
-    if truth:
-        summary["segments"] = segment_errors(rows, errors_en_m(rows, truth, site.frame))
-    return FinishedTrack(rows, truth, site, ground, summary | {"settings": record.facts()}, None)
+    summary = figures_of(rows, truth, site, ground) | {"settings": record.facts()}
+    return FinishedTrack(rows, truth, site, ground, summary, None)

@@ -55,11 +55,9 @@ def write_results(
     progress: Progress = SILENT,
 ) -> dict[str, Any]:
     """Write summary.json and, if requested, the report page, replacing older ones."""
-    summary = summarise(rows, truth, frame=site.frame, ground=ground)
-    segments = {"segments": segment_errors(rows, errors_en_m(rows, truth, site.frame))} if truth else {}
     telemetry = None if frames.flight is None else frames.flight.rows
     motion = {"motion_consistency": motion_consistency(rows, telemetry, site.frame)}
-    summary |= segments | motion | {"settings": record.facts()}
+    summary = figures_of(rows, truth, site, ground) | motion | {"settings": record.facts()}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
         fixed = [row.timestamp_ns for row in rows if row.fixed and row.timestamp_ns is not None]
         given = [row.timestamp_ns for row in truth or []]
@@ -72,6 +70,12 @@ def write_results(
         return summary
     _write_page(out / PAGE, finished_track(out, rows, truth, site, ground, summary, frames), frames)
     return summary
+
+
+def figures_of(rows: list[TrackRow], truth: list[Truth] | None, site: OrthoMap, ground: Ground) -> dict[str, Any]:
+    """Figures of merit of a track, with truth its errors by segment, too."""
+    segments = {"segments": segment_errors(rows, errors_en_m(rows, truth, site.frame))} if truth else {}
+    return summarise(rows, truth, frame=site.frame, ground=ground) | segments
 
 
 def _span(stamps_ns: list[int]) -> str:

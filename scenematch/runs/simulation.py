@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.values import Prior
+from engine.values import Frame, Prior, Truth
 from scenematch.files.flight import write_flight_folder
 from scenematch.runs.arguments import check_choice
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder
@@ -133,19 +134,32 @@ def simulate(
 def write_flight(folder: StrPath, plan: FlightPlan, *, progress: Progress = SILENT) -> FlightFiles:
     """Write the simulated flight to disk like any other flight; it is then read back."""
     truth = plan.truth_rows()
-    start = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=START_SIGMA_M)
     names = [f"{index:06d}.jpg" for index in range(len(plan))]
+    frames = progress.track(zip(names, plan.iter_frames(), strict=True), len(plan), "flying")
+    write_folder(folder, plan.town, plan.camera, frames, truth, truth[0].lat_deg, truth[0].lon_deg)
+    return FlightFiles.in_folder(folder)
+
+
+def write_folder(
+    folder: StrPath,
+    town: Town,
+    camera: Camera,
+    frames: Iterable[tuple[str, Frame]],
+    truth: Iterable[Truth],
+    lat_deg: float,
+    lon_deg: float,
+) -> None:
+    """Write the folder of a flight over a town; its telemetry begins with a prior at a latitude and longitude."""
     write_flight_folder(
         folder,
-        frames=progress.track(zip(names, plan.iter_frames(), strict=True), len(plan), "flying"),
+        frames=frames,
         truth=truth,
-        camera=plan.camera,
-        ortho_rgb=plan.town.ortho,
-        pixel_to_crs=plan.town.pixel_to_crs,
-        crs_epsg=plan.town.crs_epsg,
-        surface_m=plan.town.surface_m,
-        start=start,
+        camera=camera,
+        ortho_rgb=town.ortho,
+        pixel_to_crs=town.pixel_to_crs,
+        crs_epsg=town.crs_epsg,
+        surface_m=town.surface_m,
+        start=Prior(lat_deg=lat_deg, lon_deg=lon_deg, sigma_m=START_SIGMA_M),
         georeference_sigma_m=EXACT,
         slope_sigma_deg=EXACT,
     )
-    return FlightFiles.in_folder(folder)

@@ -89,17 +89,7 @@ def _at_truth(folder: Path, track: list[TrackRow], path: Path) -> list[PoseRow]:
 def _true_row(row: TrackRow, at: Truth, frame: LocalFrame, up_m: float) -> PoseRow:
     """The true pose at the time of a fix; a height that is not a number is unknown."""
     east_m, north_m = map(float, frame.enu_from_geodetic(at.lat_deg, at.lon_deg))
-    return PoseRow(
-        timestamp_ns=row.timestamp_ns,
-        frame=row.frame,
-        status=row.status,
-        lat_deg=at.lat_deg,
-        lon_deg=at.lon_deg,
-        east_m=east_m,
-        north_m=north_m,
-        up_m=up_m if math.isfinite(up_m) else None,
-        alt_amsl_m=at.alt_amsl_m,
-        roll_deg=at.roll_deg,
-        pitch_deg=at.pitch_deg,
-        heading_deg=at.heading_deg,
-    )
+    names = ("lat_deg", "lon_deg", "alt_amsl_m", "roll_deg", "pitch_deg", "heading_deg")
+    known = {name: getattr(at, name) for name in names} | {"up_m": up_m if math.isfinite(up_m) else None}
+    own = {name: getattr(row, name) for name in ("timestamp_ns", "frame", "status")}
+    return PoseRow(**own, **known, east_m=east_m, north_m=north_m)

@@ -1,4 +1,4 @@
-"""The reference filter: an error-state EKF over IMU, barometer, compass, and positions of GPS or of the engine.
+"""The reference filter: an error-state EKF over IMU, barometer, compass and the engine's fixes.
 
 Convention:
     Fifteen states of the vehicle: errors of position, velocity, attitude (a small rotation in east-north-up,
@@ -13,15 +13,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from engine.geo import chi_square, enu_from_body
+from engine.geo import Array, chi_square, enu_from_body
 from engine.values import Attitude, Fix
 from scenematch.simulator.quadrotor import GRAVITY, STEP_S, IdealImu, next_time_s
 from scenematch.simulator.rotations import cross_matrix, rotation
-from scenematch.simulator.sensors import GpsSample, SensorSuite
-
-Array = NDArray[np.float64]
+from scenematch.simulator.sensors import SensorSuite
 
 POSITION, VELOCITY, TURN, ACCEL, GYRO = (slice(k, k + 3) for k in range(0, 15, 3))
 BARO, COMPASS = 15, 16
@@ -199,14 +196,6 @@ def fuse_heading(state: FilterState, heading_deg: float, suite: SensorSuite) -> 
     off = math.radians(heading_deg) - math.atan2(east, north) - state.compass_bias_rad
     residual = np.array([(off + math.pi) % (2.0 * math.pi) - math.pi])
     return correct(state, residual, H, np.array([[math.radians(suite.compass.noise_deg) ** 2]]))
-
-
-def fuse_gps(state: FilterState, sample: GpsSample, suite: SensorSuite) -> FilterState:
-    """Fuse the receiver's position and velocity; the state is at the sample's time."""
-    gps = suite.gps
-    variances = np.array([gps.noise_m] * 2 + [gps.height_noise_m] + [gps.velocity_noise_mps] * 3) ** 2
-    residual = np.concatenate([sample.position_m - state.position_m, sample.velocity_mps - state.velocity_mps])
-    return correct(state, residual, np.eye(6, STATES), np.diag(variances))
 
 
 def fuse_fix(state: FilterState, fix: Fix) -> FilterState:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.geo import LocalFrame, wrap_difference_deg
+from engine.geo import Array, LocalFrame, wrap_difference_deg
 from engine.values import Attitude, Frame, Truth
 from scenematch.simulator.conditions import Condition
 from scenematch.simulator.light import Image
@@ -31,8 +31,6 @@ from scenematch.simulator.vehicle import (
     fly_waypoints,
     simulate_telemetry,
 )
-
-Array = NDArray[np.float64]
 
 NADIR_PITCH_DEG = -90.0
 """Pitch of a camera that looks straight down."""
@@ -100,6 +98,33 @@ def picture_at(
     return take_picture(town.world, camera, grid, up, attitude, rng, sensor=sensor, optics=optics, sway=sway)
 
 
+def truth_at(town: Town, origin: LocalFrame, timestamp_ns: int, position_m: Array, attitude: Attitude) -> Truth:
+    """The true pose of a vehicle.
+
+    Args:
+        town: that it flies over.
+        origin: of the local east-north-up frame.
+        timestamp_ns: of the pose.
+        position_m: (3,) east, north and up in that frame.
+        attitude: of its body.
+
+    Returns:
+        Truth: with heights above the sea and above the ground below it.
+    """
+    east, north, up = (float(v) for v in position_m)
+    lat, lon = origin.geodetic_from_enu(east, north)
+    return Truth(
+        timestamp_ns=timestamp_ns,
+        lat_deg=float(lat),
+        lon_deg=float(lon),
+        alt_amsl_m=town.datum_amsl_m + up,
+        height_agl_m=up - town.world.ground_at(grid_at(town, origin, position_m)),
+        roll_deg=attitude.roll_deg,
+        pitch_deg=attitude.pitch_deg,
+        heading_deg=attitude.heading_deg,
+    )
+
+
 @dataclass(frozen=True)
 class FlightPlan:
     """A flight before its pictures are rendered.
@@ -136,15 +161,13 @@ class FlightPlan:
             yield self._frame(k, rng)
 
     def _frame(self, k: int, rng: np.random.Generator) -> Frame:
-        truth, telemetry = self.truth, self.telemetry
-        attitude = Attitude(float(truth.roll_deg[k]), float(truth.pitch_deg[k]), float(truth.heading_deg[k]))
-        position_m, sway = truth.position_m[k], self.sways[k] if self.sways else None
+        telemetry, position_m = self.telemetry, self.truth.position_m[k]
+        ground_m = self.town.world.ground_at(grid_at(self.town, self.origin, position_m))
+        where = self.town, self.camera, self.origin, position_m, self._attitude(k), rng
         return Frame(
-            picture_at(
-                self.town, self.camera, self.origin, position_m, attitude, rng, optics=self.optics, sway=sway
-            ),
+            picture_at(*where, optics=self.optics, sway=self.sways[k] if self.sways else None),
             timestamp_ns=self.timestamps_ns[k],
-            height_agl_m=float(telemetry.position_m[k, 2]) - self._ground_m(k),
+            height_agl_m=float(telemetry.position_m[k, 2]) - ground_m,
             heading_deg=float(telemetry.heading_deg[k]),
             roll_deg=float(telemetry.roll_deg[k]),
             pitch_deg=float(telemetry.pitch_deg[k]),
@@ -152,25 +175,14 @@ class FlightPlan:
             north_velocity_mps=float(telemetry.velocity_mps[k, 1]),
         )
 
-    def _ground_m(self, k: int) -> float:
-        """The bare ground below the vehicle, above the world's height 0."""
-        return self.town.world.ground_at(grid_at(self.town, self.origin, self.truth.position_m[k]))
+    def _attitude(self, k: int) -> Attitude:
+        truth = self.truth
+        return Attitude(float(truth.roll_deg[k]), float(truth.pitch_deg[k]), float(truth.heading_deg[k]))
 
     def truth_rows(self) -> list[Truth]:
         """True poses of the camera, one row per frame."""
-        motion = self.truth
-        lat, lon = self.origin.geodetic_from_enu(motion.position_m[:, 0], motion.position_m[:, 1])
         return [
-            Truth(
-                timestamp_ns=stamp,
-                lat_deg=float(lat[k]),
-                lon_deg=float(lon[k]),
-                alt_amsl_m=self.town.datum_amsl_m + float(motion.position_m[k, 2]),
-                height_agl_m=float(motion.position_m[k, 2]) - self._ground_m(k),
-                roll_deg=float(motion.roll_deg[k]),
-                pitch_deg=float(motion.pitch_deg[k]),
-                heading_deg=float(motion.heading_deg[k]),
-            )
+            truth_at(self.town, self.origin, stamp, self.truth.position_m[k], self._attitude(k))
             for k, stamp in enumerate(self.timestamps_ns)
         ]
 

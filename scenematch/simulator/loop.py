@@ -23,7 +23,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.geo import attitude_from_rotation
+from engine.geo import Array, attitude_from_rotation
 from engine.navigation.navigator import Matcher, Navigator
 from engine.navigation.state import NavigatorState
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
@@ -32,7 +32,6 @@ from scenematch.simulator.ekf import (
     FilterState,
     fix_chi_square,
     fuse_fix,
-    fuse_gps,
     fuse_heading,
     fuse_height,
     initial_state,
@@ -41,7 +40,7 @@ from scenematch.simulator.faults import Fault, ShiftedMap
 from scenematch.simulator.history import History
 from scenematch.simulator.pilot import Gains, Pilot, Route, Setpoint
 from scenematch.simulator.quadrotor import STEP_S, Airframe, State, Wind, WindField, advance, hovering, shaken
-from scenematch.simulator.sensors import GpsSample, Instruments, SensorSuite, steps_between
+from scenematch.simulator.sensors import Instruments, SensorSuite, steps_between
 from scenematch.simulator.vehicle import START_NS
 
 __all__ = [
@@ -55,7 +54,6 @@ __all__ = [
     "fly_closed_loop",
 ]
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 RenderCallback = Callable[[State], Image]
 """Returns the camera's picture at a state of the vehicle."""
@@ -88,7 +86,6 @@ class LoopOptions:
         gate: chi-square of two degrees of freedom, beyond which a fix contradicts the filter.
         max_contradictions: fixes in a row that contradict the filter, at which the flight is handed over.
         healthy_s: largest age of the last fix, beyond its latency, at which the engine counts as healthy.
-        gps: whether to fuse the receiver's positions instead of the engine's fixes.
 
     Raises:
         OptionError: a value is not above 0.
@@ -108,7 +105,6 @@ class LoopOptions:
     gate: float = 18.4
     max_contradictions: int = 15
     healthy_s: float = 1.0
-    gps: bool = False
 
     def __post_init__(self) -> None:
         names = ("latency_s", "start_sigma_m", "hold_sigma_m", "give_up_sigma_m", "resume_m")
@@ -242,14 +238,12 @@ class ClosedLoop:
         self._air, self._pilot = WindField(options.wind, air), Pilot(options.gains)
         self._instruments = Instruments(options.sensors, sensors)
         self._state = hovering(route.position_m[0], float(route.heading_deg[0]))
-        keep_s = 1.0 + max(options.latency_s, options.sensors.gps.latency_s)
-        self._history = History(self._initial_estimate(start), options.sensors, keep_s)
+        self._history = History(self._initial_estimate(start), options.sensors, 1.0 + options.latency_s)
         self._navigator: Navigator | None = self._new_engine()
         self._clock_s, self._pace, self._plan = 0.0, 1.0, route.at(0.0)
         self._kicks = deque(route.kicks_s)
         self._picture: Image | None = None
         self._pending: deque[LoopAnswer] = deque()
-        self._receiver: deque[GpsSample] = deque()
         self._contradictions = 0  # in a row
         self._last_fix_s = -math.inf
         self._mode = Mode.FOLLOW
@@ -304,7 +298,7 @@ class ClosedLoop:
         return self._route.at(self._clock_s, pace, change)
 
     def _sense(self, k: int) -> None:
-        """Read barometer and compass, and the GPS receiver if used."""
+        """Read barometer and compass."""
         suite, instruments, state = self.options.sensors, self._instruments, self._state
         now_s = self._history.now.time_s
         if k % steps_between(suite.barometer.rate_hz) == 0:
@@ -313,8 +307,6 @@ class ClosedLoop:
         if k % steps_between(suite.compass.rate_hz) == 0:
             heading_deg = instruments.heading_deg(state)
             self._history.fuse(partial(fuse_heading, heading_deg=heading_deg, suite=suite), now_s)
-        if self.options.gps and k % steps_between(suite.gps.rate_hz) == 0:
-            self._receiver.append(instruments.gps(state))
 
     def _process_frame(self) -> Frame:
         """Take a picture and match it; the answer arrives after the latency."""
@@ -354,15 +346,11 @@ class ClosedLoop:
         )
 
     def _receive(self) -> None:
-        """Fuse all measurements that have arrived, each at its own time."""
-        now_s, options = self._state.time_s, self.options
-        while self._pending and self._pending[0].arrives_s <= now_s + 0.5 * STEP_S:
+        """Fuse the fixes that have arrived, each at its own time."""
+        while self._pending and self._pending[0].arrives_s <= self._state.time_s + 0.5 * STEP_S:
             answer = self._pending.popleft()
-            if isinstance(answer.result, Fix) and not options.gps:
+            if isinstance(answer.result, Fix):
                 self._gate(answer.result, answer)
-        while self._receiver and self._receiver[0].time_s + options.sensors.gps.latency_s <= now_s + 0.5 * STEP_S:
-            sample = self._receiver.popleft()
-            self._history.fuse(partial(fuse_gps, sample=sample, suite=options.sensors), sample.time_s)
 
     def _choose_mode(self) -> None:
         estimate, options = self._history.now, self.options

@@ -6,16 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.geo import Array
 from engine.values import check_positive
 from scenematch.simulator.quadrotor import STEP_S
 from scenematch.simulator.vehicle import COURSE_STEP_S, FlightStyle, course
 
 __all__ = ["Gains", "Pilot", "Route", "Setpoint", "plan_rounds", "plan_route"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

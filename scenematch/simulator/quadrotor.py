@@ -12,17 +12,15 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.geo import attitude_from_rotation, enu_from_body
+from engine.geo import Array, attitude_from_rotation, enu_from_body
 from engine.values import Attitude, check_positive
 from scenematch.simulator.rotations import rotation, rotation_vector
 from scenematch.simulator.vehicle import GRAVITY_MPS2
 
 __all__ = ["Airframe", "IdealImu", "State", "Wind", "WindField", "advance", "hovering"]
 
-Array = NDArray[np.float64]
 
 STEP_S = 0.01
 """Time step of dynamics, control and IMU."""

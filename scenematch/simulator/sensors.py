@@ -1,4 +1,4 @@
-"""The vehicle's sensors and their errors: IMU, compass, barometer and GPS, drawn from one seed."""
+"""The vehicle's sensors and their errors: IMU, compass and barometer, drawn from one seed."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.geo import wrap_heading_deg
+from engine.geo import Array, wrap_heading_deg
 from engine.values import check_positive
 from scenematch.simulator.quadrotor import STEP_S, IdealImu, State
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,32 +91,7 @@ class Barometer:
         _check_rate(self)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Gps:
-    """A receiver like u-blox's M8 (data sheet: 2.5 m horizontally, 50 %; 0.05 m/s).
-
-    Attributes:
-        rate_hz: samples per second.
-        noise_m: white noise of east and of north.
-        height_noise_m: of the height.
-        velocity_noise_mps: of each component of the velocity.
-        latency_s: from the time of a position to its arrival.
-
-    Raises:
-        OptionError: a value is not above 0.
-    """
-
-    rate_hz: float = 5.0
-    noise_m: float = 1.5
-    height_noise_m: float = 3.0
-    velocity_noise_mps: float = 0.1
-    latency_s: float = 0.11
-
-    def __post_init__(self) -> None:
-        _check_rate(self)
-
-
-def _check_rate(sensor: Compass | Barometer | Gps) -> None:
+def _check_rate(sensor: Compass | Barometer) -> None:
     check_positive(sensor, *sensor.__dataclass_fields__)
     steps_between(sensor.rate_hz)
 
@@ -142,16 +114,6 @@ class SensorSuite:
     imu: Imu = field(default_factory=Imu)
     compass: Compass = field(default_factory=Compass)
     barometer: Barometer = field(default_factory=Barometer)
-    gps: Gps = field(default_factory=Gps)
-
-
-@dataclass(frozen=True, slots=True)
-class GpsSample:
-    """(3,) position and (3,) velocity, east, north and up, at ``time_s``."""
-
-    time_s: float
-    position_m: Array
-    velocity_mps: Array
 
 
 class Instruments:
@@ -166,7 +128,7 @@ class Instruments:
 
     def __init__(self, suite: SensorSuite, rng: np.random.Generator) -> None:
         self.suite = suite
-        self._imu, self._compass, self._baro, self._gps = rng.spawn(4)
+        self._imu, self._compass, self._baro = rng.spawn(3)
         self.accel_bias_mps2: Array = suite.imu.accel_start_mps2 * self._imu.standard_normal(3)
         self.gyro_bias_rps: Array = suite.imu.gyro_start_rps * self._imu.standard_normal(3)
         self.compass_bias_deg = suite.compass.bias_deg * float(self._compass.standard_normal())
@@ -200,10 +162,3 @@ class Instruments:
         keep = math.exp(-steps_between(baro.rate_hz) * STEP_S / baro.drift_time_s)
         self.baro_drift_m = keep * self.baro_drift_m + baro.drift_m * math.sqrt(1.0 - keep**2) * walk
         return float(measured)
-
-    def gps(self, state: State) -> GpsSample:
-        """Position and velocity by the receiver; they arrive ``latency_s`` later."""
-        gps, white = self.suite.gps, self._gps.standard_normal(6)
-        sigmas_m = np.array([gps.noise_m, gps.noise_m, gps.height_noise_m])
-        position, velocity = state.position_m + sigmas_m * white[:3], state.velocity_mps
-        return GpsSample(state.time_s, position, velocity + gps.velocity_noise_mps * white[3:])

@@ -12,25 +12,16 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.geo import wrap_difference_deg
-
-Array = NDArray[np.float64]
+from engine.geo import Array, wrap_difference_deg
+from engine.values import check_positive
 
 GRAVITY_MPS2 = 9.80665
 COURSE_STEP_S = 0.01
 """Time step for integrating a flight along waypoints."""
 START_NS = 1_000_000_000
 """Timestamp at which simulated flights begin."""
-
-
-def _check_positive(owner: object, *, zero: bool = False) -> None:
-    for item in fields(owner):  # type: ignore[arg-type]
-        value = getattr(owner, item.name)
-        if not (math.isfinite(value) and (value > 0 or (zero and value == 0))):
-            raise OptionError(f"{item.name}: expected {'0 or more' if zero else 'above 0'}, got {value}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +50,10 @@ class SensorNoise:
     velocity_sd_mps: float = 0.2
 
     def __post_init__(self) -> None:
-        _check_positive(self, zero=True)
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not 0.0 <= value < math.inf:
+                raise OptionError(f"{item.name}: expected 0 or more, got {value}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +82,7 @@ class FlightStyle:
     height_sd_m: float = 0.4
 
     def __post_init__(self) -> None:
-        _check_positive(self)
+        check_positive(self, *self.__dataclass_fields__)
         steady = math.degrees(math.atan(self.acceleration_mps2 / GRAVITY_MPS2))
         if steady >= self.peak_tilt_deg:
             raise OptionError(

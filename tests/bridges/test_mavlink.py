@@ -28,7 +28,6 @@ from engine.errors import OptionError, TelemetryError
 from engine.geo import LocalFrame
 from engine.values import Attitude, NoFix, Prior, Reason
 from scenematch.bridges import mavlink_requests
-from scenematch.bridges.delay_memory import remember_delay
 from scenematch.bridges.fix_velocity import GroundVelocity, VelocityFromFixes
 from scenematch.bridges.links import Connection, parse_connection
 from scenematch.bridges.mavlink import CONFIRM_COMMAND, MavlinkBridge
@@ -60,6 +59,7 @@ from scenematch.bridges.parameters import ParameterOptions, parameter_file
 from scenematch.bridges.pictures import replay
 from scenematch.bridges.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
 from scenematch.cli.app import run as main
+from scenematch.runs.last_fix import remember_delay
 from tests.support.fixes import a_fix
 from tests.support.paths import ROOT
 
@@ -276,7 +276,7 @@ def test_what_would_mislead_is_withheld(changes, message, why):
 
 @pytest.mark.parametrize(
     "values",
-    [{"firmware": "inav"}, {"message": "global_position_sensor"}, {"max_age_ms": 251.0}, {"max_sigma_m": 101.0}],
+    [{"firmware": "inav"}, {"message": "global_position_sensor"}, {"max_sigma_m": 101.0}],
 )
 def test_options_are_refused_in_one_line(values):
     with pytest.raises(OptionError, match=next(iter(values))):

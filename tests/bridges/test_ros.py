@@ -28,6 +28,7 @@ from scenematch.bridges.ros_out import FIRMWARES, RosOptions, diagnostics, pose,
 from scenematch.bridges.vehicle import NedOrigin, VehicleState
 from scenematch.cli.app import run as main
 from scenematch.cli.argument_names import ros_arguments_last
+from scenematch.files.quaternions import quaternion_xyzw
 from scenematch.files.ros.messages import (
     NO_POSITION,
     ODOMETRY_TYPES,
@@ -36,7 +37,6 @@ from scenematch.files.ros.messages import (
     camera_from_message,
     image_from_message,
     position_from_message,
-    quaternion_xyzw,
     range_from_message,
     stamp_ns,
 )

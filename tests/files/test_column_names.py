@@ -1,4 +1,4 @@
-"""Telemetry with the columns of other programs: named in the settings, or guessed and asked."""
+"""Telemetry with the columns of other programs: named in the settings, or told as not read."""
 
 import json
 import sqlite3
@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from engine.errors import OptionError, TelemetryError
-from scenematch.files.column_names import likely
 from scenematch.files.settings import changed, nested, options_from_mapping
 from scenematch.files.telemetry import open_telemetry
 from scenematch.runs.inputs import FlightFiles, open_inputs
@@ -22,6 +21,9 @@ NAMES = {
     "timestamp_us": "time_us", "frame": "Image Name", "height_agl_m": "altitude_agl [m]", "heading_deg": "Yaw",
     "lat_deg": "Latitude", "lon_deg": "Longitude",
 }  # fmt: skip
+
+
+PLACE = "[telemetry_columns] of the settings names those that are ours"
 
 
 @pytest.fixture
@@ -39,28 +41,24 @@ def test_named_columns_are_read(save):
     row = found.rows[1]
     assert (row.timestamp_ns, row.frame, row.height_agl_m, row.heading_deg) == (500_000_000, "1.png", 121.5, 269.0)
     assert (row.lat_deg, row.lon_deg) == (48.5, 16.5)
-    assert found.remarks == []
+    assert found.remarks == ["telemetry.csv: columns that are not read: battery; " + PLACE]
 
 
-def test_a_missing_required_column_is_asked_for(save):
+def test_a_missing_required_column_is_told_with_those_that_are_there(save):
     with pytest.raises(TelemetryError) as caught:
-        open_telemetry(save(OTHERS))
-    assert (
-        "line 1: lacks the column timestamp_ns: is it 'time_us'? "
-        'If so, add to the settings, [telemetry_columns] timestamp_us = "time_us"; its columns are'
-    ) in str(caught.value)
-    with pytest.raises(TelemetryError, match="lacks the column frame: is it 'Image Name'"):
-        open_telemetry(save(OTHERS), names={"timestamp_us": "time_us"})
-    with pytest.raises(TelemetryError, match="lacks the column timestamp_ns; its columns are 'speed,frame'"):
         open_telemetry(save("speed,frame\n1,a.png\n"))
+    assert str(caught.value).endswith(
+        "line 1: lacks the column timestamp_ns; its columns are 'speed,frame'; " + PLACE
+    )
+    with pytest.raises(TelemetryError, match="lacks the column frame; its columns are 'time_us,Image Name,"):
+        open_telemetry(save(OTHERS), names={"timestamp_us": "time_us"})
 
 
-def test_other_columns_that_look_like_ours_are_asked_for_in_one_line(save):
+def test_columns_that_are_not_read_are_told_in_one_line(save):
     found = open_telemetry(save(OTHERS), names={"timestamp_us": "time_us", "frame": "Image Name"})
     assert found.rows[0].heading_deg is None
     assert found.remarks == [
-        "telemetry.csv: unused columns; are they these? If so, add to the settings, [telemetry_columns]: "
-        'height_agl_m = "altitude_agl [m]", heading_deg = "Yaw", lat_deg = "Latitude", lon_deg = "Longitude"'
+        "telemetry.csv: columns that are not read: altitude_agl [m], Yaw, Latitude, Longitude, battery; " + PLACE
     ]
 
 
@@ -69,21 +67,6 @@ def test_a_name_that_the_file_lacks_is_refused(save):
         TelemetryError, match="line 1: lacks the column alt, which the settings name as height_agl_m"
     ):
         open_telemetry(save(OTHERS), names=NAMES | {"height_agl_m": "alt"})
-
-
-@pytest.mark.parametrize(
-    ("theirs", "ours"),
-    [
-        ("time", "timestamp_ns"), ("Timestamp (ms)", "timestamp_ms"), ("time_s", "timestamp_s"),
-        ("utc", "timestamp_utc"), ("datetime_utc", "timestamp_utc"), ("timestamp_ns", "timestamp_ns"),
-        ("filename", "frame"), ("rel_alt", "height_agl_m"), ("Altitude (m)", "alt_amsl_m"), ("altitude_ft", None),
-        ("yaw_deg", "heading_deg"), ("roll_rad", None), ("vel_n", "north_velocity_mps"), ("lat", "lat_deg"),
-        ("battery", None), ("", None), ("frame", None),
-    ],
-)  # fmt: skip
-def test_what_a_column_is_likely_to_be(theirs, ours):
-    """In feet or radians it is none: a name alone would not convert it."""
-    assert likely(theirs) == ours
 
 
 def test_the_settings_name_them(tmp_path):

@@ -272,7 +272,6 @@ def test_truth_is_unknown_outside_and_in_gaps():
     assert interpolate_truth(rows, 18 * 10**9) is rows[2]
     for stamp_s in (9, 19, 15):
         assert interpolate_truth(rows, stamp_s * 10**9) is None
-    assert interpolate_truth(rows, 15 * 10**9, max_gap_ns=6 * 10**9) is not None
     assert interpolate_truth([], 5) is None
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from collections import Counter
 from types import SimpleNamespace
 
 import cv2
@@ -25,7 +26,7 @@ from engine.errors import OptionError, TelemetryError
 from scenematch.cli.app import run
 from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import LogClock, open_log, open_truth, stamp_frames
-from scenematch.files.resampling import MAX_SAMPLE_GAP_NS, FlightLog, interpolate, make_series, telemetry_at
+from scenematch.files.resampling import MAX_SAMPLE_GAP_NS, FlightLog, interpolate, make_series, rows_and_sources_at
 from scenematch.files.telemetry import read_telemetry, take_off_sigma_m
 from scenematch.files.track import read_track
 from scenematch.files.truth import interpolate_truth, read_truth
@@ -36,7 +37,8 @@ from tests.support.videos import write_video
 
 
 def at(log, *seconds):
-    return telemetry_at(log, [round(s * S) for s in seconds], [str(i) for i in range(len(seconds))])
+    rows, sources = rows_and_sources_at(log, [round(s * S) for s in seconds], list(map(str, range(len(seconds)))))
+    return rows, dict(Counter(filter(None, sources)))
 
 
 def refusal(call, *arguments, error=TelemetryError, **options):
@@ -121,14 +123,14 @@ def test_without_an_estimator_the_receiver_says_where_and_how_fast(tmp_path):
 def test_frames_stamped_in_utc_are_brought_to_the_logs_clock(tmp_path):
     path = dataflash_flight(tmp_path / "1.BIN")
     stamp_ns = UTC_NS + 2 * S + S // 2
-    (row,), _ = telemetry_at(open_log(path), [stamp_ns], ["a.png"])
+    (row,), _ = rows_and_sources_at(open_log(path), [stamp_ns], ["a.png"])
     assert (row.timestamp_ns, row.heading_deg) == (stamp_ns, pytest.approx(355.0))
     truth = open_truth(path, stamp_ns)
     assert [t.timestamp_ns - UTC_NS for t in truth] == [k * S for k in range(11)]
     assert [t.timestamp_ns for t in open_truth(path)] == [(60 + k) * S for k in range(11)]
     assert (truth[3].lat_deg, truth[3].alt_amsl_m, truth[3].heading_deg) == pytest.approx((32.5003, 703.0, 356.0))
     without = write_dataflash(tmp_path / "2.BIN", [("ATT", 1_000_000, 0, 0, 0)])
-    assert "expected GPS time" in refusal(telemetry_at, open_log(without), [stamp_ns], ["a.png"])
+    assert "expected GPS time" in refusal(rows_and_sources_at, open_log(without), [stamp_ns], ["a.png"])
     assert "expected positions to serve as truth" in refusal(open_truth, without)
 
 

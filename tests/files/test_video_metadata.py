@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from scenematch.files.logs.readers import open_log
-from scenematch.files.resampling import telemetry_at
+from scenematch.files.resampling import rows_and_sources_at
 from tests.support.paths import ROOT
 
 UAS_DATALINK = bytes.fromhex("060e2b34020b01010e01030101000000")
@@ -37,7 +37,7 @@ def test_the_documented_script_makes_telemetry_of_klv(tmp_path):
     text = subprocess.run(command, cwd=tmp_path, capture_output=True, check=True).stdout
     (tmp_path / "flight.srt").write_bytes(text)
     log = open_log(tmp_path / "flight.srt")
-    rows, _ = telemetry_at(log, [1_250_000_000 * k for k in range(4)], list("0123"))
+    rows, _ = rows_and_sources_at(log, [1_250_000_000 * k for k in range(4)], list("0123"))
     for k, row in enumerate(rows):
         assert (row.lat_deg, row.lon_deg) == pytest.approx((48.25 + 1e-4 * k, -16.5 + 2e-4 * k), abs=2e-7)
         assert row.alt_amsl_m == pytest.approx(420.0 + 2.0 * k, abs=0.16)  # the standard's step is 0.3 m

@@ -24,7 +24,8 @@ from engine.orthomap import OrthoMap
 from scenematch.bridges.ros import RosTopics
 from scenematch.bridges.vehicle import NedOrigin, north_east_m
 from scenematch.files.geotiff import write_geotiff
-from scenematch.files.ros.messages import MessageFactory, quaternion_xyzw
+from scenematch.files.quaternions import quaternion_xyzw
+from scenematch.files.ros.messages import MessageFactory
 from tests.support.paths import ROOT
 
 STACK, ROS2 = ROOT / "examples" / "paper-stack", ROOT / "examples" / "ros2"

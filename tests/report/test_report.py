@@ -2,7 +2,6 @@
 
 import json
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ import pytest
 from engine.geo import LocalFrame
 from engine.values import Truth
 from scenematch.files.track import TrackRow
-from scenematch.report.figures import plain_log_ticks
 from scenematch.report.metrics import Ground, errors_en_m, summarise
 
 HERE = LocalFrame(32.79, 34.99)
@@ -159,29 +157,3 @@ def test_a_summary_is_json_without_nan():
     rows = [fix_at(0, 0, 0, sigma_m=(0.0, 0.0)), refusal_at(None), fix_at(1, 1, 1, sigma_m=(None, None))]
     for truth in (None, straight(), [truth_at(0, 0, 999)]):
         assert json.loads(json.dumps(summarise(rows, truth), allow_nan=False))
-
-
-# -------------------------------------------------------------------------------------------------- figures
-
-
-@pytest.mark.parametrize("span", [(0.9, 1.8), (0.0015, 2.0), (0.2, 19.0)])
-def test_labels_of_a_logarithmic_axis_are_plain_and_do_not_overlap(span):
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(3.4, 3.0), layout="constrained")
-    ax = figure.add_subplot()
-    ax.plot(span, (0.0, 1.0))
-    ax.set_xscale("log")
-    plain_log_ticks(ax.xaxis)
-    FigureCanvasAgg(figure).draw()
-    inside = [t for t in ax.xaxis.get_ticklabels(which="both") if t.get_text() and _within(t, ax)]
-    boxes = sorted(label.get_window_extent().extents[[0, 2]].tolist() for label in inside)
-    assert boxes
-    assert all(right < left for (_, right), (left, _) in pairwise(boxes))
-    assert all(float(label.get_text()) == pytest.approx(label.get_position()[0]) for label in inside)
-
-
-def _within(label, ax):
-    low, high = ax.get_xlim()
-    return low <= label.get_position()[0] <= high

@@ -52,6 +52,8 @@ def summary_of(**known):
         "false_fixes": 0,
         "beyond_3_sigma": 0,
         "nees_mean": 1.9,
+        "stated_sigma_median_m": 0.4,
+        "settings": {"budget_ms": 40.0},
     } | known
 
 
@@ -82,21 +84,21 @@ def summary_of(**known):
     ],
 )  # fmt: skip
 def test_the_verdict_says_the_worst_first(known, grade, begins):
-    verdict = verdict_of(summary_of(**known), 0.4, 40.0)
+    verdict = verdict_of(summary_of(**known))
     assert verdict.grade == grade
     assert verdict.accuracy.startswith(begins)
 
 
 def test_sigmas_that_are_far_larger_than_the_errors_are_said_to_be():
-    assert "cautious: about 14 times" in verdict_of(summary_of(nees_mean=0.01), 3.0, None).accuracy
-    assert "cautious" not in verdict_of(summary_of(nees_mean=1.0), 0.4, None).accuracy
+    assert "cautious: about 14 times" in verdict_of(summary_of(nees_mean=0.01)).accuracy
+    assert "cautious" not in verdict_of(summary_of(nees_mean=1.0)).accuracy
 
 
 def test_the_verdict_on_time():
-    assert "all of them within the budget of 40 ms" in verdict_of(summary_of(), 0.4, 40.0).latency
-    assert "3 answers came after" in verdict_of(summary_of(deadlines_missed=3), 0.4, 40.0).latency
-    assert "no budget" in verdict_of(summary_of(), 0.4, None).latency
-    assert "9.9 ms" in verdict_of(summary_of(), 0.4, None).latency
+    assert "all of them within the budget of 40 ms" in verdict_of(summary_of()).latency
+    assert "3 answers came after" in verdict_of(summary_of(deadlines_missed=3)).latency
+    assert "no budget" in verdict_of(summary_of(settings={})).latency
+    assert "9.9 ms" in verdict_of(summary_of(settings={})).latency
 
 
 def test_every_reason_has_its_meaning_in_one_sentence():

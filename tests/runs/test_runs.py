@@ -11,6 +11,7 @@ import scenematch.runs
 from engine import OptionError, TelemetryError
 from engine.errors import BackendError, MissingExtraError, require
 from scenematch import (
+    AuditFiles,
     BridgeFiles,
     BridgeSettings,
     CameraInput,
@@ -21,11 +22,11 @@ from scenematch import (
     Progress,
     TrackSettings,
     WorldSettings,
+    audit_map,
     compare,
     evaluate,
     export_track,
     locate_image,
-    run_demo,
     run_mavlink_bridge,
     simulate,
     track,
@@ -233,7 +234,7 @@ def ulog():
         ("rosbags", "rosbags", "bags", import_rosbags),
         ("rosbags.highlevel", "rosbags", "bags", import_rosbags),
         ("pyulog", "pyulog", "logs", ulog),
-        ("matplotlib", "matplotlib", "desk", lambda: run_demo("demo")),
+        ("matplotlib", "matplotlib", "desk", lambda: audit_map(AuditFiles(map=MapInput("m.tif")), "audit")),
         ("rerun", "rerun-sdk", "live", lambda: LiveViewTarget("view.rrd").check()),
     ],
 )

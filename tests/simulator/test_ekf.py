@@ -24,7 +24,6 @@ from scenematch.simulator.ekf import (
     correct,
     fix_chi_square,
     fuse_fix,
-    fuse_gps,
     fuse_heading,
     fuse_height,
     initial_state,
@@ -34,10 +33,11 @@ from scenematch.simulator.history import History
 from scenematch.simulator.pilot import Pilot, plan_route
 from scenematch.simulator.quadrotor import STEP_S, Airframe, IdealImu, Wind, WindField, advance, hovering, shaken
 from scenematch.simulator.rotations import rotation, rotation_vector
-from scenematch.simulator.sensors import GpsSample, Instruments, SensorSuite
+from scenematch.simulator.sensors import Instruments, SensorSuite
 from tests.support.fixes import a_fix
 
 SUITE = SensorSuite()
+FIX_SIGMA_M, FIX_LATENCY_S = 1.5, 0.11
 SAMPLE = IdealImu(np.array([0.4, -0.3, -9.6]), np.array([0.2, -0.1, 0.3]))
 
 
@@ -173,7 +173,7 @@ def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
 # -------------------------------------------------------------------------------------------------- consistency
 
 
-def fly(seed, seconds, gps_until_s=math.inf):
+def fly(seed, seconds, fixes_until_s=math.inf):
     """A flight steered by the filter: every second its error (17,), covariance, and the sigma of the position."""
     route = plan_route(np.array([[-40.0, -40.0], [-40.0, 30.0], [30.0, 30.0]]))
     winds, sensors, start, shakes = np.random.default_rng(seed).spawn(4)
@@ -183,7 +183,7 @@ def fly(seed, seconds, gps_until_s=math.inf):
     state = replace(state, velocity_mps=0.1 * off[:3])
     believed = Attitude(0.5 * off[3], 0.5 * off[4], carried.heading_deg(state))
     history = History(initial_state(state.position_m + 2.0 * off[5:], 2.0, believed, SUITE), SUITE)
-    kicks, receiver, rows = list(route.kicks_s), [], []
+    kicks, pending, rows = list(route.kicks_s), [], []
     for k in range(1, round(seconds / STEP_S) + 1):
         target, estimate = route.at(k * STEP_S), history.now
         if kicks and k * STEP_S >= kicks[0]:
@@ -198,11 +198,13 @@ def fly(seed, seconds, gps_until_s=math.inf):
         if k % 10 == 0:
             heading_deg = carried.heading_deg(state)
             history.fuse(partial(fuse_heading, heading_deg=heading_deg, suite=SUITE), state.time_s)
-        if k % 20 == 0 and state.time_s < gps_until_s:
-            receiver.append(carried.gps(state))
-        if receiver and state.time_s >= receiver[0].time_s + SUITE.gps.latency_s:
-            sample = receiver.pop(0)
-            history.fuse(partial(fuse_gps, sample=sample, suite=SUITE), sample.time_s)
+        if k % 20 == 0 and state.time_s < fixes_until_s:
+            pending.append(
+                (state.time_s, fix_at(*(state.position_m + FIX_SIGMA_M * start.standard_normal(3)), FIX_SIGMA_M))
+            )
+        if pending and state.time_s >= pending[0][0] + FIX_LATENCY_S:
+            time_s, fix = pending.pop(0)
+            history.fuse(partial(fuse_fix, fix=fix), time_s)
         if k % 100 == 0:
             now = history.now
             truth = FilterState(
@@ -240,7 +242,7 @@ def test_the_covariance_stays_positive_definite_and_symmetric():
 def test_without_positions_the_sigma_grows_and_holds_the_error():
     squares, sigmas = [], []
     for seed in range(300, 304):
-        rows = fly(seed, 12.0, gps_until_s=6.0)
+        rows = fly(seed, 12.0, fixes_until_s=6.0)
         sigma = [s for *_, s in rows]
         assert (np.diff(sigma[7:]) > 0.0).all()
         error, P, _ = rows[-1]
@@ -284,6 +286,3 @@ def test_the_start_can_be_corrected_too_and_no_other_moment():
     for moment in (0.0, 0.31):
         with pytest.raises(StateError, match="time_s"):
             history.fuse(partial(fuse_fix, fix=fix_at(10.0, -5.0)), moment)
-    sample = GpsSample(0.2, np.array([10.0, -5.0, 120.0]), np.zeros(3))
-    history.fuse(partial(fuse_gps, sample=sample, suite=SUITE), sample.time_s)
-    assert history.at(0.2).sigma_m < SUITE.gps.noise_m

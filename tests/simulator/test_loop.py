@@ -124,13 +124,6 @@ def test_a_long_latency_costs_little_because_fixes_are_taken_in_where_they_belon
     assert np.median(distance(flown.estimate_error_m[50:])) < 0.5  # 5 m are flown in 0.6 s
 
 
-def test_with_gps_the_engines_fixes_are_not_needed():
-    flown = fly(8.0, matcher=Scripted(blind=True), gps=True)
-    assert flown.used == []
-    assert distance(flown.estimate_error_m[50:]).max() < 3.0
-    assert modes(flown) == {Mode.FOLLOW}
-
-
 # ------------------------------------------------------------------------------------------------------- faults
 
 

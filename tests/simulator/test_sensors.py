@@ -12,7 +12,6 @@ from scenematch.simulator.quadrotor import STEP_S, IdealImu, hovering
 from scenematch.simulator.sensors import (
     Barometer,
     Compass,
-    Gps,
     Imu,
     Instruments,
     SensorSuite,
@@ -87,21 +86,9 @@ def test_the_barometer_starts_at_zero_and_drifts_to_its_sigma():
     assert np.std(drifts) == pytest.approx(1.5, rel=0.25)
 
 
-def test_the_receiver_spreads_as_it_says_and_keeps_the_moment():
-    gps = Gps(noise_m=2.0, height_noise_m=4.0, velocity_noise_mps=0.2)
-    carried = instruments(gps=gps)
-    samples = [carried.gps(STILL) for _ in range(3000)]
-    place = np.array([s.position_m for s in samples]) - STILL.position_m
-    np.testing.assert_allclose(place.std(axis=0), [2.0, 2.0, 4.0], rtol=0.06)
-    np.testing.assert_allclose(place.mean(axis=0), 0.0, atol=0.3)
-    assert np.std([s.velocity_mps for s in samples]) == pytest.approx(0.2, rel=0.06)
-    assert samples[0].time_s == STILL.time_s
-
-
 def test_one_seed_gives_one_flight_and_each_sensor_its_own_stream():
     first, second, other = instruments(7), instruments(7), instruments(8)
-    second.gps(STILL)  # another sensor's use changes nothing
-    second.height_m(STILL)
+    second.height_m(STILL)  # another sensor's use changes nothing
     a, b, c = (s.imu(NOTHING).force_mps2 for s in (first, second, other))
     np.testing.assert_array_equal(a, b)
     assert not np.array_equal(a, c)
@@ -115,7 +102,7 @@ def test_rates_are_those_of_the_steps():
             steps_between(rate)
 
 
-@pytest.mark.parametrize("sensor", [Imu, Compass, Barometer, Gps])
+@pytest.mark.parametrize("sensor", [Imu, Compass, Barometer])
 def test_a_sensor_without_noise_or_rate_is_refused_by_name(sensor):
     for name in sensor.__dataclass_fields__:
         with pytest.raises(OptionError, match=name):

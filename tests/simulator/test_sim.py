@@ -295,7 +295,7 @@ def test_options_are_refused_by_name(town):
         SensorNoise(tilt_sd_deg=-1.0)
     with pytest.raises(OptionError, match="height_sd_m"):
         SensorNoise(height_sd_m=float("nan"))
-    with pytest.raises(OptionError, match="cruise_mps: expected above 0"):
+    with pytest.raises(OptionError, match="cruise_mps: expected a number above 0"):
         FlightStyle(cruise_mps=0.0)
     with pytest.raises(OptionError, match="peak_tilt_deg"):
         FlightStyle(acceleration_mps2=2.0)

@@ -25,12 +25,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from bench.live.flights.recorded import recorded
 from bench.live.standin import State
-from engine.geo import LocalFrame
+from engine.geo import Array, LocalFrame
 
 SIZE = (640, 400)
 """Of the pictures; 852 x 480 of the video leave 106 and 40 pixels on either side."""
-
-Array = NDArray[np.float64]
 
 
 def ground_from_pixel(state: State, size: tuple[int, int], focal_px: float) -> Array:

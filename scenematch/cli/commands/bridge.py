@@ -25,7 +25,9 @@ from scenematch.cli.options import (
     SettingsOption,
     StartOption,
     SurfaceOption,
+    flag,
     live_view,
+    option,
     read_settings,
     table,
     with_options,
@@ -44,21 +46,15 @@ class LinkOptions:
 
     connect: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--connect",
-            metavar="LINK",
-            help="udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
-            rich_help_panel=INPUT,
+            "LINK",
+            "udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
+            INPUT,
         ),
     ] = None
     firmware: Annotated[
-        str | None,
-        typer.Option(
-            "--firmware",
-            metavar="ardupilot|px4",
-            help="Firmware of the autopilot (default: ardupilot).",
-            rich_help_panel=INPUT,
-        ),
+        str | None, option("--firmware", "ardupilot|px4", "Firmware of the autopilot (default: ardupilot).", INPUT)
     ] = None
 
     def link(self, settings: Settings) -> MavlinkSettings:
@@ -72,31 +68,20 @@ class PictureOptions(CameraOptions):
     """The camera, or recorded pictures."""
 
     frames: Annotated[
-        Path | None,
-        typer.Option(
-            "--frames",
-            metavar="DIR|VIDEO",
-            help="Recorded pictures, replayed in real time.",
-            rich_help_panel=INPUT,
-        ),
+        Path | None, option("--frames", "DIR|VIDEO", "Recorded pictures, replayed in real time.", INPUT)
     ] = None
     telemetry: Annotated[
         Path | None,
-        typer.Option(
+        option(
             "--telemetry",
-            metavar="FILE",
-            help="telemetry.csv that times the replay (default: the video's own timestamps).",
-            rich_help_panel=INPUT,
+            "FILE",
+            "telemetry.csv that times the replay (default: the video's own timestamps).",
+            INPUT,
         ),
     ] = None
     camera_source: Annotated[
         str | None,
-        typer.Option(
-            "--camera-source",
-            metavar="N|URL|exec:CMD",
-            help="A camera, a stream, or a command that writes JPEGs.",
-            rich_help_panel=INPUT,
-        ),
+        option("--camera-source", "N|URL|exec:CMD", "A camera, a stream, or a command that writes JPEGs.", INPUT),
     ] = None
 
 
@@ -127,12 +112,7 @@ class MatchingOptions:
 class OptionalMapOptions:
     """The map, needed only to send fixes."""
 
-    map: Annotated[
-        Path | None,
-        typer.Option(
-            "--map", metavar="FILE", help="GeoTIFF, or a picture with a world file.", rich_help_panel=MAP
-        ),
-    ] = None
+    map: Annotated[Path | None, option("--map", "FILE", "GeoTIFF, or a picture with a world file.", MAP)] = None
     surface: SurfaceOption = None
 
     def map_input(self, settings: Settings) -> MapInput:
@@ -148,21 +128,11 @@ class OtherWork:
 
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--write-params",
-            metavar="FILE",
-            help="Write the autopilot's parameters for these fixes, then exit.",
-            rich_help_panel=OUTPUT,
-        ),
+        option("--write-params", "FILE", "Write the autopilot's parameters for these fixes, then exit.", OUTPUT),
     ] = None
-    measure_delay: Annotated[
-        bool,
-        typer.Option(
-            "--measure-delay",
-            help="Measure the camera's latency, then exit.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = False
+    measure_delay: Annotated[bool, flag("--measure-delay", "Measure the camera's latency, then exit.", OUTPUT)] = (
+        False
+    )
 
 
 @with_options
@@ -174,11 +144,7 @@ def mavlink(
     other: OtherWork,
     supervise: Annotated[
         bool,
-        typer.Option(
-            "--supervise",
-            help="Keep a loaded standby process that takes over if the worker dies.",
-            rich_help_panel=EXPERT,
-        ),
+        flag("--supervise", "Keep a loaded standby process that takes over if the worker dies.", EXPERT),
     ] = False,
     settings: SettingsOption = None,
     rerun: RerunOption = None,
@@ -282,25 +248,23 @@ def ros(
             metavar="NAME:=VALUE", help="ROS remaps; for ROS 2 after --ros-args, which also takes parameters."
         ),
     ] = None,
-    version: Annotated[
-        int, typer.Option("--ros", metavar="1|2", help="rospy or rclpy.", rich_help_panel=INPUT)
-    ] = 2,
+    version: Annotated[int, option("--ros", "1|2", "rospy or rclpy.", INPUT)] = 2,
     image: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--image-topic",
-            metavar="NAME",
-            help="Image topic, raw or compressed; set other topics by --settings ros.topics.imu=NAME.",
-            rich_help_panel=INPUT,
+            "NAME",
+            "Image topic, raw or compressed; set other topics by --settings ros.topics.imu=NAME.",
+            INPUT,
         ),
     ] = None,
     firmware: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--firmware",
-            metavar="none|ardupilot|px4",
-            help="Autopilot behind MAVROS that receives the poses (default: none).",
-            rich_help_panel=INPUT,
+            "none|ardupilot|px4",
+            "Autopilot behind MAVROS that receives the poses (default: none).",
+            INPUT,
         ),
     ] = None,
     settings: SettingsOption = None,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
-
 from scenematch.cli import console, tables
 from scenematch.cli.options import (
     FlightOptions,
@@ -15,6 +13,7 @@ from scenematch.cli.options import (
     SettingsOption,
     StartOption,
     flight_options,
+    option,
     read_settings,
     with_options,
 )
@@ -26,11 +25,7 @@ def compare(
     out: OutOption,
     runs: Annotated[
         list[str] | None,
-        typer.Option(
-            "--run",
-            metavar="METHOD[/PROFILE]|FILE",
-            help="One run; repeat for more (default: the paper's Table I).",
-        ),
+        option("--run", "METHOD[/PROFILE]|FILE", "One run; repeat for more (default: the paper's Table I)."),
     ] = None,
     start: StartOption = None,
     settings: SettingsOption = None,
@@ -39,11 +34,11 @@ def compare(
 ) -> None:
     """Compare methods or settings on one flight.
 
-    Tracks the flight once per run, each into its own folder, and compares the runs in one table and one chart.
+    Tracks the flight once per run, each into its own folder, and compares the runs in one table and on one page.
     --settings applies to all runs; a run's own file takes precedence.
     """
-    from scenematch.runs.comparison import CHART, parse_runs
     from scenematch.runs.comparison import compare as compare_runs
+    from scenematch.runs.comparison import parse_runs
     from scenematch.runs.reporting import COMPARISON
 
     given = read_settings(settings)
@@ -55,7 +50,6 @@ def compare(
     else:
         tables.print_comparison(results, str(flight.frames))
         console.say(f"written to {out}")
-    # The chart is always drawn; the page only if it has enough colours for the runs.
-    drawn = next((out / name for name in (COMPARISON, CHART) if (out / name).is_file()), out)
+    drawn = out / COMPARISON if (out / COMPARISON).is_file() else out
     following = f"track {flight_options(files, settings=settings, start=start)} --out out"
     console.next_step(following, as_json=as_json, hint=f"open {console.quoted(drawn)}")

@@ -5,22 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from scenematch.cli import console, tables
-from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, use_threads
+from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, option, use_threads
 
 
 def demo(
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Report folder.", rich_help_panel=OUTPUT)
-    ] = Path("demo-report"),
-    frames: Annotated[
-        int | None, typer.Option("--frames", min=2, metavar="N", help="Fly only the first N frames.")
-    ] = None,
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, metavar="N", help="Number of the generated town and flight.")
-    ] = 1,
+    out: Annotated[Path, option("--out", "DIR", "Report folder.", OUTPUT)] = Path("demo-report"),
+    frames: Annotated[int | None, option("--frames", "N", "Fly only the first N frames.", min=2)] = None,
+    seed: Annotated[int, option("--seed", "N", "Number of the generated town and flight.", min=0)] = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:

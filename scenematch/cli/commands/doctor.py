@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from scenematch.cli import console
-from scenematch.cli.options import OUTPUT, JsonOption
+from scenematch.cli.options import OUTPUT, JsonOption, flag
 
 _DISTRIBUTION = "scenematch-engine"  # "scenematch" on PyPI is another project
 _DEVELOPERS = ("test", "bench", "docs", "dev")
@@ -29,9 +29,7 @@ _HEAD = """\
 
 
 def doctor(
-    settings: Annotated[
-        bool, typer.Option("--settings", help="Print a settings file with every setting.", rich_help_panel=OUTPUT)
-    ] = False,
+    settings: Annotated[bool, flag("--settings", "Print a settings file with every setting.", OUTPUT)] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Show versions, devices and missing packages.

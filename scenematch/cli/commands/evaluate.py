@@ -9,25 +9,16 @@ import typer
 
 from engine.errors import OptionError
 from scenematch.cli import console, tables
-from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, after_track
+from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, after_track, option
 
 
 def evaluate(
     runs: Annotated[list[Path], typer.Argument(metavar="DIR", help="Output folders of track.")],
     truth: Annotated[
-        Path | None,
-        typer.Option(
-            "--truth", metavar="FILE", help="truth.csv, log or photographs (default: the one that track used)."
-        ),
+        Path | None, option("--truth", "FILE", "truth.csv, log or photographs (default: the one that track used).")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            metavar="FILE",
-            help="Page that compares several runs (default: comparison.html).",
-            rich_help_panel=OUTPUT,
-        ),
+        Path | None, option("--out", "FILE", "Page that compares several runs (default: comparison.html).", OUTPUT)
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,

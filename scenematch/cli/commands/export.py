@@ -8,23 +8,18 @@ from typing import Annotated
 import typer
 
 from scenematch.cli import console
-from scenematch.cli.options import OUTPUT, ForceOption, JsonOption
+from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, option
 
 
 def export(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of track.")],
-    kind: Annotated[str, typer.Option("--format", metavar="gpx|geojson|tum", help="What is written.")],
+    kind: Annotated[str, option("--format", "gpx|geojson|tum", "What is written.")],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", metavar="FILE", help="File to write (default: track.FORMAT in DIR).", rich_help_panel=OUTPUT
-        ),
+        Path | None, option("--out", "FILE", "File to write (default: track.FORMAT in DIR).", OUTPUT)
     ] = None,
     truth: Annotated[
         Path | None,
-        typer.Option(
-            "--truth", metavar="FILE", help="Export this reference at the times of the fixes instead of the track."
-        ),
+        option("--truth", "FILE", "Export this reference at the times of the fixes instead of the track."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,

@@ -17,6 +17,7 @@ from scenematch.cli.options import (
     MethodOption,
     SettingsOption,
     StartOption,
+    option,
     read_settings,
     with_options,
 )
@@ -30,16 +31,10 @@ def locate(
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="One picture.")],
     site: MapOptions,
     lens: CameraOptions,
-    height_agl_m: Annotated[
-        float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground.")
-    ] = None,
-    heading_deg: Annotated[
-        float | None, typer.Option("--heading", metavar="DEG", help="Degrees clockwise from true north.")
-    ] = None,
-    roll_deg: Annotated[
-        float | None, typer.Option("--roll", metavar="DEG", help="Degrees, right side down.")
-    ] = None,
-    pitch_deg: Annotated[float | None, typer.Option("--pitch", metavar="DEG", help="Degrees, nose up.")] = None,
+    height_agl_m: Annotated[float | None, option("--height-agl", "M", "Metres above the ground.")] = None,
+    heading_deg: Annotated[float | None, option("--heading", "DEG", "Degrees clockwise from true north.")] = None,
+    roll_deg: Annotated[float | None, option("--roll", "DEG", "Degrees, right side down.")] = None,
+    pitch_deg: Annotated[float | None, option("--pitch", "DEG", "Degrees, nose up.")] = None,
     start: StartOption = None,
     method: MethodOption = None,
     device: DeviceOption = None,

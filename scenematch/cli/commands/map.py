@@ -18,6 +18,8 @@ from scenematch.cli.options import (
     OutOption,
     SettingsOption,
     SurfaceOption,
+    flag,
+    option,
     read_settings,
     table,
     with_options,
@@ -31,17 +33,11 @@ def info(
     surface: SurfaceOption = None,
     map_bounds: Annotated[
         str | None,
-        typer.Option(
-            "--map-bounds",
-            metavar="W,S,E,N",
-            help="Bounds of a picture without georeference, in degrees or in --map-crs.",
-            rich_help_panel=MAP,
+        option(
+            "--map-bounds", "W,S,E,N", "Bounds of a picture without georeference, in degrees or in --map-crs.", MAP
         ),
     ] = None,
-    map_crs: Annotated[
-        str | None,
-        typer.Option("--map-crs", metavar="EPSG:N", help="CRS, if the map names none.", rich_help_panel=MAP),
-    ] = None,
+    map_crs: Annotated[str | None, option("--map-crs", "EPSG:N", "CRS, if the map names none.", MAP)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show size, ground sample distance, CRS and bounds.
@@ -63,32 +59,20 @@ def audit(
     surface: SurfaceOption = None,
     camera: Annotated[
         Path | None,
-        typer.Option(
-            "--camera",
-            metavar="FILE",
-            help="Calibration file (default: 300 x 300 px with a 60 degree field of view).",
-        ),
+        option("--camera", "FILE", "Calibration file (default: 300 x 300 px with a 60 degree field of view)."),
     ] = None,
     height_agl_m: Annotated[
-        float | None, typer.Option("--height-agl", metavar="M", help="Metres above the ground (default: 150).")
+        float | None, option("--height-agl", "M", "Metres above the ground (default: 150).")
     ] = None,
     route: Annotated[
-        Path | None,
-        typer.Option("--route", metavar="FILE", help="GeoJSON LineString, or a QGroundControl .plan."),
+        Path | None, option("--route", "FILE", "GeoJSON LineString, or a QGroundControl .plan.")
     ] = None,
-    around: Annotated[
-        str | None,
-        typer.Option("--around", metavar="LAT,LON,RADIUS_M", help="Audit only this circle."),
-    ] = None,
+    around: Annotated[str | None, option("--around", "LAT,LON,RADIUS_M", "Audit only this circle.")] = None,
     corridor_m: Annotated[
-        float | None,
-        typer.Option("--corridor-m", metavar="M", help="Audit only this distance to either side of the route."),
+        float | None, option("--corridor-m", "M", "Audit only this distance to either side of the route.")
     ] = None,
     other: Annotated[
-        Path | None,
-        typer.Option(
-            "--other", metavar="FILE", help="Map of the same ground at another date, to find stale areas."
-        ),
+        Path | None, option("--other", "FILE", "Map of the same ground at another date, to find stale areas.")
     ] = None,
     settings: SettingsOption = None,
     force: ForceOption = False,
@@ -128,52 +112,34 @@ class WantedMap:
     """What is fetched."""
 
     around: Annotated[
-        str,
-        typer.Option(
-            "--around", metavar="LAT,LON|DIR", help="Centre of the map, or a folder of photographs with positions."
-        ),
+        str, option("--around", "LAT,LON|DIR", "Centre of the map, or a folder of photographs with positions.")
     ]
-    source: Annotated[
-        str,
-        typer.Option("--source", metavar="URL", help="Tiles as https://host/{z}/{x}/{y}.png, a WMS or a WMTS."),
-    ]
+    source: Annotated[str, option("--source", "URL", "Tiles as https://host/{z}/{x}/{y}.png, a WMS or a WMTS.")]
     radius_m: Annotated[
         float | None,
-        typer.Option(
+        option(
             "--radius-m",
-            metavar="M",
-            help="Minimum distance from the centre to each edge (default: what the photographs cover).",
+            "M",
+            "Minimum distance from the centre to each edge (default: what the photographs cover).",
         ),
     ] = None
     gsd_m_per_px: Annotated[
         float | None,
-        typer.Option(
-            "--gsd-m-per-px", metavar="M", help="Coarsest resolution (default: 0.5, or what the photographs need)."
-        ),
+        option("--gsd-m-per-px", "M", "Coarsest resolution (default: 0.5, or what the photographs need)."),
     ] = None
-    layer: Annotated[
-        str | None, typer.Option("--layer", metavar="NAME", help="Layer, if a WMS or WMTS has several.")
-    ] = None
+    layer: Annotated[str | None, option("--layer", "NAME", "Layer, if a WMS or WMTS has several.")] = None
     surface: Annotated[
         str | None,
-        typer.Option(
-            "--surface",
-            metavar="FILE|URL",
-            help="Surface model to fetch too; {lat} and {lon} become N48 and E016.",
-        ),
+        option("--surface", "FILE|URL", "Surface model to fetch too; {lat} and {lon} become N48 and E016."),
     ] = None
 
 
 @with_options
 def fetch(
     what: WantedMap,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="The map, a GeoTIFF.", rich_help_panel=OUTPUT)
-    ],
+    out: Annotated[Path, option("--out", "FILE", "The map, a GeoTIFF.", OUTPUT)],
     settings: SettingsOption = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be fetched, then exit.", rich_help_panel=EXPERT)
-    ] = False,
+    dry_run: Annotated[bool, flag("--dry-run", "Show what would be fetched, then exit.", EXPERT)] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -7,8 +7,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from engine.errors import OptionError
 from scenematch.cli import console
 from scenematch.cli.options import (
@@ -18,7 +16,9 @@ from scenematch.cli.options import (
     JsonOption,
     RerunOption,
     SurfaceOption,
+    flag,
     live_view,
+    option,
     use_threads,
     with_options,
 )
@@ -37,28 +37,17 @@ _FLIGHT = {
 class WorldOptions:
     """What is flown over."""
 
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, metavar="N", help="Number of the generated town and flight.")
-    ] = 1
+    seed: Annotated[int, option("--seed", "N", "Number of the generated town and flight.", min=0)] = 1
     condition: Annotated[
-        str | None,
-        typer.Option(
-            "--condition", metavar="NAME", help="Light, season and weather in the frames (default: noon)."
-        ),
+        str | None, option("--condition", "NAME", "Light, season and weather in the frames (default: noon).")
     ] = None
-    relief_m: Annotated[float, typer.Option("--relief-m", metavar="H", help="Height of the town's hills.")] = 0.0
-    map: Annotated[
-        Path | None,
-        typer.Option(
-            "--map", metavar="FILE", help="Fly over this map instead of a generated town.", rich_help_panel=MAP
-        ),
-    ] = None
+    relief_m: Annotated[float, option("--relief-m", "H", "Height of the town's hills.")] = 0.0
+    map: Annotated[Path | None, option("--map", "FILE", "Fly over this map instead of a generated town.", MAP)] = (
+        None
+    )
     surface: SurfaceOption = None
     camera_pitch_deg: Annotated[
-        float,
-        typer.Option(
-            "--camera-pitch-deg", metavar="P", help="Pitch of the camera: -90 straight down, -45 oblique."
-        ),
+        float, option("--camera-pitch-deg", "P", "Pitch of the camera: -90 straight down, -45 oblique.")
     ] = -90.0
 
     def world(self) -> WorldSettings:
@@ -72,22 +61,15 @@ class WorldOptions:
 class LoopOptions:
     """How the loop is closed, if it is."""
 
-    closed_loop: Annotated[
-        bool, typer.Option("--closed-loop", help="Steer by the engine's fixes, with GPS off.")
-    ] = False
+    closed_loop: Annotated[bool, flag("--closed-loop", "Steer by the engine's fixes, with GPS off.")] = False
     minutes: Annotated[
-        float | None,
-        typer.Option("--minutes", metavar="M", help="With --closed-loop: minutes to fly (default: 5)."),
+        float | None, option("--minutes", "M", "With --closed-loop: minutes to fly (default: 5).")
     ] = None
     method: Annotated[
-        str | None,
-        typer.Option(
-            "--method", metavar="auto|ncc|sift", help="With --closed-loop: matching method (default: auto)."
-        ),
+        str | None, option("--method", "auto|ncc|sift", "With --closed-loop: matching method (default: auto).")
     ] = None
     fault: Annotated[
-        str | None,
-        typer.Option("--fault", metavar="none|killed|shifted|frozen", help="With --closed-loop: fault to inject."),
+        str | None, option("--fault", "none|killed|shifted|frozen", "With --closed-loop: fault to inject.")
     ] = None
 
     def given(self) -> dict[str, Any]:
@@ -97,15 +79,10 @@ class LoopOptions:
 
 @with_options
 def simulate(
-    out: Annotated[
-        Path,
-        typer.Option("--out", metavar="DIR", help="Flight folder, created by this run.", rich_help_panel=OUTPUT),
-    ],
+    out: Annotated[Path, option("--out", "DIR", "Flight folder, created by this run.", OUTPUT)],
     town: WorldOptions,
     loop: LoopOptions,
-    frames: Annotated[
-        int | None, typer.Option("--frames", min=1, metavar="N", help="Fly only the first N frames.")
-    ] = None,
+    frames: Annotated[int | None, option("--frames", "N", "Fly only the first N frames.", min=1)] = None,
     rerun: RerunOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,

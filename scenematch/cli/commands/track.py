@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
-
 from scenematch.cli import console, tables
 from scenematch.cli.options import (
     EXPERT,
@@ -21,6 +19,7 @@ from scenematch.cli.options import (
     StartOption,
     after_track,
     live_view,
+    option,
     read_settings,
     with_options,
 )
@@ -35,22 +34,13 @@ def track(
     method: MethodOption = None,
     profile: Annotated[
         str | None,
-        typer.Option(
-            "--profile",
-            metavar="engine|paper",
-            help="paper: the paper's own recipe for ncc or sift (default: engine).",
-            rich_help_panel=EXPERT,
+        option(
+            "--profile", "engine|paper", "paper: the paper's own recipe for ncc or sift (default: engine).", EXPERT
         ),
     ] = None,
     device: DeviceOption = None,
     budget_ms: Annotated[
-        float | None,
-        typer.Option(
-            "--budget-ms",
-            metavar="MS",
-            help="Longest time per frame; later answers are refused.",
-            rich_help_panel=EXPERT,
-        ),
+        float | None, option("--budget-ms", "MS", "Longest time per frame; later answers are refused.", EXPERT)
     ] = None,
     settings: SettingsOption = None,
     rerun: RerunOption = None,

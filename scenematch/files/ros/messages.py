@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from engine.camera import DISTORTION_MODELS, Camera
 from engine.errors import CalibrationError, TelemetryError
-from engine.geo import Array, attitude_from_rotation, enu_from_body
+from engine.geo import Array, attitude_from_rotation
+from scenematch.files.quaternions import quaternion_xyzw, rotation_of
 from scenematch.files.velocities import velocity_sigma_mps
 
 CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4}
@@ -209,13 +210,7 @@ def _rotation(q: Any) -> Array | None:
     square = x * x + y * y + z * z + w * w
     if not abs(square - 1.0) < _NORM_TOLERANCE:
         return None
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotation_of(w, x, y, z)
 
 
 def range_from_message(message: Any) -> float | None:
@@ -314,22 +309,3 @@ class MessageFactory:
             position_covariance=np.asarray(covariance_m2, np.float64).ravel(),
             position_covariance_type=_COVARIANCE_KNOWN,
         )
-
-
-def quaternion_xyzw(roll_deg: float, pitch_deg: float, heading_deg: float) -> tuple[float, float, float, float]:
-    """Quaternion that rotates the body (forward-left-up) to east-north-up, w not negative."""
-    m = enu_from_body(roll_deg, pitch_deg, heading_deg) @ _FLU_FROM_FRD
-    # The largest of the four squares is at least 1/4, so that dividing by its root is stable.
-    squares = np.array([1 + 2 * m[i, i] - np.trace(m) for i in range(3)] + [1 + np.trace(m)]) / 4.0
-    k = int(np.argmax(squares))
-    sums = np.array(
-        [
-            [4 * squares[0], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
-            [m[0, 1] + m[1, 0], 4 * squares[1], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]],
-            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 4 * squares[2], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], 4 * squares[3]],
-        ]
-    )
-    q = sums[k] / (4.0 * math.sqrt(squares[k]))
-    x, y, z, w = (float(v) for v in (q if q[3] >= 0.0 else -q))
-    return x, y, z, w
