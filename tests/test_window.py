@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from engine import Fix, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, SceneMatcher, Window
@@ -62,6 +62,7 @@ def test_a_window_inside_the_map_holds_the_pixels_whose_area_it_touches():
     size=st.tuples(st.floats(0.5, 150.0), st.floats(0.5, 150.0)),
     limit=st.tuples(st.integers(1, 100), st.integers(1, 100)),
 )
+@example(center=(105.2, 50.0), size=(10.0, 10.0), limit=(100, 100))  # it ends where the map does
 def test_a_window_is_what_the_crop_and_the_map_have_in_common(center, size, limit):
     window = place_window(center, size, limit)
     common = []
