@@ -43,18 +43,7 @@ def flight(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(
-            page,
-            id=page_name(page),
-            marks=[pytest.mark.slow] if page.stem in ("simulator", "own-matcher", "learned") else [],
-        )
-        for page in PAGES
-        if FENCE.search(page.read_text(encoding="utf-8"))
-    ],
-)
+@pytest.mark.parametrize("page", [page for page in PAGES if FENCE.search(page.read_text("utf-8"))], ids=page_name)
 def test_snippets_run_as_they_stand(page, flight, monkeypatch):
     monkeypatch.chdir(flight)
     names = {"__name__": page.stem}  # the snippets of a page follow each other

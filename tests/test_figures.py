@@ -44,60 +44,32 @@ FIGURES = {  # page: claim: the rows that state it, by results page, heading and
             ("field.md", "`caliterra`", "survey photographs"),
             ("paper-stack.md", "The paper's stack", "The world is"),
         ],
-        "was 0.11 m RMS off": [
-            ("mavlink.md", "ArduCopter SITL", "| NCC, `vision_position_estimate`, 5 min |"),
-        ],
-        "PX4's 0.24 m": [
-            ("mavlink.md", "PX4 SITL", "| `odometry`, 5 min |"),
-        ],
-        "NCC 2.4 m at 40 ms": [
-            ("latency.md", "Table I", "| NCC, as published |"),
-        ],
-        "SIFT 2.1 m at 121 ms": [
-            ("latency.md", "Table I", "| SIFT, as published |"),
-        ],
+        "was 0.11 m RMS off": [("mavlink.md", "ArduCopter SITL", "| NCC, `vision_position_estimate`, 5 min |")],
+        "PX4's 0.24 m": [("mavlink.md", "PX4 SITL", "| `odometry`, 5 min |")],
+        "NCC 2.4 m at 40 ms": [("latency.md", "Table I", "| NCC, as published |")],
+        "SIFT 2.1 m at 121 ms": [("latency.md", "Table I", "| SIFT, as published |")],
     },
     "docs/budget.md": {
         "from 12.9 to 11.8 ms": [
             ("latency.md", "Table I", "| auto, scenematch | 1 |"),
             ("latency.md", "Table I", "| auto, scenematch | 2 |"),
-        ],
+        ]
     },
     "docs/calibrate.md": {
-        "300 x 300 px were enough from 100 m": [
-            ("mavlink.md", "ArduCopter SITL", "ArduCopter 4.8-dev"),
-        ],
+        "300 x 300 px were enough from 100 m": [("mavlink.md", "ArduCopter SITL", "ArduCopter 4.8-dev")]
     },
-    "docs/embed.md": {
-        "takes `auto` 13 ms": [
-            ("latency.md", "Table I", "| auto, scenematch | 1 |"),
-        ],
-    },
-    "docs/datasets.md": {
-        "by 26 degrees": [
-            ("datasets.md", "Published", "The 26 degrees"),
-        ],
-    },
+    "docs/embed.md": {"takes `auto` 13 ms": [("latency.md", "Table I", "| auto, scenematch | 1 |")]},
+    "docs/datasets.md": {"by 26 degrees": [("datasets.md", "Published", "The 26 degrees")]},
     "docs/first-hour.md": {
         "300 of 300 frames were fixed, with 0.22 m RMS and 1.22 m at most": [
-            ("simulator.md", "The first hour", "| `track`"),
-        ],
+            ("simulator.md", "The first hour", "| `track`")
+        ]
     },
-    "docs/how-ncc-works.md": {
-        "from 1.4 to 0.15 m": [
-            ("ncc.md", "Dense refinement", "| `gazebo-a1` |"),
-        ],
-    },
+    "docs/how-ncc-works.md": {"from 1.4 to 0.15 m": [("ncc.md", "Dense refinement", "| `gazebo-a1` |")]},
     "docs/mavlink.md": {
-        "0.24 m RMS off in simulation": [
-            ("mavlink.md", "PX4 SITL", "| `odometry`, 5 min |"),
-        ],
-        "by `global_position_sensor` 1.4 m": [
-            ("mavlink.md", "PX4 SITL", "| `global_position_sensor`, 1"),
-        ],
-        "some 0.1 s": [
-            ("vehicle.md", "The unit of systemd", "| worker killed |"),
-        ],
+        "0.24 m RMS off in simulation": [("mavlink.md", "PX4 SITL", "| `odometry`, 5 min |")],
+        "by `global_position_sensor` 1.4 m": [("mavlink.md", "PX4 SITL", "| `global_position_sensor`, 1")],
+        "some 0.1 s": [("vehicle.md", "The unit of systemd", "| worker killed |")],
         "takes 3.2 s by NCC and 6.2 s by `auto`": [
             ("mavlink.md", "Flights with faults", "| NCC | 5.0"),
             ("mavlink.md", "Flights with faults", "| `auto` | 9.0"),
@@ -108,9 +80,7 @@ FIGURES = {  # page: claim: the rows that state it, by results page, heading and
             ("odometry.md", "Gaps", "Velocities are withheld"),
             ("odometry.md", "Gaps", "| gazebo-a1 | odometry |"),
         ],
-        "4 m on real video": [
-            ("odometry.md", "Gaps", "| nust | odometry |"),
-        ],
+        "4 m on real video": [("odometry.md", "Gaps", "| nust | odometry |")],
     },
     "docs/seasons.md": {
         "NCC answered 93 to 100 %": [
@@ -123,54 +93,30 @@ FIGURES = {  # page: claim: the rows that state it, by results page, heading and
         ],
     },
     "docs/vehicle.md": {
-        "some 0.1 s": [
-            ("vehicle.md", "The unit of systemd", "| worker killed |"),
-        ],
-        "the fixes of x86-64 to 0.15 mm": [
-            ("vehicle.md", "arm64", "| 11 frames"),
-        ],
-        "1.5 GB on disk": [
-            ("vehicle.md", "On disk", "| plain |"),
-        ],
-        "0.3 GB of memory for NCC": [
-            ("vehicle.md", "To the first fix", "| ncc | all kept |"),
-        ],
-        "0.6 GB for `auto`": [
-            ("vehicle.md", "To the first fix", "| auto | all kept |"),
-        ],
+        "some 0.1 s": [("vehicle.md", "The unit of systemd", "| worker killed |")],
+        "the fixes of x86-64 to 0.15 mm": [("vehicle.md", "arm64", "| 11 frames")],
+        "1.5 GB on disk": [("vehicle.md", "On disk", "| plain |")],
+        "0.3 GB of memory for NCC": [("vehicle.md", "To the first fix", "| ncc | all kept |")],
+        "0.6 GB for `auto`": [("vehicle.md", "To the first fix", "| auto | all kept |")],
         "1 to 3 s to the first fix": [
             ("vehicle.md", "To the first fix", "| ncc | all kept |"),
             ("vehicle.md", "To the first fix", "| auto | all kept |"),
         ],
-        "35 s before that": [
-            ("vehicle.md", "To the first fix", "| auto | nothing kept |"),
-        ],
+        "35 s before that": [("vehicle.md", "To the first fix", "| auto | nothing kept |")],
     },
     "docs/walkthrough-photographs.md": {
         "nine photographs from 44 m SIFT fixed 6 on a map of 0.41 m/px (1.83 m RMS)": [
             ("photographs.md", "Photographs", "`brighton`"),
             ("photographs.md", "The map", "| 0.41"),
         ],
-        "all on one of 0.10 (0.91 m": [
-            ("photographs.md", "The map", "| 0.10"),
-        ],
-        "RMS error 0.95 m median error 0.82 m": [
-            ("photographs.md", "The map", "| `track"),
-        ],
-        "within 1.35 m largest error 1.37 m": [
-            ("photographs.md", "The map", "| `track"),
-        ],
-        "9 of 9, 1.04 m": [
-            ("photographs.md", "The map", "| the same"),
-        ],
+        "all on one of 0.10 (0.91 m": [("photographs.md", "The map", "| 0.10")],
+        "RMS error 0.95 m median error 0.82 m": [("photographs.md", "The map", "| `track")],
+        "within 1.35 m largest error 1.37 m": [("photographs.md", "The map", "| `track")],
+        "9 of 9, 1.04 m": [("photographs.md", "The map", "| the same")],
     },
     "docs/wrong-inputs.md": {
-        "3 degrees of heading": [
-            ("wrong-inputs.md", "Faults", "| heading off by 3 |"),
-        ],
-        "5 % of the focal length": [
-            ("wrong-inputs.md", "Faults", "| focal length off by 5 % |"),
-        ],
+        "3 degrees of heading": [("wrong-inputs.md", "Faults", "| heading off by 3 |")],
+        "5 % of the focal length": [("wrong-inputs.md", "Faults", "| focal length off by 5 % |")],
     },
 }
 

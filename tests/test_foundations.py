@@ -39,7 +39,7 @@ from engine import (
     Window,
 )
 from engine.budget import Deadline
-from engine.runtime.device import resolve, synchronise
+from engine.runtime.device import resolve
 from engine.runtime.threads import set_threads
 from engine.values import Peak
 from tests.support.fixes import a_fix
@@ -78,13 +78,10 @@ def test_a_budget_is_above_zero(total_ms):
         Budget(total_ms=total_ms)
 
 
-def test_a_budget_is_a_value():
-    assert Budget(total_ms=40.0) == Budget(total_ms=40.0)
-    assert Budget().total_ms == math.inf
+def test_a_budget_is_endless_unless_stated_and_stated_by_name():
+    assert Deadline(Budget(), lambda: 10**18).remaining_ms == math.inf
     with pytest.raises(TypeError):
         Budget(40.0)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        Budget().total_ms = 3.0
 
 
 def test_a_deadline_runs_from_its_start_to_its_budget():
@@ -98,30 +95,6 @@ def test_a_deadline_runs_from_its_start_to_its_budget():
     clock.wait_ms(0.001)
     assert not deadline.met
     assert deadline.remaining_ms == pytest.approx(-0.001)
-
-
-def test_a_deadline_of_nobody_is_always_met():
-    clock = Clock()
-    deadline = Deadline(Budget(), clock)
-    clock.wait_ms(1e12)
-    assert deadline.met
-    assert deadline.remaining_ms == math.inf
-
-
-def test_two_deadlines_do_not_share_their_start():
-    clock = Clock()
-    first = Deadline(Budget(total_ms=10.0), clock)
-    clock.wait_ms(8.0)
-    second = Deadline(Budget(total_ms=10.0), clock)
-    clock.wait_ms(5.0)
-    assert (first.met, second.met) == (False, True)
-
-
-def test_the_clock_of_a_deadline_is_monotonic():
-    deadline = Deadline(Budget(total_ms=60_000.0))
-    seen = [deadline.elapsed_ms for _ in range(100)]
-    assert seen == sorted(seen)
-    assert seen[0] >= 0.0
 
 
 def test_a_frame_that_searches_has_a_budget_of_its_own():
@@ -154,10 +127,6 @@ def test_a_device_that_is_missing_is_a_device_error(name):
         pytest.skip("this machine has that device")
     with pytest.raises(DeviceError, match=rf"^device: {name} was requested, but this machine has \d"):
         resolve(name)
-
-
-def test_waiting_for_the_cpu_is_no_work():
-    synchronise(torch.device("cpu"))
 
 
 def test_threads_are_set_for_torch_and_opencv():
@@ -297,34 +266,21 @@ def test_reasons_are_an_enum_of_their_own_names():
 # Errors
 
 
-@pytest.mark.parametrize(
-    ("error", "base"),
-    [
-        (ShapeError, ValueError), (DtypeError, TypeError), (OptionError, ValueError), (DeviceError, Exception),
-        (MapError, Exception), (CalibrationError, Exception), (TelemetryError, Exception),
-        (BackendError, Exception),
-    ],
-)  # fmt: skip
-def test_every_error_is_an_engine_error(error, base):
-    assert issubclass(error, EngineError)
-    assert issubclass(error, base)
-    assert error.__name__ in engine.errors.__doc__  # the tree is drawn there
+def test_the_tree_of_errors_is_as_it_is_drawn():
+    builtin = {ShapeError: ValueError, DtypeError: TypeError, OptionError: ValueError}
+    named = {*builtin, DeviceError, MapError, CalibrationError, TelemetryError, BackendError}
+    found = {e for e in vars(engine.errors).values() if isinstance(e, type) and issubclass(e, EngineError)}
+    assert named < found
+    assert all(error.__name__ in engine.errors.__doc__ for error in found)
+    assert all(issubclass(error, base) for error, base in builtin.items())
 
 
-def test_the_tree_of_errors_is_whole():
-    drawn = engine.errors.__doc__
-    for name, value in vars(engine.errors).items():
-        if isinstance(value, type) and issubclass(value, engine.errors.EngineError):
-            assert name in drawn
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "environment", "expected"),
     [
-        pytest.param(
-            ["nobody", "before", "after"], {}, ["nobody 1 1", "before 2 2", "after 2 2"], marks=pytest.mark.slow
-        ),
-        pytest.param(["environment"], {"OMP_NUM_THREADS": "2"}, ["environment 2"], marks=pytest.mark.slow),
+        (["nobody", "before", "after"], {}, ["nobody 1 1", "before 2 2", "after 2 2"]),
+        (["environment"], {"OMP_NUM_THREADS": "2"}, ["environment 2"]),
     ],
 )
 def test_a_matcher_takes_one_thread_unless_somebody_chose(words, environment, expected):
@@ -350,11 +306,8 @@ for chosen in sys.argv[1:]:
 """
     bare = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
 
-    def threads(*words, **environment):
-        done = subprocess.run(
-            [sys.executable, "-c", program, *words],
-            capture_output=True, text=True, check=True, env=bare | environment,
-        )  # fmt: skip
-        return [line.rpartition(" ")[0] if environment else line for line in done.stdout.splitlines()]
-
-    assert threads(*words, **environment) == expected
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words],
+        capture_output=True, text=True, check=True, env=bare | environment,
+    )  # fmt: skip
+    assert all(line.startswith(one) for line, one in zip(done.stdout.splitlines(), expected, strict=True))

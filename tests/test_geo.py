@@ -54,12 +54,6 @@ def test_ecef_round_trip_closes_to_a_micrometre(lat_deg, lon_deg, height_m):
     assert float(height) == pytest.approx(height_m, abs=1e-6)
 
 
-def test_ecef_of_landmarks():
-    np.testing.assert_allclose(ecef_from_geodetic(0.0, 0.0), [6378137.0, 0.0, 0.0], atol=1e-9)
-    np.testing.assert_allclose(ecef_from_geodetic(0.0, 90.0), [0.0, 6378137.0, 0.0], atol=1e-8)
-    np.testing.assert_allclose(ecef_from_geodetic(90.0, 0.0), [0.0, 0.0, 6356752.314245], atol=1e-5)
-
-
 @pytest.mark.parametrize(("lat_deg", "lon_deg"), PLACES)
 def test_enu_agrees_with_proj_topocentric(lat_deg, lon_deg):
     lat = lat_deg + np.array([0.0, 0.02, -0.03, 0.05])
@@ -67,22 +61,6 @@ def test_enu_agrees_with_proj_topocentric(lat_deg, lon_deg):
     east, north, _ = topocentric(lat_deg, lon_deg).transform(lon, lat, np.zeros(4))
     enu = LocalFrame(lat_deg, lon_deg).enu_from_geodetic(lat, lon)
     np.testing.assert_allclose(enu, np.stack([east, north], axis=-1), atol=1e-6)
-
-
-def test_enu_of_the_origin_is_zero_and_axes_point_east_and_north():
-    frame = LocalFrame(32.79, 34.99)
-    np.testing.assert_allclose(frame.enu_from_geodetic(32.79, 34.99), [0.0, 0.0], atol=1e-9)
-    assert frame.enu_from_geodetic(32.79, 35.0)[0] > 900.0
-    assert frame.enu_from_geodetic(32.80, 34.99)[1] > 1100.0
-
-
-def test_a_degree_is_as_long_as_the_radii_of_curvature_say():
-    frame = LocalFrame(45.0, 10.0)
-    step_deg = 1e-4
-    north_m = frame.enu_from_geodetic(45.0 + step_deg, 10.0)[1]
-    east_m = frame.enu_from_geodetic(45.0, 10.0 + step_deg)[0]
-    assert north_m / step_deg == pytest.approx(111_131.8, rel=1e-5)
-    assert east_m / step_deg == pytest.approx(78_846.8, rel=1e-5)
 
 
 @given(st.floats(-85.0, 85.0), LONGITUDES, st.floats(-20_000.0, 20_000.0), st.floats(-20_000.0, 20_000.0))
@@ -104,12 +82,8 @@ def test_enu_takes_arrays_of_any_shape():
 @given(st.floats(-89.9, 89.9), LONGITUDES, st.floats(-0.5, 0.5), st.floats(-1.0, 1.0))
 @settings(max_examples=150, deadline=None)
 def test_true_north_is_where_a_step_of_latitude_leads(lat_deg, lon_deg, away_lat_deg, away_lon_deg):
-    frame, lat, lon = (
-        LocalFrame(lat_deg, lon_deg),
-        max(-89.9, min(lat_deg + away_lat_deg, 89.9)),
-        lon_deg + away_lon_deg,
-    )
-    step_deg = 1e-4
+    frame, step_deg = LocalFrame(lat_deg, lon_deg), 1e-4
+    lat, lon = max(-89.9, min(lat_deg + away_lat_deg, 89.9)), lon_deg + away_lon_deg
     south, north = frame.enu_from_geodetic(np.array([lat - step_deg, lat + step_deg]), lon)
     expected = math.degrees(math.atan2(*(north - south)))
     assert abs(math.remainder(frame.convergence_deg(lat, lon) - expected, 360.0)) < 1e-5
@@ -118,16 +92,6 @@ def test_true_north_is_where_a_step_of_latitude_leads(lat_deg, lon_deg, away_lat
 @pytest.mark.parametrize(("lat_deg", "lon_deg"), PLACES)
 def test_true_north_is_the_planes_at_its_origin(lat_deg, lon_deg):
     assert LocalFrame(lat_deg, lon_deg).convergence_deg(lat_deg, lon_deg) == 0.0
-
-
-def test_true_north_of_places_to_the_east_leans_to_the_west_in_the_north_of_the_earth():
-    # 30 km east of the origin; 0.4 degrees of longitude.
-    assert LocalFrame(48.0, 15.0).convergence_deg(48.0, 15.4) == pytest.approx(-0.297, abs=1e-3)
-    assert LocalFrame(-48.0, 15.0).convergence_deg(-48.0, 15.4) == pytest.approx(0.297, abs=1e-3)
-    assert LocalFrame(0.0, 15.0).convergence_deg(0.0, 15.4) == 0.0
-    assert LocalFrame(60.0, 179.9).convergence_deg(60.0, -179.9) == pytest.approx(
-        -0.2 * math.sin(math.radians(60)), abs=1e-6
-    )
 
 
 FORWARD, RIGHT, DOWN = np.eye(3)

@@ -11,7 +11,6 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, shift
-from skimage.feature import match_template
 
 from engine import DtypeError, OptionError, ShapeError
 from engine.ncc_fft import find_peak, ncc
@@ -59,34 +58,12 @@ def test_ncc_equals_opencv(size, model, dtype, zero_mean):
             np.testing.assert_allclose(scores[b, t].numpy(), expected, rtol=0, atol=1e-5)
 
 
-def test_a_batch_is_its_members_one_by_one():
-    rng = torch.Generator().manual_seed(2)
-    search, templates = torch.rand(3, 40, 50, generator=rng), torch.rand(3, 4, 9, 14, generator=rng)
-    together = ncc(search, templates)
-    for b in range(3):
-        for t in range(4):
-            alone = ncc(search[b : b + 1], templates[b : b + 1, t : t + 1])
-            torch.testing.assert_close(together[b : b + 1, t : t + 1], alone, rtol=0, atol=2e-6)
-
-
 def test_a_dark_window_in_a_batch_does_not_disturb_a_bright_one():
     rng = torch.Generator().manual_seed(4)
     search = torch.rand(2, 60, 60, generator=rng) * torch.tensor([1e-3, 1e4])[:, None, None]
     templates = torch.stack([search[b : b + 1, 20:40, 10:30] for b in range(2)])
     for scores in ncc(search, templates):
         assert float(scores[0, 20, 10]) == pytest.approx(1.0, abs=1e-6)
-
-
-@pytest.mark.parametrize("dtype", ["int16", "uint16", "float32", "float64"])
-def test_a_large_offset_costs_no_accuracy(dtype):
-    """Mean 20,000 and deviation 10: squares of float32 would lose every digit that matters."""
-    rng = np.random.default_rng(5)
-    search = np.rint(rng.normal(20_000, 10, (80, 90)))
-    template = np.rint(rng.normal(20_000, 10, (30, 21)))
-    scores = ncc(
-        torch.from_numpy(search.astype(dtype))[None], torch.from_numpy(template.astype(dtype))[None, None]
-    )
-    np.testing.assert_allclose(scores[0, 0].numpy(), match_template(search, template), rtol=0, atol=1e-5)
 
 
 @given(

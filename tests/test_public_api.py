@@ -1,10 +1,9 @@
-"""What ``import engine`` gives and does not load; every public name is described, and documents use no other."""
+"""What ``import engine`` gives and does not load; documents use no other name."""
 
 from __future__ import annotations
 
 import ast
 import importlib
-import inspect
 import json
 import re
 import subprocess
@@ -108,25 +107,6 @@ def test_the_public_names_are_sorted_and_there_is_nothing_else():
         engine.Matcher  # noqa: B018
 
 
-@pytest.mark.parametrize("name", PUBLIC)
-def test_public_names_are_described(name):
-    value = getattr(engine, name)
-    assert inspect.getdoc(value)
-    if inspect.isclass(value):
-        for member, thing in vars(value).items():
-            if not member.startswith("_") and (
-                inspect.isfunction(thing) or isinstance(thing, property | classmethod)
-            ):
-                assert inspect.getdoc(thing), f"{name}.{member}"
-
-
-@pytest.mark.parametrize("module", ["features", "ncc_fft"])
-def test_public_functions_are_described(module):
-    for name, value in vars(getattr(engine, module)).items():
-        if inspect.isfunction(value) and not name.startswith("_") and value.__module__ == f"engine.{module}":
-            assert inspect.getdoc(value), name
-
-
 def public_module(name):
     """A named public module, skipped where the optional package that it needs is missing."""
     if MODULES[name] is not None:
@@ -135,15 +115,12 @@ def public_module(name):
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))
-def test_a_public_module_names_what_it_promises_sorted_and_described(name):
+def test_a_public_module_names_what_it_promises_sorted(name):
     module = public_module(name)
     constants_first = sorted(module.__all__, key=lambda word: (not word.isupper(), not word[0].isupper(), word))
     assert module.__all__ == constants_first
     assert len(set(module.__all__)) == len(module.__all__)
-    for public in module.__all__:
-        value = getattr(module, public)
-        if inspect.isclass(value) or inspect.isfunction(value):
-            assert inspect.getdoc(value), f"{name}.{public}"
+    assert all(hasattr(module, public) for public in module.__all__)
 
 
 def engine_imports(path):

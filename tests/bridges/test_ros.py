@@ -25,7 +25,7 @@ from engine.values import Attitude, NoFix, Reason, Window
 from scenematch.bridges.ros import OUTPUTS, RosBridge
 from scenematch.bridges.ros_in import RosTelemetry, RosTopics
 from scenematch.bridges.ros_out import FIRMWARES, RosOptions, diagnostics, pose, window_picture
-from scenematch.bridges.vehicle import NedOrigin, VehicleState
+from scenematch.bridges.vehicle import NedOrigin, VehicleState, north_east_m
 from scenematch.cli.app import run as main
 from scenematch.cli.argument_names import ros_arguments_last
 from scenematch.files.quaternions import quaternion_xyzw
@@ -40,6 +40,11 @@ from scenematch.files.ros.messages import (
     range_from_message,
     stamp_ns,
 )
+from scenematch.runs.cameras import CameraInput
+from scenematch.runs.map_input import MapInput
+from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
 from tests.support.fixes import a_fix
 from tests.support.ground import body_axes
 from tests.support.odometries import odometry_message, twist_message
@@ -69,6 +74,14 @@ def ros(request):
 @pytest.fixture
 def maker(ros):
     return maker_of(ros)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """A folder with a map and a camera."""
+    folder = tmp_path_factory.mktemp("flight")
+    write_flight(folder, plan_flight(town=drawn_town(), frames=1))
+    return folder
 
 
 # ------------------------------------------------------------------------------------------------- pictures
@@ -212,12 +225,7 @@ def test_quaternions_turn_forward_left_up_to_east_north_up():
         turn = Rotation.from_quat(quaternion_xyzw(*angles)).as_matrix()
         forward, right, down = body_axes(*angles)
         assert np.allclose(turn, np.stack([forward, -right, -down], axis=1), atol=1e-12)
-
-
-def test_facing_east_is_no_turn_and_north_a_quarter():
-    assert quaternion_xyzw(0, 0, 90) == pytest.approx((0, 0, 0, 1))
-    half = math.sqrt(0.5)
-    assert quaternion_xyzw(0, 0, 0) == pytest.approx((0, 0, half, half))
+        assert quaternion_xyzw(*angles)[3] >= 0.0
 
 
 def test_attitudes_come_back(ros, maker):
@@ -459,14 +467,12 @@ def test_a_measured_attitude_outranks_the_vehicles(maker, sim_site):
 
 def test_a_whole_pose_has_the_covariance_of_its_attitude_about_east_north_up(maker, sim_site):
     # Heading east: a roll is a turn about east, a pitch one about north.
-    known = {"attitude": Attitude(0.0, 0.0, 90.0), "attitude_covariance_deg2": np.diag([4.0, 9.0, 16.0])}
-    message = pose(maker, fix_on(sim_site, **known), VEHICLE, NOW_NS, sim_site, RosOptions())
-    turns_deg2 = np.asarray(message.pose.covariance).reshape(6, 6)[3:, 3:] * math.degrees(1.0) ** 2
-    assert turns_deg2 == pytest.approx(np.diag([5.0, 10.0, 17.0]))  # a degree is the mount's
-    north = known | {"attitude": Attitude(0.0, 0.0, 0.0)}
-    message = pose(maker, fix_on(sim_site, **north), VEHICLE, NOW_NS, sim_site, RosOptions())
-    turns_deg2 = np.asarray(message.pose.covariance).reshape(6, 6)[3:, 3:] * math.degrees(1.0) ** 2
-    assert turns_deg2 == pytest.approx(np.diag([10.0, 5.0, 17.0]))
+    known = {"attitude_covariance_deg2": np.diag([4.0, 9.0, 16.0])}
+    for heading_deg, expected in ((90.0, [5.0, 10.0, 17.0]), (0.0, [10.0, 5.0, 17.0])):  # a degree is the mount's
+        fix = fix_on(sim_site, **known | {"attitude": Attitude(0.0, 0.0, heading_deg)})
+        message = pose(maker, fix, VEHICLE, NOW_NS, sim_site, RosOptions())
+        turns_deg2 = np.asarray(message.pose.covariance).reshape(6, 6)[3:, 3:] * math.degrees(1.0) ** 2
+        assert turns_deg2 == pytest.approx(np.diag(expected))
 
 
 def test_what_is_unknown_is_as_uncertain_as_can_be(maker, sim_site):
@@ -488,14 +494,8 @@ def test_the_origin_moves_the_pose(maker, sim_site):
 def test_ardupilot_finds_the_fix_again_and_the_height_drowns_nothing(maker, sim_site):
     fix, origin = fix_on(sim_site), NedOrigin(sim_site.frame.lat_deg + 0.01, sim_site.frame.lon_deg - 0.01, 0.0)
     message = pose(maker, fix, VEHICLE, NOW_NS, sim_site, RosOptions(firmware="ardupilot", origin=origin))
-    at, scale = (
-        message.pose.pose.position,
-        0.011131884502145034,
-    )  # of ArduPilot's Location, metres per 1e-7 degrees
-    lat_deg = origin.lat_deg + at.y / scale * 1e-7
-    middle = math.radians(0.5 * (lat_deg + origin.lat_deg))
-    assert lat_deg == pytest.approx(fix.lat_deg, abs=1e-9)
-    assert origin.lon_deg + at.x / scale * 1e-7 / math.cos(middle) == pytest.approx(fix.lon_deg, abs=1e-9)
+    at = message.pose.pose.position
+    assert (at.y, at.x) == pytest.approx(north_east_m(fix.lat_deg, fix.lon_deg, origin, "ardupilot"))
     covariance = np.asarray(message.pose.covariance).reshape(6, 6)
     assert np.array_equal(covariance[:2, :2], fix.covariance_m2[:2, :2])
     assert covariance[2, 2] == pytest.approx(fix.sigma_m**2)
@@ -573,9 +573,12 @@ class Answers:
 
 
 @contextlib.contextmanager
-def bridge_of(node, site, make, **options):
-    navigator = Answers(make)
-    bridge = RosBridge(node, site, lambda start: navigator, RosOptions(), None, LiveOptions(deadline_ms=60_000))
+def bridge_of(node, site, make=None, deadline_ms=60_000):
+    """A bridge and its navigator, by default one whose every frame is a fix."""
+    navigator = Answers(make or (lambda frame: fix_on(site, timestamp_ns=frame.timestamp_ns)))
+    bridge = RosBridge(
+        node, site, lambda start: navigator, RosOptions(), None, LiveOptions(deadline_ms=deadline_ms)
+    )
     try:
         yield bridge, navigator
     finally:
@@ -588,10 +591,7 @@ def an_image(maker, time_ns, shape=(4, 6)):
 
 def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, sim_site):
     node, captured_ns = StandIn(maker), NOW_NS - 50_000_000
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site, timestamp_ns=frame.timestamp_ns)) as (
-        bridge,
-        seen,
-    ):
+    with bridge_of(node, sim_site) as (bridge, seen):
         bridge.telemetry.imu(maker.imu(captured_ns, "", 1.0, 2.0, 3.0))
         bridge.on_image(an_image(maker, captured_ns))
         node.wait_for("window", 1)
@@ -628,7 +628,7 @@ def test_a_refusal_is_told_and_never_a_pose(maker, sim_site):
 
 def test_nobody_looks_at_the_window(maker, sim_site):
     node = StandIn(maker, wanted=False)
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, _):
+    with bridge_of(node, sim_site) as (bridge, _):
         bridge.on_image(an_image(maker, NOW_NS))
         node.wait_for("diagnostics", 1)
     assert not node.of("window")
@@ -636,7 +636,7 @@ def test_nobody_looks_at_the_window(maker, sim_site):
 
 def test_pictures_that_cannot_be_read_are_told(maker, sim_site):
     node = StandIn(maker)
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, _):
+    with bridge_of(node, sim_site) as (bridge, _):
         odd = an_image(maker, NOW_NS)
         odd.encoding = "32FC1"
         bridge.on_image(odd)
@@ -651,7 +651,7 @@ def test_pictures_that_cannot_be_read_are_told(maker, sim_site):
 
 def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, sim_site):
     node = StandIn(maker)
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, seen):
+    with bridge_of(node, sim_site) as (bridge, seen):
         for k, time_ns in enumerate((0, NOW_NS + 1, NOW_NS - 60_000_000_000)):
             node.time_ns = time_ns or NOW_NS
             bridge.on_image(an_image(maker, time_ns))
@@ -664,7 +664,7 @@ def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, si
 def test_an_odometry_along_other_axes_is_reported_with_every_frame(ros, maker, sim_site, caplog):
     node, level = StandIn(maker), (0.0, 0.0, 0.0)
     topics = RosTopics(odometry="/vio/twist", odometry_type="TwistWithCovarianceStamped")
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, seen):
+    with bridge_of(node, sim_site) as (bridge, seen):
         _, heard = bridge.handlers(topics)["/vio/twist"]
         bridge.on_imu(maker.imu(NOW_NS, "", *level))
         for k, frame in enumerate(("odom", "odom", "base_link")):
@@ -680,17 +680,14 @@ def test_an_odometry_along_other_axes_is_reported_with_every_frame(ros, maker, s
     assert seen.frames[2].north_velocity_mps == pytest.approx(2.0)
 
 
-def a_compressed(maker, time_ns, picture):
-    _, data = cv2.imencode(".png", picture)
-    return maker.make("sensor_msgs/msg/CompressedImage", header=maker.header(time_ns, ""), format="png", data=data)
-
-
 def test_compressed_pictures_are_live_too(ros, maker, sim_site):
     node, picture = StandIn(maker), np.random.default_rng(1).integers(0, 256, (5, 7), dtype=np.uint8)
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, seen):
+    with bridge_of(node, sim_site) as (bridge, seen):
         handlers = bridge.handlers(RosTopics(image="/camera/image_raw/compressed"))
         kind, handler = handlers["/camera/image_raw/compressed"]
-        message = wired(ros, a_compressed(maker, NOW_NS, picture))
+        header, data = maker.header(NOW_NS, ""), cv2.imencode(".png", picture)[1]
+        made = maker.make("sensor_msgs/msg/CompressedImage", header=header, format="png", data=data)
+        message = wired(ros, made)
         assert message.__msgtype__ == kind
         handler(message)
         node.wait_for("pose", 1)
@@ -699,7 +696,7 @@ def test_compressed_pictures_are_live_too(ros, maker, sim_site):
 
 def test_a_picture_waits_for_the_attitude_of_its_capture(maker, sim_site):
     node, after_ns = StandIn(maker), NOW_NS + 40_000_000
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, seen):
+    with bridge_of(node, sim_site) as (bridge, seen):
         bridge.on_imu(maker.imu(NOW_NS - 60_000_000, "", 0.0, -6.0, 0.0))
         bridge.on_image(an_image(maker, NOW_NS))
         assert bridge.status.counts.submitted == 0
@@ -720,10 +717,7 @@ def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, sim_site):
         answers.wait(60.0)
         return fix_on(sim_site)
 
-    bridge = RosBridge(
-        node, sim_site, lambda start: Answers(slowly), RosOptions(), None, LiveOptions(deadline_ms=50)
-    )
-    try:
+    with bridge_of(node, sim_site, slowly, deadline_ms=50) as (bridge, _):
         bridge.on_image(an_image(maker, NOW_NS))
         time.sleep(0.2)
         answers.set()  # 200 ms here, none there
@@ -733,14 +727,12 @@ def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, sim_site):
         node.time_ns = NOW_NS + 60_000_000
         node.wait_for("diagnostics", 2)
         answers.set()
-    finally:
-        bridge.close()
     assert bridge.status.refused == {"late": 1}
 
 
 def test_silence_is_told(maker, sim_site, monkeypatch):
     node = StandIn(maker)
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, _):
+    with bridge_of(node, sim_site) as (bridge, _):
         bridge.check_input()
         assert not node.of("diagnostics")
         later = time.monotonic() + 5.0
@@ -751,7 +743,7 @@ def test_silence_is_told(maker, sim_site, monkeypatch):
 
 def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
     node = StandIn(maker)
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, _):
+    with bridge_of(node, sim_site) as (bridge, _):
         handlers = bridge.handlers(RosTopics(compass="", velocity=""))
         kinds = {topic: kind for topic, (kind, _) in handlers.items()}
         handlers[RosTopics().height][1](maker.float64(42.0))
@@ -883,7 +875,7 @@ def test_the_ros2_node_hears_and_publishes_until_its_context_ends(rclpy_with, si
     stated = node.wait_for(RosTopics().camera_info, "sensor_msgs/msg/CameraInfo", 5.0)
     assert np.array_equal(camera_from_message(stated).matrix, camera.matrix)
     assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site)) as (bridge, _):
+    with bridge_of(node, sim_site) as (bridge, _):
         node.spin(bridge.handlers(RosTopics()), bridge.check_input, None)
     assert {topic: len(sent) for topic, sent in rclpy.published.items()} == {
         "~/pose": 1, "~/fix": 1, "~/window": 1, "/diagnostics": 1,
@@ -935,21 +927,14 @@ def test_discovery_stays_here_unless_it_is_set(rclpy_with, monkeypatch, given, b
 
 
 @pytest.mark.parametrize("ends", [ShutdownError, KeyboardInterrupt])
-def test_a_run_that_is_ended_has_its_counts(rclpy_with, monkeypatch, tmp_path, ends):
+def test_a_run_that_is_ended_has_its_counts(rclpy_with, monkeypatch, flight, ends):
     """By Ctrl-C, by SIGTERM, which is made the same, or by a context that was shut down."""
-    from scenematch.runs.cameras import CameraInput
-    from scenematch.runs.map_input import MapInput
-    from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
-    from scenematch.runs.simulation import write_flight
-    from scenematch.simulator import plan_flight
-
     rclpy_with(ends=ends)
     monkeypatch.setattr("engine.matching.matcher.SceneMatcher.warmup", lambda self, report: None)
-    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
     before = signal.getsignal(signal.SIGTERM)
     try:
-        camera = CameraInput(tmp_path / "camera.yaml")
-        settings = RosSettings(map=MapInput(tmp_path / "map.tif"), camera=camera, version=2)
+        camera = CameraInput(flight / "camera.yaml")
+        settings = RosSettings(map=MapInput(flight / "map.tif"), camera=camera, version=2)
         assert run_ros_bridge(settings).line() == "0 pictures; published 0; not published: nothing"
         assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
     finally:
@@ -1005,7 +990,7 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
     assert rospy.arguments == ["/a:=/b"]
     assert ros1.os.environ["ROS_IP"] == "127.0.0.1"
     assert node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 0.01) is None
-    with bridge_of(node, sim_site, lambda frame: fix_on(sim_site, timestamp_ns=frame.timestamp_ns)) as (bridge, _):
+    with bridge_of(node, sim_site) as (bridge, _):
         node.spin(bridge.handlers(RosTopics()), bridge.check_input, 1.0)
     assert {topic: len(sent) for topic, sent in rospy.published.items()} == {
         "~pose": 1, "~fix": 1, "~window": 1, "/diagnostics": 1,
@@ -1017,13 +1002,8 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
         ros1.Node("again")
 
 
-def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp_path, monkeypatch):
+def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, flight, monkeypatch):
     """Of its field of view; nothing but the picture's topic is waited for."""
-    from scenematch.runs.cameras import CameraInput
-    from scenematch.runs.map_input import MapInput
-    from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
-    from scenematch.runs.simulation import write_flight
-    from scenematch.simulator import plan_flight
 
     class Spun(StandIn):
         asked, picture = [], an_image(maker, NOW_NS, (30, 40, 3))
@@ -1042,9 +1022,8 @@ def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp
         raise LoadedError(camera)
 
     monkeypatch.setattr("scenematch.runs.ros_bridge.SceneMatcher", matcher)
-    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
     settings = RosSettings(
-        map=MapInput(tmp_path / "map.tif"), camera=CameraInput(hfov_deg=90.0), topics=RosTopics(image="/down")
+        map=MapInput(flight / "map.tif"), camera=CameraInput(hfov_deg=90.0), topics=RosTopics(image="/down")
     )
     node = Spun(maker)
     with pytest.raises(LoadedError) as ended:
@@ -1059,20 +1038,16 @@ def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, tmp
         RosSettings(map=MapInput("m.tif"), camera=CameraInput("c.yaml", hfov_deg=90.0))
 
 
-def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, tmp_path):
-    from scenematch.runs.simulation import write_flight
-    from scenematch.simulator import plan_flight
-
-    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
+def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, flight):
     for name in ("rospy", "rclpy"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setenv("ROS_IP", "127.0.0.1")
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     for version, code, stated in (("1", 1, "rospy"), ("2", 1, "rclpy"), ("3", 2, "--ros: expected 1 or 2")):
         capsys.readouterr()
-        assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "map.tif")]) == code
+        assert main(["bridge", "ros", "--ros", version, "--map", str(flight / "map.tif")]) == code
         assert stated in capsys.readouterr().err
-    assert main(["bridge", "ros", "--map", str(tmp_path / "map.tif"), "--firmware", "x"]) == 2
+    assert main(["bridge", "ros", "--map", str(flight / "map.tif"), "--firmware", "x"]) == 2
 
 
 @pytest.mark.parametrize(

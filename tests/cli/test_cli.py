@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from engine.errors import OptionError
@@ -31,6 +30,8 @@ COLUMNS = (
     "covariance_en_m2,score,method,window_width_px,window_height_px,latency_ms,deadline_met"
 )
 FRAMES = 6
+FILES = {"map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames",
+         "telemetry": "telemetry.csv"}  # fmt: skip
 WRITTEN = {"track.csv", "summary.json", "notes.csv", "report.html"}
 pytestmark = pytest.mark.usefixtures("bare_runs")  # but for `done`, which is drawn before it
 SCRIPT = Path(sys.executable).with_name("scenematch")
@@ -59,8 +60,7 @@ def done(flight, tmp_path_factory):
 
 
 def track(folder, out, *more, **replaced):
-    files = {"map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames"}
-    files |= {"telemetry": "telemetry.csv"} | replaced
+    files = FILES | replaced
     options = [f"--{name}={folder / file}" for name, file in files.items() if file is not None]
     return ["track", *options, "--method=ncc", f"--out={out}", *map(str, more)]
 
@@ -105,27 +105,33 @@ def set_cell(path, row, column, value):
         writer.writerows(rows)
 
 
+def picture(path):
+    Image.new("L", (64, 64)).save(path)
+    return {"map": path.name}
+
+
+def far_surface(path):
+    write_geotiff(path, np.zeros((64, 64), np.float32), [[0.5, 0, 400000.0], [0, -0.5, 5000000.0]], 32633)
+    return {"surface": path.name}
+
+
 # ------------------------------------------------------------------------------------------------ what works
 
 
-def test_track_writes_one_row_a_frame_and_every_file(done):
+def test_track_writes_one_row_a_frame_and_every_file_and_what_it_was_made_of(done, flight):
     assert (done / "track.csv").read_text(encoding="utf-8").splitlines()[0] == COLUMNS
     rows = cells(done / "track.csv")
     assert [row["frame"] for row in rows] == [f"{i:06d}.jpg" for i in range(FRAMES)]
-    assert all(row["status"] == "fix" and row["method"] == "ncc" for row in rows)
-    assert all(row["deadline_met"] == "" and row["reason"] == "" for row in rows)
+    told = ("status", "reason", "method", "deadline_met")
+    assert {tuple(row[name] for name in told) for row in rows} == {("fix", "", "ncc", "")}
     assert {file.name for file in done.iterdir()} == WRITTEN
-
-
-def test_summary_tells_what_the_run_was_made_of(done, flight):
     summary = json.loads((done / "summary.json").read_text(encoding="utf-8"))
     assert summary["frames"] == summary["fixes"] == summary["scored_fixes"] == FRAMES
     assert summary["status"] == {"fix": FRAMES, "no_fix": 0}
     assert summary["rms_m"] < 5
     assert set(summary["latency_ms"]) == {"p50", "p95", "p99", "max"}
-    assert summary["settings"]["map"] == str((flight / "map.tif").resolve())
-    assert summary["settings"]["truth"] == str((flight / "truth.csv").resolve())
-    assert (summary["settings"]["method"], summary["settings"]["profile"]) == ("ncc", "engine")
+    made_of = {"map": str(flight / "map.tif"), "truth": str(flight / "truth.csv"), "method": "ncc"}
+    assert summary["settings"].items() >= (made_of | {"profile": "engine"}).items()
 
 
 def test_track_prints_a_table_and_keeps_the_rest_from_standard_output(flight, tmp_path, capsys):
@@ -331,9 +337,7 @@ def test_version(capsys):
         (["map", "audit"], ["MAP"]),
         (["--bogus"], ["--bogus"]),
         (["track", "--bogus"], ["--bogus", "scenematch track --help"]),
-        (["locate"], ["IMAGE"]),
         (["map"], ["scenematch map --help"]),
-        (["demo", "--frames=1"], ["--frames"]),
         (["demo", "--seed=-1"], ["--seed"]),
         (["demo", "--seed=one"], ["--seed"]),
         (["map", "audit", "m.tif", "--out=never-made", "--settings=threads=0"], ["threads"]),
@@ -345,26 +349,6 @@ def test_wrong_usage(arguments, words, capsys):
     for word in words:
         assert word in line
     assert not Path("never-made").exists()
-
-
-@pytest.mark.parametrize(
-    "option",
-    ["--method=orb", "--profile=fast", "--start=here", "--start=33", "--start=33,35,1,2", "--start=nan,35",
-     "--start=95,35", "--start=33,35,-1", "--start=10,10", "--budget-ms=0", "--budget-ms=-5", "--budget-ms=nan",
-     "--budget-ms=soon"],
-)  # fmt: skip
-def test_wrong_options_of_track_are_named(option, flight, tmp_path, capsys):
-    refused(capsys, flight, tmp_path / "out", 2, option.split("=")[0], more=[option])
-
-
-def test_device_names(flight, tmp_path, capsys):
-    refused(capsys, flight, tmp_path / "out", 2, "device", "tpu", more=["--device=tpu"])
-    if not torch.cuda.is_available():
-        refused(capsys, flight, tmp_path / "out", 1, "cuda", more=["--device=cuda"])
-
-
-def test_the_papers_profile_has_no_auto(flight, tmp_path, capsys):
-    refused(capsys, flight, tmp_path / "out", 2, "--method", more=["--method=auto", "--profile=paper"])
 
 
 def test_an_output_folder_is_not_overwritten(done, flight, tmp_path, capsys):
@@ -391,24 +375,29 @@ def test_force_replaces_results_and_touches_nothing_else(flight, tmp_path):
 # ---------------------------------------------------------------------------------------------- wrong input
 
 
-@pytest.mark.parametrize("name", ["map", "surface", "camera", "frames", "telemetry"])
-def test_missing_files_are_named(name, flight, tmp_path, capsys):
-    refused(capsys, flight, tmp_path / "out", 1, flight / "gone", **{name: "gone"})
-
-
-def test_missing_truth_is_named(flight, tmp_path, capsys):
-    refused(capsys, flight, tmp_path / "out", 1, "gone.csv", more=["--truth=gone.csv"])
-
-
-def test_a_picture_is_no_map(copy, tmp_path, capsys):
-    Image.new("L", (64, 64)).save(copy / "map.png")
-    refused(capsys, copy, tmp_path / "out", 1, copy / "map.png", "georeference", map="map.png")
-
-
-def test_a_surface_of_another_place(copy, tmp_path, capsys):
-    affine = [[0.5, 0, 400000.0], [0, -0.5, 5000000.0]]
-    write_geotiff(copy / "far.tif", np.zeros((64, 64), np.float32), affine, 32633)
-    refused(capsys, copy, tmp_path / "out", 1, "surface", "far.tif", surface="far.tif")
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        *((lambda copy, name=name: {name: "gone"}, ["gone"]) for name in FILES),
+        (lambda copy: {"more": ["--truth=gone.csv"]}, ["gone.csv"]),
+        (lambda copy: picture(copy / "map.png"), ["map.png", "georeference"]),
+        (lambda copy: far_surface(copy / "far.tif"), ["surface", "far.tif"]),
+        (lambda copy: (copy / "flight.mp4").write_bytes(b"no video") and {"frames": "flight.mp4"}, ["flight.mp4"]),
+        (lambda copy: (copy / "nothing").mkdir() or {"frames": "nothing"}, ["nothing"]),
+        (lambda copy: edit(copy / "telemetry.csv", "timestamp_ns", "time"), ["telemetry.csv", "timestamp_ns"]),
+        (
+            lambda copy: set_cell(copy / "telemetry.csv", 0, "lat_deg", "48.1"),
+            ["telemetry.csv", "map.tif", "48.1"],
+        ),
+        (lambda copy: set_cell(copy / "truth.csv", 1, "lat_deg", "north"), ["truth.csv", "lat_deg"]),
+        (
+            lambda copy: edit(copy / "camera.yaml", "image_width: 300", "image_width: 640"),
+            ["camera", "640 x 300", "300 x 300"],
+        ),
+    ],
+)
+def test_an_input_that_is_missing_or_does_not_fit_is_named(spoil, words, copy, tmp_path, capsys):
+    refused(capsys, copy, tmp_path / "out", 1, *words, **(spoil(copy) or {}))
 
 
 @pytest.mark.parametrize(
@@ -431,39 +420,12 @@ def test_broken_pictures_are_found_before_the_run(kind, index, copy, tmp_path, c
     refused(capsys, copy, tmp_path / "out", 1, path)
 
 
-def test_frames_that_are_neither_folder_nor_video(copy, tmp_path, capsys):
-    (copy / "flight.mp4").write_bytes(b"no video at all")
-    refused(capsys, copy, tmp_path / "out", 1, copy / "flight.mp4", frames="flight.mp4")
-    (copy / "nothing").mkdir()
-    refused(capsys, copy, tmp_path / "out", 1, copy / "nothing", frames="nothing")
-
-
-def test_telemetry_without_a_column(copy, tmp_path, capsys):
-    edit(copy / "telemetry.csv", "timestamp_ns", "time")
-    refused(capsys, copy, tmp_path / "out", 1, copy / "telemetry.csv", "timestamp_ns")
-
-
 def test_telemetry_without_what_the_method_needs(copy, tmp_path, capsys):
     edit(copy / "telemetry.csv", "heading_deg", "course")
     refused(capsys, copy, tmp_path / "out", 1, "heading_deg", "sift")
     edit(copy / "telemetry.csv", "height_agl_m", "height")
     more = ["--method=sift", "--profile=paper"]
     refused(capsys, copy, tmp_path / "out", 1, "height_agl_m", more=more)
-
-
-def test_a_map_of_another_place_than_the_flight(copy, tmp_path, capsys):
-    set_cell(copy / "telemetry.csv", 0, "lat_deg", "48.1")
-    refused(capsys, copy, tmp_path / "out", 1, copy / "telemetry.csv", "map.tif", "48.1")
-
-
-def test_wrong_truth(copy, tmp_path, capsys):
-    set_cell(copy / "truth.csv", 1, "lat_deg", "north")
-    refused(capsys, copy, tmp_path / "out", 1, copy / "truth.csv", "lat_deg")
-
-
-def test_a_camera_of_another_resolution(copy, tmp_path, capsys):
-    edit(copy / "camera.yaml", "image_width: 300", "image_width: 640")
-    refused(capsys, copy, tmp_path / "out", 1, "camera", "640 x 300", "300 x 300")
 
 
 def test_evaluate_of_what_is_no_finished_track(done, tmp_path, capsys):

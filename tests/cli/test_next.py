@@ -80,14 +80,19 @@ def test_check_looks_at_one_frame_in_n_and_track_is_named_with_the_same(flight, 
 
 
 @pytest.mark.parametrize("runs", [["ncc"], ["ncc", "sift"]])
-def test_compare_names_a_file_that_it_wrote(flight, tmp_path, capsys, runs):
-    out = tmp_path / "two  spaces"
-    assert run(["compare", *files_of(flight), f"--out={out}", *(f"--run={name}" for name in runs)]) == 0
+def test_compare_names_a_file_that_it_wrote_and_its_settings_again(flight, tmp_path, capsys, monkeypatch, runs):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenematch.toml").touch()
+    out, files = tmp_path / "two  spaces", files_of(flight)
+    given = [f"--out={out}", "--settings=scenematch.toml", *(f"--run={name}" for name in runs)]
+    assert run(["compare", *files, *given]) == 0
     last = capsys.readouterr().err.splitlines()[-1]
     found = re.fullmatch(r"next: open (.+); scenematch (.+)", last)
     assert shlex.split(found[1]) == [str(out / "comparison.html")]
     assert (out / "comparison.html").is_file()
-    assert parsed(shlex.split(found[2])) == "track"
+    words = shlex.split(found[2])
+    assert parsed(words) == "track"
+    assert set(files) | {"--settings", "scenematch.toml"} <= set(words)
 
 
 @pytest.mark.parametrize(("availability", "command"), [(0.9, "export"), (0.0, "check")])
@@ -101,9 +106,9 @@ def test_a_closed_loop_without_a_fix_is_not_exported(tmp_path, capsys, monkeypat
 
 
 def test_a_path_with_two_spaces_stays_as_it_is(capsys):
-    console.next_step(f"track {console.options(map='two  spaces/a map.tif')}")
+    console.next_step(f"track {console.options(map='two  spaces/a map.tif', truth=None, log_offset_s=2)}")
     said = capsys.readouterr().err
-    assert shlex.split(said)[-1] == "two  spaces/a map.tif"
+    assert shlex.split(said)[2:] == ["track", "--map", "two  spaces/a map.tif", "--log-offset-s", "2"]
     console.say("one\n  line ")
     assert capsys.readouterr().err == "one line\n"
 
@@ -113,12 +118,6 @@ def test_a_program_is_told_nothing(capsys):
     printed = capsys.readouterr()
     assert json.loads(printed.out)
     assert "next:" not in printed.err
-
-
-def test_names_with_spaces_stay_one_word(capsys):
-    console.next_step(f"track {console.options(map='a map.tif', truth=None, log_offset_s=2)}")
-    said = capsys.readouterr().err
-    assert shlex.split(said)[2:] == ["track", "--map", "a map.tif", "--log-offset-s", "2"]
 
 
 def test_a_run_without_a_fix_is_followed_by_check_of_the_same_files(flight, tmp_path, capsys):
@@ -137,13 +136,3 @@ def test_a_run_without_a_fix_is_followed_by_check_of_the_same_files(flight, tmp_
     words = next_of(capsys, words)
     assert parsed(words) == "track"
     assert set(files) | set(wrong) <= set(words)
-
-
-def test_compare_names_its_settings_again(flight, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "scenematch.toml").touch()
-    files = files_of(flight)
-    given = ["--out=compared", "--run=ncc", "--settings=scenematch.toml"]
-    words = next_of(capsys, ["compare", *files, *given])
-    assert parsed(words) == "track"
-    assert set(files) | {"--settings", "scenematch.toml"} <= set(words)

@@ -51,6 +51,11 @@ def said(capsys, arguments, code=2):
         ),
         *((command, "input.every", value) for command in (TRACK, CHECK, PLAYED) for value in ("0", "-3")),
         (LOCATE, "--start", "48,16,1e200"),
+        *((TRACK, "--start", value) for value in ("here", "33", "33,35,1,2")),
+        *((TRACK, "--budget-ms", value) for value in ("0", "-5", "nan")),
+        (TRACK, "--method", "orb"),
+        (TRACK, "--profile", "fast"),
+        ([*TRACK, "--profile=paper"], "--method", "auto"),
         *((SIMULATE, "--relief-m", value) for value in ("nan", "-5", "81")),
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
         *((command, "--device", "gpu") for command in (PLAYED, ROS, TRACK, LOCATE)),
@@ -88,11 +93,11 @@ def test_an_option_that_would_say_nothing_is_refused(command, option, wanted, ca
     assert said(capsys, command) == f"{option}: expected with {wanted} only\n"
 
 
-def test_a_topic_is_of_a_bag(capsys):
-    assert (
-        said(capsys, [*TRACK, "--settings=input.image_topic=/down"])
-        == "--settings input.image_topic: expected a bag as frames, got f\n"
-    )
+def test_a_topic_is_of_a_bag_and_a_start_on_the_earth(capsys):
+    line = said(capsys, [*TRACK, "--settings=input.image_topic=/down"])
+    assert line == "--settings input.image_topic: expected a bag as frames, got f\n"
+    for start in ("nan,35", "95,35", "33,35,-1"):
+        assert said(capsys, [*TRACK, f"--start={start}"]).startswith("--start: ")
 
 
 @pytest.mark.parametrize("source", ["9" * 20, "9" * 5000, "7", "²", "no-such-file.mp4"])

@@ -108,20 +108,12 @@ def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matche
 
 @pytest.mark.slow
 @KNOWN
-def test_a_frame_of_another_town_is_refused(matcher, other_site, flight, known):
+@pytest.mark.parametrize("telemetry", [REACH, ANY_HEADING], ids=["reach", "all around"])
+def test_a_frame_of_another_town_is_refused(matcher, other_site, flight, telemetry, known):
     bank = matcher(other_site)
     prior = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0) if known else None
     for k in PLACES:
-        assert isinstance(bank.locate(replace(flight.frames[k], **REACH), prior), NoFix)
-
-
-@pytest.mark.slow
-@KNOWN
-def test_a_frame_of_another_town_is_refused_all_around(matcher, other_site, flight, known):
-    bank = matcher(other_site)
-    prior = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0) if known else None
-    for k in PLACES:
-        assert isinstance(bank.locate(replace(flight.frames[k], **ANY_HEADING), prior), NoFix)
+        assert isinstance(bank.locate(replace(flight.frames[k], **telemetry), prior), NoFix)
 
 
 @pytest.mark.slow

@@ -104,16 +104,13 @@ def test_a_fix_says_the_same_place_in_every_way(matchers, ground, frame, prior, 
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_the_covariance_of_a_fix_is_finite_symmetric_and_positive_definite(matchers, ground, camera, method):
+def test_the_covariance_of_a_fix_is_symmetric_and_positive_definite(matchers, ground, camera, method):
     for heading in (0.0, 130.0):
         nadir = NADIR + heading / 10
         shown = ground.frame(camera, nadir, heading_deg=heading, pitch_deg=5.0)
         fix = matchers[method].locate(shown, ground.prior(nadir))
-        covariance = fix.covariance_m2
-        assert covariance.shape == (3, 3)
-        assert np.isfinite(covariance).all()
-        np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
-        assert np.linalg.eigvalsh(covariance).min() > 0
+        np.testing.assert_allclose(fix.covariance_m2, fix.covariance_m2.T, rtol=1e-9)
+        assert np.linalg.eigvalsh(fix.covariance_m2).min() > 0
         assert 0.1 < fix.sigma_m < 10.0
 
 
@@ -282,8 +279,7 @@ def test_a_place_counts_only_where_enough_of_the_frame_lies_on_the_map(camera):
         options = MatcherOptions(ncc=NccOptions(min_valid_share=share))
         result = SceneMatcher(site, camera, "ncc", "cpu", options).locate(shown, ground.prior(NADIR))
         assert isinstance(result, kind), result
-        if isinstance(result, Fix):
-            assert distance_px(result) < 0.5
+        assert kind is NoFix or distance_px(result) < 0.5
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -362,17 +358,15 @@ def test_features_of_the_map_prepared_or_found_per_frame_give_the_same_place(gro
         assert fixes[0].score > 0.8
 
 
-def test_upright_features_agree_about_the_turn_also_where_the_maps_up_is_not_north(camera):
+@pytest.mark.parametrize("upright", [True, False])
+@pytest.mark.parametrize(("turned", "heading_deg"), [(1, 100.0), (-1, 250.0)])
+def test_features_agree_about_the_turn_also_where_the_maps_up_is_not_north(camera, upright, turned, heading_deg):
     ground = Ground(lat_deg=60.0, lon_deg=17.9)  # 2.5 degrees of convergence
-    matcher = with_sift(ground, camera, second_look=False, max_turn_deg=8.0)
-    oriented = with_sift(ground, camera, second_look=False, upright=False, max_turn_deg=8.0)
-    for mount in (camera.mount, np.array([[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]]) @ camera.mount):
-        for heading in (100.0 if mount is camera.mount else 250.0,):
-            shown = ground.frame(camera, NADIR, heading_deg=heading, pitch_deg=8.0)
-            given = shown if mount is camera.mount else replace(shown, image=shown.image[::-1, ::-1].copy())
-            for each in (matcher, oriented):
-                turned = SceneMatcher(ground.site, replace(camera, mount=mount), "sift", "cpu", each.options)
-                assert distance_px(turned.locate(given, ground.prior(NADIR))) < 0.5
+    shown = ground.frame(camera, NADIR, heading_deg=heading_deg, pitch_deg=8.0)
+    mounted = replace(camera, mount=np.diag([turned, turned, 1.0]) @ camera.mount)
+    matcher = with_sift(ground, mounted, second_look=False, upright=upright, max_turn_deg=8.0)
+    given = replace(shown, image=shown.image[::turned, ::turned].copy())
+    assert distance_px(matcher.locate(given, ground.prior(NADIR))) < 0.5
 
 
 @pytest.mark.parametrize("mounted_deg", [0.0, 30.0, 60.0])
@@ -451,21 +445,18 @@ def test_a_prior_outside_the_map_is_refused(matchers, frame, method, where):
     assert_refused(matchers[method].locate(frame, Prior(**where, sigma_m=5.0)), Reason.OUTSIDE_MAP)
 
 
-@pytest.mark.parametrize("profile", ["engine", "paper"])
-@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
-@pytest.mark.parametrize("lon_deg", [0.0, 183.0, -177.0])
-def test_a_prior_that_the_maps_crs_cannot_show_is_refused(camera, frame, method, profile, lon_deg):
+@pytest.mark.parametrize(
+    ("method", "profile"),
+    [("ncc", "engine"), ("sift", "engine"), ("auto", "engine"), ("ncc", "paper"), ("sift", "paper")],
+)
+def test_a_prior_that_the_maps_crs_cannot_show_is_refused(camera, frame, method, profile):
     """Null island, as a receiver without a fix reports it, and its opposite have no place in UTM's zone 46."""
-    if (method, profile) == ("auto", "paper"):
-        return
-    site = OrthoMap.from_arrays(
-        np.random.default_rng(0).integers(0, 256, (400, 400), np.uint8),
-        [[0.5, 0.0, 500_000.0], [0.0, -0.5, 3_600_000.0]],
-        "EPSG:32646",
-    )
+    gray = np.random.default_rng(0).integers(0, 256, (400, 400), np.uint8)
+    site = OrthoMap.from_arrays(gray, [[0.5, 0.0, 500_000.0], [0.0, -0.5, 3_600_000.0]], "EPSG:32646")
     matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions(profile=profile))
-    nowhere = Prior(lat_deg=0.0, lon_deg=lon_deg, sigma_m=10.0)
-    assert_refused(matcher.locate(frame, nowhere), Reason.OUTSIDE_MAP)
+    for lon_deg in (0.0, 183.0, -177.0):
+        nowhere = Prior(lat_deg=0.0, lon_deg=lon_deg, sigma_m=10.0)
+        assert_refused(matcher.locate(frame, nowhere), Reason.OUTSIDE_MAP)
 
 
 @pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
@@ -522,12 +513,6 @@ def test_an_answer_after_the_budget_is_late(matchers, frame, prior, method):
     for given in (prior, None):
         assert_refused(matchers[method].locate(frame, given, Budget(total_ms=1e-6)), Reason.LATE)
     assert distance_px(matchers[method].locate(frame, prior, Budget(total_ms=60_000.0))) < 0.3
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_an_answer_after_the_budget_is_late_in_the_papers_profile(ground, camera, frame, prior, method):
-    matcher = SceneMatcher(ground.site, camera, method, "cpu", MatcherOptions(profile="paper"))
-    assert_refused(matcher.locate(frame, prior, Budget(total_ms=1e-6)), Reason.LATE, method)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -641,6 +626,7 @@ def test_the_papers_profile_refuses_what_it_cannot_do(ground, camera, frame, pri
     matcher = SceneMatcher(ground.site, camera, method, "cpu", MatcherOptions(profile="paper"))
     assert_refused(matcher.locate(with_telemetry(frame.image, None), prior), Reason.NO_HEIGHT, method)
     assert_refused(matcher.locate(frame, Prior(east_m=9e3, north_m=0.0, sigma_m=5.0)), Reason.OUTSIDE_MAP, method)
+    assert_refused(matcher.locate(frame, prior, Budget(total_ms=1e-6)), Reason.LATE, method)
     flat = matcher.locate(with_telemetry(np.zeros((300, 300), np.uint8)), prior)
     assert isinstance(flat, Fix) or flat.reason is Reason.TOO_FEW_MATCHES  # NCC always has a peak
     if method == "ncc":
@@ -652,16 +638,12 @@ def test_the_papers_profile_refuses_what_it_cannot_do(ground, camera, frame, pri
 # The map's projection does not matter
 
 
-def write_map(path, gray, crs, transform):
-    return OrthoMap.open(write_raster(path, gray, nodata=0, crs=crs, transform=transform))
-
-
 def projections(folder, gray, pixel_to_crs, epsg):
     """The same map as UTM, as degrees and as web Mercator, warped with cubic splines by GDAL."""
     gray = np.maximum(gray, 1)  # 0 is nodata
     corner = Affine(*pixel_to_crs.ravel()) @ Affine.translation(-0.5, -0.5)
     height, width = gray.shape
-    sites = {"utm": write_map(folder / "utm.tif", gray, f"EPSG:{epsg}", corner)}
+    rasters = {"utm": (gray, f"EPSG:{epsg}", corner)}
     left, top = corner @ (0, 0)
     right, bottom = corner @ (width, height)
     for crs in ("EPSG:4326", "EPSG:3857"):
@@ -675,39 +657,10 @@ def projections(folder, gray, pixel_to_crs, epsg):
             gray, warped, src_transform=corner, src_crs=f"EPSG:{epsg}", dst_transform=transform, dst_crs=crs,
             resampling=Resampling.cubic, src_nodata=0, dst_nodata=0,
         )  # fmt: skip
-        sites[crs] = write_map(folder / f"{crs[5:]}.tif", warped, crs, transform)
-    return sites
-
-
-def fixes_m(site, frame, camera, method, frames, priors):
-    """Fixes (N, 2) in metres about one origin, whatever the map; of NCC by the peak alone."""
-    matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions(ncc=NccOptions(refine=False)))
-    fixes = [matcher.locate(shown, prior) for shown, prior in zip(frames, priors, strict=True)]
-    assert all(isinstance(fix, Fix) for fix in fixes)
-    return np.array([frame.enu_from_geodetic(fix.lat_deg, fix.lon_deg) for fix in fixes])
-
-
-@pytest.fixture(scope="module")
-def town_projections(tmp_path_factory, sim_town):
-    gray = cv2.cvtColor(sim_town.ortho, cv2.COLOR_RGB2GRAY)
-    return projections(tmp_path_factory.mktemp("town"), gray, sim_town.pixel_to_crs, sim_town.crs_epsg)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("method", "mean_m", "most_m"), [("ncc", 0.05, 0.1), ("sift", 0.2, 1.0)])
-def test_a_town_gives_the_same_fixes_in_any_projection(town_projections, sim_flight, method, mean_m, most_m):
-    """SIFT picks other features of a picture that was resampled; all frames share them, and so their errors."""
-    frames, truths = sim_flight.frames[4:], sim_flight.truth[4:]
-    priors = [Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=8.0) for truth in truths]
-    frame = town_projections["utm"].frame
-    places = {
-        name: fixes_m(site, frame, sim_flight.camera, method, frames, priors)
-        for name, site in town_projections.items()
-    }
-    for name in ("EPSG:4326", "EPSG:3857"):
-        difference = places[name] - places["utm"]
-        assert np.hypot(*difference.mean(axis=0)) < mean_m, name
-        assert np.hypot(*difference.T).max() < most_m, name
+        rasters[crs[5:]] = warped, crs, transform
+    for name, (picture, crs, transform) in rasters.items():
+        path = folder / f"{name}.tif"
+        yield name, OrthoMap.open(write_raster(path, picture, nodata=0, crs=crs, transform=transform))
 
 
 @pytest.mark.slow
@@ -723,10 +676,13 @@ def test_ground_without_relief_is_where_it_is_in_any_projection(tmp_path, camera
     ]
     priors = [ground.prior(nadir) for nadir in nadirs]
     truth = ground.enu_from_pixel(nadirs)
-    sites = projections(tmp_path, ground.gray, ground.pixel_to_crs, ground.epsg)
-    for method, most_m in (("ncc", 0.02), ("sift", 0.2)):
-        for name, site in sites.items():
-            places = fixes_m(site, ground.site.frame, camera, method, frames, priors)
+    for name, site in projections(tmp_path, ground.gray, ground.pixel_to_crs, ground.epsg):
+        for method, most_m in (("ncc", 0.02), ("sift", 0.2)):
+            by_peak = MatcherOptions(ncc=NccOptions(refine=False))
+            matcher = SceneMatcher(site, camera, method, "cpu", by_peak)
+            fixes = [matcher.locate(*question) for question in zip(frames, priors, strict=True)]
+            assert all(isinstance(fix, Fix) for fix in fixes)
+            places = [ground.site.frame.enu_from_geodetic(fix.lat_deg, fix.lon_deg) for fix in fixes]
             assert np.hypot(*(places - truth).mean(axis=0)) < 0.1, (method, name)
             assert np.hypot(*(places - truth).T).max() < most_m, (method, name)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,14 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engine import Fix, Frame, MatcherOptions, OptionError, OrthoMap, SceneMatcher
-from engine.budget import Budget, Deadline
 from engine.kernels.scores import SCORES, enhance
 from engine.maps import prepared as prepared_map
 from engine.maps.prepared import PreparedMap
-from engine.matching.ncc import Ncc
-from engine.matching.query import Query
 from engine.options import NccOptions
-from engine.runtime.scheduler import Scheduler
 from engine.values import Window
 from tests.support.paths import ROOT
 
@@ -53,16 +48,6 @@ def test_local_is_what_is_taken_where_no_score_is_named():
     assert NccOptions().score == "local"
 
 
-def test_local_is_the_normalisation_as_written():
-    gray = np.random.default_rng(0).integers(0, 256, (40, 50)).astype(np.uint8)
-    smooth = binomial(gray)
-    for enhanced in (enhance(gray, radius_px=3), enhance(gray, radius_px=3, valid=np.ones(gray.shape, bool))):
-        for y, x in ((10, 10), (20, 33), (36, 46)):
-            box = smooth[y - 3 : y + 4, x - 3 : x + 4]
-            expected = (smooth[y, x] - box.mean()) / math.sqrt(box.var() + 4.0)
-            assert enhanced[y, x] == pytest.approx(expected, abs=0.05)  # smoothed to whole grey levels
-
-
 @given(gain=st.floats(0.5, 1.0), offset=st.integers(0, 60), seed=st.integers(0, 1000))
 def test_local_takes_exposure_out(gain, offset, seed):
     gray = np.random.default_rng(seed).integers(0, 190, (48, 48)).astype(np.uint8)
@@ -80,17 +65,18 @@ def test_local_without_a_neighbourhood_only_smooths():
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_gradient_is_its_normalised_magnitude_as_written(masked):
+@pytest.mark.parametrize(("score", "off"), [("local", 0.05), ("gradient", 0.1)])
+def test_a_score_is_its_normalisation_as_written(score, off, masked):
+    """Of the smoothed picture, or of its gradient's magnitude by central differences."""
     gray = noise()
     smooth = binomial(gray)
-    dy, dx = (np.gradient(smooth, axis=axis) for axis in (0, 1))  # central differences inside
-    magnitude = np.hypot(dx, dy)
+    picture = smooth if score == "local" else np.hypot(*np.gradient(smooth))
     valid = np.ones(gray.shape, bool) if masked else None
-    enhanced = enhance(gray, radius_px=3, score="gradient", valid=valid)
+    enhanced = enhance(gray, radius_px=3, score=score, valid=valid)
     for y, x in ((10, 10), (20, 33), (50, 44)):
-        box = magnitude[y - 3 : y + 4, x - 3 : x + 4]
-        expected = (magnitude[y, x] - box.mean()) / math.sqrt(box.var() + 4.0)
-        assert enhanced[y, x] == pytest.approx(expected, abs=0.1)  # smoothed to whole grey levels
+        box = picture[y - 3 : y + 4, x - 3 : x + 4]
+        expected = (picture[y, x] - box.mean()) / math.sqrt(box.var() + 4.0)
+        assert enhanced[y, x] == pytest.approx(expected, abs=off)  # smoothed to whole grey levels
 
 
 def test_gradient_does_not_care_which_side_is_darker():
@@ -174,12 +160,12 @@ def test_regions_of_a_large_map_join_without_a_seam(score, nodata, ground, monke
 # Finding a place
 
 
+def matcher_of(ground, camera, score):
+    return SceneMatcher(ground.site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(score=score)))
+
+
 def locate(ground, camera, frame, score):
-    """The NCC method on a map that was prepared for a score, at the first look."""
-    options = MatcherOptions(ncc=NccOptions(score=score))
-    scheduler = Scheduler(Deadline(Budget()), CPU)
-    query = Query(frame, np.asarray(frame.image), camera, ground.site, ground.prior(NADIR), CPU, scheduler, 1e-4)
-    return replace(Ncc(ground.site, CPU, options).locate(query), timings=query.timings)
+    return matcher_of(ground, camera, score).locate(frame, ground.prior(NADIR))
 
 
 def assert_found(result):
@@ -189,14 +175,8 @@ def assert_found(result):
 
 @pytest.mark.parametrize("score", SCORES)
 def test_every_score_finds_its_place(ground, camera, score):
+    matcher = matcher_of(ground, camera, score)
     frame = ground.frame(camera, NADIR, roll_deg=-5.0, pitch_deg=4.0, heading_deg=200.0)
-    assert_found(locate(ground, camera, frame, score))
-
-
-@pytest.mark.parametrize("score", SCORES)
-def test_a_matcher_prepares_its_map_for_its_score(ground, camera, score):
-    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(score=score)))
-    frame = ground.frame(camera, NADIR, heading_deg=30.0)
     assert_found(matcher.locate(frame, ground.prior(NADIR)))
     assert_found(matcher.locate(frame))  # whole map
 

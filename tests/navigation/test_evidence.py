@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from engine import Fix, Frame, Navigator, Prior, Reason, Window
+from engine import Fix, Frame, Navigator, Prior, Window
 from engine.navigation.motion import PositionEstimate
 from engine.navigation.odds import (
     MAX_PROBABILITY,
@@ -20,6 +18,7 @@ from engine.navigation.odds import (
     repeated_log_odds,
 )
 from tests.support.fixes import a_fix
+from tests.support.matchers import ScriptedMatcher
 
 IMAGE = np.zeros((8, 8), np.uint8)
 SECOND = 1_000_000_000
@@ -31,22 +30,9 @@ def fix_at(east_m, north_m, confidence=None, sigma_m=1.0):
     return a_fix(east_m, north_m, sigma_m, method="sift", window=window, confidence=confidence)
 
 
-class Script:
-    """A matcher over a map of 1 km that answers from a list of (east, north, confidence) and keeps the priors."""
-
-    site = SimpleNamespace(is_searchable=True, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0)
-
-    def __init__(self, *answers):
-        self.answers, self.priors = list(answers), []
-
-    def locate(self, frame, prior=None, budget=None):
-        self.priors.append(prior)
-        return replace(fix_at(*self.answers.pop(0)), timestamp_ns=frame.timestamp_ns)
-
-
 def flown(answers, seconds, start=None, priors=None):
     """The reasons, or "fix", of frames that are so many seconds apart, without velocities."""
-    script = Script(*answers)
+    script = ScriptedMatcher(*(fix_at(*answer) for answer in answers))
     navigator, stated = Navigator(script, start), []
     for k in range(len(answers)):
         frame = Frame(IMAGE, round(k * seconds * SECOND), 100.0, 0.0)
@@ -132,12 +118,7 @@ def test_a_match_far_from_its_own_telemetry_is_refused_until_others_agree():
 def test_telemetry_that_leads_nowhere_is_left_in_turns():
     """After twelve refusals every third frame searches the whole map."""
 
-    class Blind(Script):
-        def locate(self, frame, prior=None, budget=None):
-            self.priors.append(prior)
-            return fix_at(0.0, 0.0).refused(Reason.LOW_SCORE, "")
-
-    script = Blind()
+    script = ScriptedMatcher(*[None] * 18)
     navigator = Navigator(script)
     for k in range(18):
         navigator.update(Frame(IMAGE, k * SECOND, 100.0, 0.0), Prior(east_m=0.0, north_m=0.0, sigma_m=15.0))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from types import SimpleNamespace
 
 import numpy as np
 
 from engine import Fix, Frame, Navigator, Window
 from engine.navigation.hypotheses import MAX_HYPOTHESES
 from tests.support.fixes import a_fix
+from tests.support.matchers import ScriptedMatcher
 
 _NUMBERS = itertools.count()
 SECOND = 1_000_000_000
@@ -21,21 +21,10 @@ def new_image():
     return np.full((8, 8), next(_NUMBERS) % 256, np.uint8)
 
 
-class Weak:
-    """A matcher whose matches, at the next of its places, are right with a probability of 0.8."""
-
-    site = SimpleNamespace(is_searchable=True, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0)
-
-    def __init__(self, places):
-        self.places = list(places)
-
-    def locate(self, frame, prior=None, budget=None):
-        return a_fix(*self.places.pop(0), score=0.3, window=Window(0, 0, 200, 200), confidence=0.8)
-
-
 def fly(places):
-    """Frames eastwards from 100 m above the ground, one a second, without a start."""
-    navigator, results = Navigator(Weak(places)), []
+    """Frames eastwards, one a second, without a start, whose matches are right with a probability of 0.8."""
+    stated = {"score": 0.3, "window": Window(0, 0, 200, 200), "confidence": 0.8}
+    navigator, results = Navigator(ScriptedMatcher(*(a_fix(*place, **stated) for place in places))), []
     for k in range(len(places)):
         moved = {"east_velocity_mps": SPEED_MPS, "north_velocity_mps": 0.0}
         results.append(navigator.update(Frame(new_image(), k * SECOND, 100.0, 0.0, **moved)))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from engine.geo import LocalFrame
 from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
 from engine.navigation.motion import PositionEstimate
 from tests.support.fixes import a_fix
+from tests.support.matchers import ScriptedMatcher, a_site
 
 IMAGE = np.zeros((8, 8), np.uint8)
 SECOND = 1_000_000_000
@@ -21,30 +20,17 @@ STILL = {"east_velocity_mps": 0.0, "north_velocity_mps": 0.0}
 
 
 def fix_at(east_m, north_m, sigma_m=0.5, map_sigma_m=3.0):
-    stated = {
-        "method": "sift",
-        "confidence": 0.9999,
-        "map_sigma_m": map_sigma_m,
-        "window": Window(0, 0, 1000, 1000),
-    }
-    return a_fix(east_m, north_m, math.hypot(sigma_m, map_sigma_m), **stated)
+    stated = {"method": "sift", "confidence": 0.9999, "window": Window(0, 0, 1000, 1000)}
+    return a_fix(east_m, north_m, math.hypot(sigma_m, map_sigma_m), map_sigma_m=map_sigma_m, **stated)
 
 
-class Script:
+def scripted(*places):
     """A matcher that answers with places on a map that states nothing of its accuracy."""
-
-    site = SimpleNamespace(is_searchable=True, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=None)
-
-    def __init__(self, *places):
-        self.places, self.priors = list(places), []
-
-    def locate(self, frame, prior=None, budget=None):
-        self.priors.append(prior)
-        return replace(fix_at(*self.places.pop(0)), timestamp_ns=frame.timestamp_ns)
+    return ScriptedMatcher(*(fix_at(*place) for place in places), site=a_site(georeference_sigma_m=None))
 
 
 def fly(places, given=None, seconds=1.0):
-    script = Script(*places)
+    script = scripted(*places)
     navigator = Navigator(script, Prior(east_m=0.0, north_m=0.0, sigma_m=5.0))
     results = []
     for k in range(len(places)):
@@ -71,7 +57,7 @@ def test_the_maps_error_cancels_between_fixes_on_it():
 def test_a_position_of_another_source_is_searched_with_the_maps_error():
     """Known to centimetres in the world, it is known to 3 m on a map that states nothing."""
     centimetres = [Prior(east_m=4.0, north_m=3.0, sigma_m=0.02)]
-    script = Script((0.0, 0.0))
+    script = scripted((0.0, 0.0))
     navigator = Navigator(script)
     assert isinstance(navigator.update(Frame(IMAGE, 0, 100.0, 0.0, **STILL), centimetres[0]), Fix)
     assert script.priors[0].sigma_m == pytest.approx(3.0, rel=1e-3)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +28,7 @@ from engine import (
 )
 from engine.options import ACCEPT_ALL
 from tests.support.fixes import a_fix
+from tests.support.matchers import ScriptedMatcher, a_site
 
 NUMBERS = itertools.count()
 START = Prior(east_m=10.0, north_m=20.0, sigma_m=5.0)
@@ -40,24 +40,10 @@ def fix_at(east_m, north_m, sigma_m=1.0, **stated):
     return a_fix(east_m, north_m, sigma_m, attitude=Attitude(0.0, 0.0, 0.0), method="sift", **stated)
 
 
-class Script:
-    """A matcher that answers from a list: a place, None for a refusal, or its reason. It keeps what is asked."""
-
-    def __init__(self, *answers, site=None, sigma_m=1.0, up_m=None):
-        self.site = site or SimpleNamespace(
-            is_searchable=True, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0
-        )
-        self.answers, self.sigma_m, self.up_m = list(answers), sigma_m, up_m
-        self.frames, self.priors, self.budgets = [], [], []
-
-    def locate(self, frame, prior=None, budget=None):
-        self.frames.append(frame)
-        self.priors.append(prior)
-        self.budgets.append(budget)
-        place = self.answers.pop(0)
-        if place is None or isinstance(place, Reason):
-            return NoFix(reason=place or Reason.LOW_SCORE, timestamp_ns=frame.timestamp_ns)
-        return fix_at(*place, self.sigma_m, timestamp_ns=frame.timestamp_ns, up_m=self.up_m)
+def script(*answers, sigma_m=1.0, up_m=None, site=None):
+    """A matcher that answers from a list: a place, None for a refusal, or its reason."""
+    fixes = (fix_at(*a, sigma_m, up_m=up_m) if isinstance(a, tuple) else a for a in answers)
+    return ScriptedMatcher(*fixes, site=site)
 
 
 def new_image():
@@ -75,6 +61,14 @@ def reasons(results):
     return ["fix" if isinstance(result, Fix) else result.reason.value for result in results]
 
 
+def flown(*answers, start=START, every_s=1.0, velocity=STILL, options=None, **known):
+    """The ends of frames that are so far apart and are answered from a list, what was asked, and the navigator."""
+    matcher = script(*answers, **known)
+    navigator = Navigator(matcher, start, options=options)
+    results = [navigator.update(at(every_s * k, velocity)) for k in range(len(answers))]
+    return reasons(results), matcher.priors, navigator
+
+
 def assert_prior(prior, east, north, sigma, moved=None):
     assert (prior.east_m, prior.north_m) == (pytest.approx(east), pytest.approx(north))
     assert prior.sigma_m == pytest.approx(sigma)
@@ -83,12 +77,12 @@ def assert_prior(prior, east, north, sigma, moved=None):
 
 
 def test_a_flight_begins_at_its_start():
-    script = Script((10.0, 20.0))
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0))
+    navigator = Navigator(matcher, START)
     assert not navigator.tracking
     assert isinstance(navigator.update(at(1.0)), Fix)
     assert navigator.tracking
-    assert_prior(script.priors[0], 10.0, 20.0, 5.0)
+    assert_prior(matcher.priors[0], 10.0, 20.0, 5.0)
 
 
 # Prediction
@@ -96,19 +90,19 @@ def test_a_flight_begins_at_its_start():
 
 def test_it_predicts_with_the_velocity_of_the_telemetry():
     """2 s at (7, -3) m/s, known to 0.5 m/s: 14 m east and 6 m south, and 1 m of sigma more."""
-    script = Script((10.0, 20.0), None)
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), None)
+    navigator = Navigator(matcher, START)
     navigator.update(at(1.0))
     navigator.update(at(3.0, (7.0, -3.0)))
-    assert_prior(script.priors[1], 24.0, 14.0, math.hypot(1.0, 1.0), moved=(14.0, -6.0))
+    assert_prior(matcher.priors[1], 24.0, 14.0, math.hypot(1.0, 1.0), moved=(14.0, -6.0))
 
 
 def test_between_two_measured_velocities_it_moves_with_their_mean():
-    script = Script((10.0, 20.0), None)
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), None)
+    navigator = Navigator(matcher, START)
     navigator.update(at(1.0, (2.0, 0.0)))
     navigator.update(at(3.0, (6.0, -4.0)))
-    assert_prior(script.priors[1], 18.0, 16.0, math.hypot(1.0, 1.0), moved=(8.0, -4.0))
+    assert_prior(matcher.priors[1], 18.0, 16.0, math.hypot(1.0, 1.0), moved=(8.0, -4.0))
 
 
 def test_it_predicts_with_the_last_fixes_where_the_telemetry_has_no_velocity():
@@ -116,23 +110,23 @@ def test_it_predicts_with_the_last_fixes_where_the_telemetry_has_no_velocity():
 
     a random walk of the velocity, 3 sqrt(t) m/s after t, of which the mean over 1 s misses 3 sqrt(1/3).
     """
-    script = Script((10.0, 20.0), (16.0, 20.0), None)
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), (16.0, 20.0), None)
+    navigator = Navigator(matcher, START)
     for seconds in (1.0, 2.0, 4.0):
         navigator.update(at(seconds))
-    assert_prior(script.priors[1], 10.0, 20.0, math.hypot(1.0, 7.5), moved=(0.0, 0.0))  # 15 m/s, either way
+    assert_prior(matcher.priors[1], 10.0, 20.0, math.hypot(1.0, 7.5), moved=(0.0, 0.0))  # 15 m/s, either way
     drift_m = 2.0 * (math.sqrt(2.0) + 3.0 * math.sqrt(1 / 3)) + 3.0 * math.sqrt(8 / 3)
-    assert_prior(script.priors[2], 28.0, 20.0, math.hypot(1.0, drift_m), moved=(12.0, 0.0))
+    assert_prior(matcher.priors[2], 28.0, 20.0, math.hypot(1.0, drift_m), moved=(12.0, 0.0))
 
 
 def test_dead_reckoning_adds_up_over_refusals():
     """An error of a measured velocity lasts: 0.5 m a second. The window grows besides, the prediction does not."""
-    script = Script((10.0, 20.0), None, None, None)
-    navigator = Navigator(script, START, options=NavigatorOptions(growth=1.5))
+    matcher = script((10.0, 20.0), None, None, None)
+    navigator = Navigator(matcher, START, options=NavigatorOptions(growth=1.5))
     navigator.update(at(0.0, (4.0, 0.0)))
     for seconds, velocity in ((1.0, (4.0, 0.0)), (2.0, (4.0, 4.0)), (3.0, (0.0, 4.0))):
         navigator.update(at(seconds, velocity))
-    first, second, third = script.priors[1:]
+    first, second, third = matcher.priors[1:]
     assert_prior(first, 14.0, 20.0, math.hypot(1.0, 0.5), moved=(4.0, 0.0))
     assert_prior(second, 18.0, 22.0, math.hypot(1.0, 1.0) * 1.5, moved=(4.0, 2.0))
     assert_prior(third, 20.0, 26.0, math.hypot(1.0, 1.5) * 1.5**2, moved=(2.0, 4.0))
@@ -140,57 +134,45 @@ def test_dead_reckoning_adds_up_over_refusals():
 
 
 def test_a_fix_ends_the_growth():
-    script = Script((10.0, 20.0), None, None, (10.0, 20.0), None)
-    navigator = Navigator(script, START)
-    for k in range(5):
-        navigator.update(at(k, STILL))
-    assert_prior(script.priors[4], 10.0, 20.0, math.hypot(1.0, 0.5))
+    _, priors, _ = flown((10.0, 20.0), None, None, (10.0, 20.0), None)
+    assert_prior(priors[4], 10.0, 20.0, math.hypot(1.0, 0.5))
 
 
 def test_the_uncertainty_of_a_fix_is_that_of_the_next_prediction():
-    script = Script((10.0, 20.0), None, sigma_m=4.0)
-    navigator = Navigator(script, START)
-    navigator.update(at(0.0))
-    navigator.update(at(1.0, STILL))
-    assert script.priors[1].sigma_m == pytest.approx(math.hypot(4.0, 0.5))
+    _, priors, _ = flown((10.0, 20.0), None, sigma_m=4.0)
+    assert priors[1].sigma_m == pytest.approx(math.hypot(4.0, 0.5))
 
 
 def test_frames_without_stamps_are_an_interval_apart():
-    script = Script((10.0, 20.0), None)
-    navigator = Navigator(script, START, options=NavigatorOptions(default_interval_s=0.5))
+    matcher = script((10.0, 20.0), None)
+    navigator = Navigator(matcher, START, options=NavigatorOptions(default_interval_s=0.5))
     navigator.update(at(None))
     navigator.update(at(None, (8.0, 0.0)))
-    assert_prior(script.priors[1], 14.0, 20.0, math.hypot(1.0, 0.25))
+    assert_prior(matcher.priors[1], 14.0, 20.0, math.hypot(1.0, 0.25))
 
 
 def test_a_start_that_leads_nowhere_widens_and_is_then_forgotten():
-    script = Script(*[None] * 4)
-    navigator = Navigator(script, START, options=NavigatorOptions(lost_after=3, growth=2.0))
-    for k in range(4):
-        navigator.update(at(k, STILL))
-    assert [prior and prior.sigma_m for prior in script.priors] == [
-        5.0,
-        pytest.approx(2.0 * math.hypot(5.0, 0.5)),
-        pytest.approx(4.0 * math.hypot(5.0, 1.0)),
-        None,
-    ]
+    _, priors, _ = flown(*[None] * 4, options=NavigatorOptions(lost_after=3, growth=2.0))
+    grown_m = [5.0, 2.0 * math.hypot(5.0, 0.5), 4.0 * math.hypot(5.0, 1.0)]
+    assert [prior.sigma_m for prior in priors[:3]] == pytest.approx(grown_m)
+    assert priors[3] is None
 
 
 @pytest.mark.parametrize(("sigma_m", "used"), [(0.2, True), (50.0, False)])
 def test_the_tighter_of_its_own_prediction_and_a_given_prior_is_used(sigma_m, used):
-    script = Script((10.0, 20.0), None)
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), None)
+    navigator = Navigator(matcher, START)
     navigator.update(at(0.0))
     given = Prior(east_m=77.0, north_m=0.0, sigma_m=sigma_m)
     navigator.update(at(1.0, STILL), given)
-    assert (script.priors[1] == given) == used
+    assert (matcher.priors[1] == given) == used
 
 
 def test_a_given_prior_is_used_where_it_knows_nothing_itself(sim_site):
-    script = Script(None, site=sim_site)
+    matcher = script(None, site=sim_site)
     given = Prior(lat_deg=48.0, lon_deg=15.0, sigma_m=900.0)
-    Navigator(script).update(at(0.0), given)
-    assert script.priors == [replace(given, sigma_m=math.hypot(900.0, 3.0))]  # of a map that states nothing
+    Navigator(matcher).update(at(0.0), given)
+    assert matcher.priors == [replace(given, sigma_m=math.hypot(900.0, 3.0))]  # of a map that states nothing
 
 
 # Belief
@@ -198,42 +180,38 @@ def test_a_given_prior_is_used_where_it_knows_nothing_itself(sim_site):
 
 def test_a_match_of_the_whole_map_is_believed_once_others_agree():
     """Three in a row by the motion that was measured; the second and third are looked for near the first."""
-    script = Script(None, (100.0, 0.0), (104.5, 0.0), (107.0, 0.0), None)
-    navigator = Navigator(script)
-    results = [navigator.update(at(k, (4.0, 0.0))) for k in range(5)]
-    assert reasons(results) == ["low_score", "unconfirmed", "unconfirmed", "fix", "low_score"]
-    assert script.priors[:2] == [None, None]
-    assert_prior(script.priors[2], 104.0, 0.0, math.hypot(1.0, 0.5))
-    assert_prior(script.priors[4], 111.0, 0.0, math.hypot(1.0, 0.5))
+    answers = None, (100.0, 0.0), (104.5, 0.0), (107.0, 0.0), None
+    ends, priors, navigator = flown(*answers, start=None, velocity=(4.0, 0.0))
+    assert ends == ["low_score", "unconfirmed", "unconfirmed", "fix", "low_score"]
+    assert priors[:2] == [None, None]
+    assert_prior(priors[2], 104.0, 0.0, math.hypot(1.0, 0.5))
+    assert_prior(priors[4], 111.0, 0.0, math.hypot(1.0, 0.5))
     assert (navigator.state, navigator.reset_count) == (NavigatorState.COASTING, 0)
 
 
 @pytest.mark.parametrize("second", [None, (140.0, 0.0)])
 def test_a_match_that_is_not_confirmed_is_dropped(second):
     """By a frame that finds nothing there, or finds another place."""
-    script = Script((100.0, 0.0), second, (108.0, 0.0), (112.0, 0.0), (116.0, 0.0))
-    navigator = Navigator(script)
-    results = [navigator.update(at(k, (4.0, 0.0))) for k in range(5)]
-    assert reasons(results)[2:] == ["unconfirmed", "unconfirmed", "fix"]
+    places = (100.0, 0.0), second, (108.0, 0.0), (112.0, 0.0), (116.0, 0.0)
+    ends, _, _ = flown(*places, start=None, velocity=(4.0, 0.0))
+    assert ends[2:] == ["unconfirmed", "unconfirmed", "fix"]
 
 
 def test_matches_that_a_vehicle_cannot_fly_between_never_agree():
     places = [(300.0 * (k % 3), 200.0 * (k % 2)) for k in range(30)]
-    navigator = Navigator(Script(*places))
-    assert not any(isinstance(navigator.update(at(0.2 * k)), Fix) for k in range(30))
+    ends, _, navigator = flown(*places, start=None, every_s=0.2, velocity=(None, None))
+    assert "fix" not in ends
     assert navigator.state is NavigatorState.SEARCHING
 
 
 def test_a_wide_start_confirms_nothing():
-    script = Script(*[(10.0, 20.0)] * 3)
-    navigator = Navigator(script, Prior(east_m=10.0, north_m=20.0, sigma_m=200.0))
-    results = [navigator.update(at(k, STILL)) for k in range(3)]
-    assert reasons(results) == ["unconfirmed", "unconfirmed", "fix"]
+    ends, _, _ = flown(*[(10.0, 20.0)] * 3, start=Prior(east_m=10.0, north_m=20.0, sigma_m=200.0))
+    assert ends == ["unconfirmed", "unconfirmed", "fix"]
 
 
 def test_a_fix_that_contradicts_the_prediction_is_held_and_the_next_right_one_believed():
-    script = Script((10.0, 20.0), (10.0, 60.0), (10.0, 20.0))
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), (10.0, 60.0), (10.0, 20.0))
+    navigator = Navigator(matcher, START)
     results = [navigator.update(at(k, STILL)) for k in range(3)]
     assert reasons(results) == ["fix", "inconsistent", "fix"]
     assert "40.0 m from the prediction, sigma 1.5 m" in results[1].detail
@@ -243,44 +221,38 @@ def test_a_fix_that_contradicts_the_prediction_is_held_and_the_next_right_one_be
 
 def test_the_gate_is_a_chi_square_of_the_prediction_and_the_fix():
     """Both known to 1 m, and the way to 0.5 m: sigma 1.5 m. 18.4 lies at 4.29 of them."""
-    for off_m, kind in ((4.28 * 1.5, Fix), (4.30 * 1.5, NoFix)):
-        navigator = Navigator(Script((10.0, 20.0), (10.0 + off_m, 20.0)), START)
-        navigator.update(at(0.0))
-        assert isinstance(navigator.update(at(1.0, STILL)), kind)
+    for off_m, end in ((4.28 * 1.5, "fix"), (4.30 * 1.5, "inconsistent")):
+        assert flown((10.0, 20.0), (10.0 + off_m, 20.0))[0][1] == end
 
 
 def test_fixes_that_agree_outweigh_a_track_that_was_as_short():
     """One fix, and it was wrong: three that agree with each other are more."""
-    script = Script((10.0, 20.0), *[(60.0, 20.0)] * 3)
-    navigator = Navigator(script, START)
-    results = [navigator.update(at(k, STILL)) for k in range(4)]
-    assert reasons(results) == ["fix", "inconsistent", "inconsistent", "fix"]
+    ends, _, navigator = flown((10.0, 20.0), *[(60.0, 20.0)] * 3)
+    assert ends == ["fix", "inconsistent", "inconsistent", "fix"]
     assert navigator.reset_count == 1
 
 
 def test_without_measured_velocities_fixes_that_agree_move_the_track():
     """A guess at the motion contradicts a fix, but not several."""
-    script = Script(*[(10.0, 20.0)] * 20, *[(60.0, 20.0)] * 3)
-    navigator = Navigator(script, START)
-    results = [navigator.update(at(0.2 * k)) for k in range(23)]
-    assert reasons(results) == ["fix"] * 20 + ["inconsistent"] * 2 + ["fix"]
+    places = [(10.0, 20.0)] * 20 + [(60.0, 20.0)] * 3
+    ends, _, _ = flown(*places, every_s=0.2, velocity=(None, None))
+    assert ends == ["fix"] * 20 + ["inconsistent"] * 2 + ["fix"]
 
 
 def test_a_velocity_that_contradicts_a_smooth_way_loses_its_say():
     """5 frames a second northwards at 7 m/s, and a velocity that says southwards."""
-    script = Script(*[(10.0, 20.0 + 1.4 * k) for k in range(60)], sigma_m=0.3)
-    navigator = Navigator(script, START)
-    fixed = [isinstance(navigator.update(at(0.2 * k, (0.0, -7.0))), Fix) for k in range(60)]
-    assert fixed[0]
-    assert not all(fixed[:10])
-    assert all(fixed[15:])
+    places = [(10.0, 20.0 + 1.4 * k) for k in range(60)]
+    ends, _, _ = flown(*places, every_s=0.2, velocity=(0.0, -7.0), sigma_m=0.3)
+    assert ends[0] == "fix"
+    assert ends[:10] != ["fix"] * 10
+    assert ends[15:] == ["fix"] * 45
 
 
 def shifted_map(velocity, seconds):
     """Twenty seconds on the right map, then one that is shifted by 40 m, at 5 frames a second."""
     places = [(10.0, 20.0)] * 100 + [(50.0, 20.0)] * round(5 * seconds)
-    script = Script(*places)
-    navigator, seen = Navigator(script, START), []
+    matcher = script(*places)
+    navigator, seen = Navigator(matcher, START), []
     for k in range(len(places)):
         result = navigator.update(at(0.2 * k, velocity))
         seen.append((isinstance(result, Fix), navigator.healthy))
@@ -306,7 +278,7 @@ def test_a_jump_that_lasts_is_believed_in_the_end_and_counted():
 def creep(speed_mps):
     """Matches that lead away from a vehicle that stands still, step by step; its health, frame by frame."""
     places = [(10.0, 20.0)] * 50 + [(10.0 + 0.2 * speed_mps * k, 20.0) for k in range(50)]
-    navigator, healthy = Navigator(Script(*places), START), []
+    navigator, healthy = Navigator(script(*places), START), []
     for k in range(100):
         navigator.update(at(0.2 * k, STILL))
         healthy.append(navigator.healthy)
@@ -320,8 +292,8 @@ def test_matches_that_lead_away_slowly_are_told_by_velocities_that_were_measured
 
 
 def test_two_methods_that_disagree_for_a_second_are_unhealthy():
-    script = Script(*[(10.0, 20.0)] * 10, *[Reason.INCONSISTENT] * 10)
-    navigator, healthy = Navigator(script, START), []
+    matcher = script(*[(10.0, 20.0)] * 10, *[Reason.INCONSISTENT] * 10)
+    navigator, healthy = Navigator(matcher, START), []
     for k in range(20):
         navigator.update(at(0.2 * k, STILL))
         healthy.append(navigator.healthy)
@@ -330,17 +302,15 @@ def test_two_methods_that_disagree_for_a_second_are_unhealthy():
 
 
 def test_the_baseline_is_handed_out_as_it_comes():
-    script = Script((10.0, 20.0), (400.0, 20.0), None, (10.0, 20.0))
-    navigator = Navigator(script, options=ACCEPT_ALL)
-    results = [navigator.update(at(0.2 * k, STILL)) for k in range(4)]
-    assert reasons(results) == ["fix", "fix", "low_score", "fix"]
+    answers = (10.0, 20.0), (400.0, 20.0), None, (10.0, 20.0)
+    ends, _, _ = flown(*answers, start=None, every_s=0.2, options=ACCEPT_ALL)
+    assert ends == ["fix", "fix", "low_score", "fix"]
 
 
 def test_a_broken_covariance_is_no_fix():
     for covariance in (np.zeros((3, 3)), np.full((3, 3), np.nan), np.diag([1.0, -1.0, 1.0])):
-        script = Script()
-        script.locate = lambda *_, c=covariance: replace(fix_at(10.0, 20.0), covariance_m2=c)
-        assert Navigator(script, START).update(at(0.0)).reason is Reason.BAD_POSE
+        broken = ScriptedMatcher(replace(fix_at(10.0, 20.0), covariance_m2=covariance))
+        assert Navigator(broken, START).update(at(0.0)).reason is Reason.BAD_POSE
 
 
 # Loss
@@ -348,9 +318,9 @@ def test_a_broken_covariance_is_no_fix():
 
 def test_lost_after_enough_refusals_it_searches_the_whole_map_and_then_confirms():
     answers = [(10.0, 20.0), *[None] * 5, (400.0, 2.0), (400.0, 2.0), (400.0, 2.0), None]
-    script = Script(*answers)
+    matcher = script(*answers)
     options = NavigatorOptions(lost_after=4, search_every=2, hold_s=1.0)
-    navigator = Navigator(script, START, options=options)
+    navigator = Navigator(matcher, START, options=options)
     states = []
     for k in range(len(answers)):
         navigator.update(at(k, STILL))
@@ -358,40 +328,31 @@ def test_lost_after_enough_refusals_it_searches_the_whole_map_and_then_confirms(
     lost, coasting = [NavigatorState.LOST] * 4, [NavigatorState.COASTING] * 3
     assert states == [NavigatorState.TRACKING, *coasting, *lost, NavigatorState.TRACKING, NavigatorState.COASTING]
     # In turns over the whole map and where dead reckoning leads; then near what was found.
-    assert [prior is not None for prior in script.priors] == [True] * 5 + [False, True, True, True, True]
-    assert_prior(script.priors[7], 400.0, 2.0, math.hypot(1.0, 0.5))
-    assert_prior(script.priors[9], 400.0, 2.0, math.hypot(1.0, 0.5))
+    assert [prior is not None for prior in matcher.priors] == [True] * 5 + [False, True, True, True, True]
+    assert_prior(matcher.priors[7], 400.0, 2.0, math.hypot(1.0, 0.5))
+    assert_prior(matcher.priors[9], 400.0, 2.0, math.hypot(1.0, 0.5))
     assert navigator.reset_count == 1
 
 
 def test_lost_over_a_map_too_large_to_search_it_looks_where_dead_reckoning_leads():
-    script = Script(
-        (10.0, 20.0),
-        *[None] * 9,
-        site=SimpleNamespace(is_searchable=False, has_surface=True, gsd_m_per_px=1.0, georeference_sigma_m=0.0),
-    )
     options = NavigatorOptions(lost_after=4, search_every=2, lost_sigma_m=3.0)
-    navigator = Navigator(script, START, options=options)
-    for k in range(10):
-        navigator.update(at(k, STILL))
+    _, priors, navigator = flown((10.0, 20.0), *[None] * 9, site=a_site(is_searchable=False), options=options)
     assert navigator.state is NavigatorState.LOST
-    assert all(prior is not None for prior in script.priors)
-    sigmas_m = [prior.sigma_m for prior in script.priors[1:]]
+    sigmas_m = [prior.sigma_m for prior in priors[1:]]
     assert sigmas_m == sorted(sigmas_m)
 
 
 def test_no_single_match_is_believed_after_a_run_of_refusals():
     """Not even where dead reckoning leads."""
-    script = Script((10.0, 20.0), *[None] * 12, (10.0, 20.0), None, *[(10.0, 20.0)] * 3)
-    navigator = Navigator(script, START)
-    results = [navigator.update(at(0.2 * k, STILL)) for k in range(18)]
-    assert [k for k, result in enumerate(results) if isinstance(result, Fix)] == [0, 17]
+    answers = (10.0, 20.0), *[None] * 12, (10.0, 20.0), None, *[(10.0, 20.0)] * 3
+    ends, _, _ = flown(*answers, every_s=0.2)
+    assert [k for k, end in enumerate(ends) if end == "fix"] == [0, 17]
 
 
 def test_a_prediction_that_is_too_uncertain_is_given_up():
     """100 m at 0.5 m/s: after 200 s in which nothing was found."""
-    script = Script((10.0, 20.0), None, None)
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), None, None)
+    navigator = Navigator(matcher, START)
     navigator.update(at(0.0, STILL))
     navigator.update(at(190.0, STILL))
     assert navigator.state is NavigatorState.COASTING
@@ -400,8 +361,8 @@ def test_a_prediction_that_is_too_uncertain_is_given_up():
 
 
 def test_its_state_and_age_are_told():
-    script = Script((10.0, 20.0), None, (10.0, 20.0))
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), None, (10.0, 20.0))
+    navigator = Navigator(matcher, START)
     assert (navigator.state, navigator.anchor_age_s, navigator.healthy) == (NavigatorState.SEARCHING, None, False)
     seen = []
     for seconds in (0.0, 0.8, 1.6):
@@ -416,56 +377,56 @@ def test_its_state_and_age_are_told():
 
 @pytest.mark.parametrize("stamp", [3.0, 1.0, 0.9, 0.0])
 def test_a_frame_that_came_before_or_is_too_old_is_an_error_and_changes_nothing(stamp):
-    script = Script((10.0, 20.0), (10.0, 20.0), None)
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), (10.0, 20.0), None)
+    navigator = Navigator(matcher, START)
     navigator.update(at(1.0))
     navigator.update(at(3.0, STILL))
     again = r"a frame that did not come before, got \d+ again"
     old = r"1000000000 or later \(3000000000 was the newest frame\), got "
     with pytest.raises(TelemetryError, match=rf"^timestamp_ns: expected {again if stamp >= 1.0 else old}"):
         navigator.update(at(stamp, STILL))
-    assert len(script.priors) == 2
+    assert len(matcher.priors) == 2
     navigator.update(at(4.0, STILL))
-    assert_prior(script.priors[2], 10.0, 20.0, math.hypot(1.0, 0.5))
+    assert_prior(matcher.priors[2], 10.0, 20.0, math.hypot(1.0, 0.5))
 
 
 def test_a_late_frame_is_matched_where_the_vehicle_was_and_moves_nothing_back():
     """Half way between frames at 10 m and 14 m east."""
-    script = Script((10.0, 20.0), (14.0, 20.0), (12.2, 20.0), None)
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), (14.0, 20.0), (12.2, 20.0), None)
+    navigator = Navigator(matcher, START)
     navigator.update(at(1.0, (4.0, 0.0)))
     navigator.update(at(2.0, (4.0, 0.0)))
     late = navigator.update(at(1.5, (4.0, 0.0)))
     assert isinstance(late, Fix)
     assert late.timestamp_ns == 1_500_000_000
-    assert_prior(script.priors[2], 12.0, 20.0, math.hypot(1.0, 0.25), moved=(0.0, 0.0))
+    assert_prior(matcher.priors[2], 12.0, 20.0, math.hypot(1.0, 0.25), moved=(0.0, 0.0))
     navigator.update(at(3.0, (4.0, 0.0)))
-    assert_prior(script.priors[3], 18.0, 20.0, math.hypot(1.0, 0.5))
+    assert_prior(matcher.priors[3], 18.0, 20.0, math.hypot(1.0, 0.5))
 
 
 def test_a_late_fix_that_is_newer_than_the_last_one_is_applied_at_its_capture_time():
     """The frame of second 2 was refused; one of 1.5 s says that the vehicle is 1 m north of dead reckoning."""
-    script = Script((10.0, 20.0), None, (12.0, 21.0), None)
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), None, (12.0, 21.0), None)
+    navigator = Navigator(matcher, START)
     navigator.update(at(1.0, (4.0, 0.0)))
     navigator.update(at(2.0, (4.0, 0.0)))
     assert isinstance(navigator.update(at(1.5, (4.0, 0.0))), Fix)
     assert_prior(navigator.prediction, 14.0, 21.0, math.hypot(1.0, 0.25))
     assert navigator.anchor_age_s == pytest.approx(0.5)
     navigator.update(at(3.0, (4.0, 0.0)))
-    assert_prior(script.priors[3], 18.0, 21.0, math.hypot(1.0, 0.75))
+    assert_prior(matcher.priors[3], 18.0, 21.0, math.hypot(1.0, 0.75))
 
 
 def test_a_late_frame_that_contradicts_the_track_is_refused_and_counts_for_nothing():
-    script = Script((10.0, 20.0), (10.0, 20.0), (90.0, 20.0), None, None)
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), (10.0, 20.0), (90.0, 20.0), None, None)
+    navigator = Navigator(matcher, START)
     navigator.update(at(1.0, STILL))
     navigator.update(at(2.0, STILL))
     assert navigator.update(at(1.5, STILL)).reason is Reason.INCONSISTENT
     assert navigator.update(at(1.2, STILL)).reason is Reason.LOW_SCORE
     assert navigator.state is NavigatorState.TRACKING
     navigator.update(at(3.0, STILL))
-    assert_prior(script.priors[4], 10.0, 20.0, math.hypot(1.0, 0.5))
+    assert_prior(matcher.priors[4], 10.0, 20.0, math.hypot(1.0, 0.5))
 
 
 # What is handed on
@@ -476,20 +437,20 @@ def test_the_height_of_a_fix_is_handed_on_to_frames_without_one():
     surface = np.full((64, 64), 30.0, np.float32)
     grid = np.array([[0.5, 0.0, 5e5], [0.0, -0.5, 5.3e6]])
     site = OrthoMap.from_arrays(np.zeros((64, 64), np.uint8), grid, "EPSG:32633", surface_m=surface)
-    script = Script((10.0, 20.0), (10.0, 20.0), None, site=site, up_m=130.0)
-    navigator = Navigator(script, START)
+    matcher = script((10.0, 20.0), (10.0, 20.0), None, site=site, up_m=130.0)
+    navigator = Navigator(matcher, START)
     navigator.update(at(0.0, height_agl_m=None))
     navigator.update(at(1.0, height_agl_m=None))
     navigator.update(at(2.0, height_agl_m=95.0))
-    assert [frame.height_agl_m for frame in script.frames] == [None, 100.0, 95.0]
+    assert [frame.height_agl_m for frame in matcher.frames] == [None, 100.0, 95.0]
 
 
 def test_every_frame_gets_the_budget():
-    script = Script(None, None)
-    navigator = Navigator(script, START, Budget(total_ms=40.0))
+    matcher = script(None, None)
+    navigator = Navigator(matcher, START, Budget(total_ms=40.0))
     for k in range(2):
         navigator.update(at(k))
-    assert script.budgets == [Budget(total_ms=40.0)] * 2
+    assert matcher.budgets == [Budget(total_ms=40.0)] * 2
 
 
 @pytest.mark.parametrize("name", [name for name in NavigatorOptions.__dataclass_fields__ if name != "odometry"])
@@ -569,7 +530,7 @@ def test_a_flight_is_found_again_after_an_outage(sim_site, sim_flight, error_m):
 
 def test_a_picture_that_repeats_while_the_vehicle_moves_is_refused():
     """Of a camera that hangs: its match is where the vehicle was."""
-    navigator = Navigator(Script(*[(10.0, 20.0)] * 8), START)
+    navigator = Navigator(script(*[(10.0, 20.0)] * 8), START)
     first = at(0.0, (4.0, 0.0))
     assert isinstance(navigator.update(first), Fix)
     again = replace(at(1.0, (4.0, 0.0)), image=first.image.copy())
@@ -581,14 +542,14 @@ def test_a_picture_that_repeats_while_the_vehicle_moves_is_refused():
 
 
 def test_a_buffer_that_is_filled_again_is_no_repeat():
-    navigator, buffer = Navigator(Script(*[(10.0, 20.0)] * 3), START), np.zeros((8, 8), np.uint8)
+    navigator, buffer = Navigator(script(*[(10.0, 20.0)] * 3), START), np.zeros((8, 8), np.uint8)
     for seconds in (0.0, 0.1, 0.2):
         buffer[:] = round(100 * seconds)
         assert isinstance(navigator.update(replace(at(seconds, (0.1, 0.0)), image=buffer)), Fix)
 
 
 def test_a_camera_without_noise_may_show_one_place_twice():
-    navigator = Navigator(Script(*[(10.0, 20.0)] * 8), START)
+    navigator = Navigator(script(*[(10.0, 20.0)] * 8), START)
     first = at(0.0, (0.0, 0.0))
     navigator.update(first)
     assert isinstance(navigator.update(replace(at(1.0, (0.0, 0.0)), image=first.image)), Fix)

@@ -18,6 +18,7 @@ from engine import Attitude, Budget, Camera, Frame, Navigator, NavigatorOptions,
 from engine.navigation.motion import DeadReckoning, DriftModel, GroundMotion
 from engine.navigation.odometry import NoMotion, VisualOdometry
 from scenematch.runs.settings import TrackSettings, load_settings
+from tests.support.matchers import ScriptedMatcher, a_site
 
 CAMERA = Camera.from_fov(320, 240, 60.0)
 HEIGHT_M, GROUND_M_PER_PX = 120.0, 0.25
@@ -249,25 +250,19 @@ def test_a_velocity_with_its_own_accuracy_is_taken_at_its_word():
         assert drift.sigma_m(begin, reckoning.sample(still(1.0, **stated), None)) == pytest.approx(expected_m)
 
 
-class Blind:
+def blind(**known):
     """A matcher that refuses all."""
+    matcher = ScriptedMatcher(*[Reason.NO_TEXTURE] * 9, site=a_site(is_searchable=False, has_surface=False))
+    vars(matcher).update(known)
+    return matcher
 
-    def __init__(self):
-        self.camera = CAMERA
-        self.site = SimpleNamespace(
-            is_searchable=False, has_surface=False, gsd_m_per_px=1.0, georeference_sigma_m=0.0
-        )
 
-    def locate(self, frame, prior=None, budget=None):
-        self.budget = budget
-        return NoFix(reason=Reason.NO_TEXTURE, timestamp_ns=frame.timestamp_ns)
+START = Prior(east_m=0.0, north_m=0.0, sigma_m=2.0)
 
 
 @pytest.mark.parametrize("odometry", [True, False])
 def test_a_navigator_follows_the_ground_where_it_is_asked_to(odometry):
-    navigator = Navigator(
-        Blind(), Prior(east_m=0.0, north_m=0.0, sigma_m=2.0), options=NavigatorOptions(odometry=odometry)
-    )
+    navigator = Navigator(blind(camera=CAMERA), START, options=NavigatorOptions(odometry=odometry))
     for k in range(6):
         navigator.update(frame(picture((3.0 * k, -2.0 * k), LEVEL), INTERVAL_S * k))
     predicted = navigator.prediction
@@ -280,14 +275,10 @@ def test_a_navigator_follows_the_ground_where_it_is_asked_to(odometry):
         assert predicted.sigma_m > 15.0
 
 
-START = Prior(east_m=0.0, north_m=0.0, sigma_m=2.0)
-
-
 def test_only_odometry_needs_a_camera_of_the_matcher():
-    matcher = Blind()
-    del matcher.camera
+    matcher = blind()
     assert isinstance(Navigator(matcher, START).update(frame(picture((0, 0), LEVEL))), NoFix)
-    with pytest.raises(OptionError, match=r"^odometry: expected a matcher with a `camera`, got Blind without"):
+    with pytest.raises(OptionError, match=r"^odometry: expected a matcher with a `camera`, got ScriptedM"):
         Navigator(matcher, START, options=NavigatorOptions(odometry=True))
 
 
@@ -297,16 +288,16 @@ def test_the_time_that_odometry_takes_is_the_frames(monkeypatch, total_ms, searc
         time.sleep(0.1)
         return NoMotion("slow")
 
-    matcher, limit = Blind(), Budget(total_ms=total_ms, search_ms=search_ms)
+    matcher, limit = blind(camera=CAMERA), Budget(total_ms=total_ms, search_ms=search_ms)
     navigator = Navigator(matcher, START, limit, NavigatorOptions(odometry=True))
     monkeypatch.setattr(VisualOdometry, "update", slow)
     navigator.update(frame(picture((0, 0), LEVEL)))
-    assert 0.0 < matcher.budget.total_ms <= max(total_ms - 100.0, 1e-6)
-    assert matcher.budget.search_ms is None if search_ms is None else matcher.budget.search_ms <= 1900.0
+    assert 0.0 < matcher.budgets[0].total_ms <= max(total_ms - 100.0, 1e-6)
+    assert matcher.budgets[0].search_ms is None if search_ms is None else matcher.budgets[0].search_ms <= 1900.0
 
 
 def test_odometry_flies_at_the_height_that_fixes_showed(monkeypatch):
-    navigator = Navigator(Blind(), START, options=NavigatorOptions(odometry=True))
+    navigator = Navigator(blind(camera=CAMERA), START, options=NavigatorOptions(odometry=True))
     errors, flown = navigator._errors, frame(picture((0.0, 0.0), LEVEL))
     higher = SimpleNamespace(attitude=None, up_m=1.2 * HEIGHT_M, stage="refined")
     for _ in range(5):

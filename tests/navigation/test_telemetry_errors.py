@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,10 +15,11 @@ from engine import Camera, Navigator, Prior, SceneMatcher
 from engine.errors import OptionError
 from engine.navigation.telemetry_errors import TelemetryErrors, considered
 from engine.options import ACCEPT_ALL, AssumedErrors, NavigatorOptions
-from engine.values import Attitude, Fix, Frame, NoFix, Reason
+from engine.values import Attitude, Fix, Frame
 from scenematch.simulator import plan_flight
 from tests.support.fields import fields_of
 from tests.support.fixes import a_fix
+from tests.support.matchers import ScriptedMatcher, a_site
 from tests.support.towns import drawn_town
 
 IMAGE = np.zeros((4, 4), np.uint8)
@@ -312,28 +312,9 @@ def test_a_late_frame_is_corrected_and_teaches_nothing():
     assert errors.calibration == before
 
 
-class Measuring:
-    """A matcher whose fixes measure another heading than the frame's, or that refuses."""
-
-    def __init__(self, heading_deg):
-        self.site = SimpleNamespace(
-            is_searchable=True,
-            has_surface=True,
-            gsd_m_per_px=1.0,
-            georeference_sigma_m=0.0,
-            ground_at=lambda _: 0.0,
-        )
-        self.heading_deg, self.frames, self.refuses = heading_deg, [], False
-
-    def locate(self, frame, prior=None, budget=None):
-        self.frames.append(frame)
-        if self.refuses:
-            return NoFix(reason=Reason.LOW_SCORE, timestamp_ns=frame.timestamp_ns)
-        return replace(fix_of((0.0, 0.0, self.heading_deg), HEIGHT_M), timestamp_ns=frame.timestamp_ns)
-
-
 def test_the_navigator_takes_it_off_new_and_late_frames_and_forgets_it_when_it_leads_nowhere():
-    matcher, numbers = Measuring(-6.0), itertools.count()
+    measured, numbers = fix_of((0.0, 0.0, -6.0), HEIGHT_M), itertools.count()
+    matcher = ScriptedMatcher(*[measured] * 31, *[None] * 15, site=a_site(ground_at=lambda _: 0.0))
 
     def level_at(time_s):  # a picture like no other: one that repeats is refused
         image = np.full((8, 8), next(numbers) % 256, np.uint8)
@@ -347,7 +328,6 @@ def test_the_navigator_takes_it_off_new_and_late_frames_and_forgets_it_when_it_l
     assert matcher.frames[-1].heading_deg == pytest.approx(354.0, abs=0.3)
     navigator.update(level_at(2.55))  # a late one
     assert matcher.frames[-1].heading_deg == pytest.approx(354.0, abs=0.3)
-    matcher.refuses = True
     for k in range(15):
         navigator.update(level_at(3.0 + 0.1 * k))
     assert navigator.calibration.attitude is None

@@ -10,6 +10,7 @@ from functools import cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2, norm
 
 from engine import Camera
 from engine.matching.pose import AttitudePrior, solve_pose
@@ -19,7 +20,7 @@ Matches = tuple[Array, Array]  # (N, 3) metres, (N, 2) pixels
 
 SIZE_PX = 300
 CAMERA = Camera(SIZE_PX, SIZE_PX, np.array([[259.8, 0, 149.5], [0, 259.8, 149.5], [0, 0, 1]]))
-CHI2_3_SIGMA = 14.156  # three degrees of freedom, 99.73 %
+CHI2_3_SIGMA = float(chi2.ppf(norm.cdf(3) - norm.cdf(-3), 3))  # three degrees of freedom, 99.73 %
 GROUNDS = ("planar nadir", "tilted", "high relief", "distorted")
 
 
