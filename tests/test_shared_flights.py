@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
+from bench.accuracy.flights import moved_to_middle
 from engine import Camera, Fix, Frame, OrthoMap, Prior, SceneMatcher
-from engine.geo import enu_from_body
 from engine.values import Truth
 from scenematch.files.flight import Flight, open_flight
 from scenematch.files.truth import interpolate_truth, read_truth
@@ -44,18 +44,9 @@ class Recorded:
             prior = sigma_m and Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=sigma_m)
             result = matcher.locate(frame, prior or None)
             if isinstance(result, Fix) and middle:
-                result = self.moved_to_middle(result)
+                result = moved_to_middle(result, self.site, self.camera)
             errors.append(error_m(self.site, result, truth) if isinstance(result, Fix) else math.inf)
         return np.array(errors)
-
-    def moved_to_middle(self, fix: Fix) -> Fix:
-        """The fix at the ground in the middle of its frame, where it has an attitude; without one it is there."""
-        if fix.attitude is None or fix.up_m is None:
-            return fix
-        angles = (fix.attitude.roll_deg, fix.attitude.pitch_deg, fix.attitude.heading_deg)
-        ray = enu_from_body(*angles) @ self.camera.mount @ self.camera.frame_rays[4]
-        east, north = np.array([fix.east_m, fix.north_m]) + ray[:2] * (fix.up_m - self.site.ground_m) / -ray[2]
-        return replace(fix, east_m=float(east), north_m=float(north))
 
 
 def recorded(folder, frames="frames"):

@@ -15,13 +15,13 @@ CUE = (
 )
 
 
-def video(folder, gimbal):
-    """Three seconds due north, with a cue a frame: positions to 0.1 m, as DJI writes them."""
+def video(folder, gimbal, size=(32, 32), shade=1):
+    """Three seconds due north, each frame a shade brighter, with a cue each: positions to 0.1 m, as DJI's."""
     path = folder / "DJI_0001.mp4"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), RATE_HZ, (32, 32))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), RATE_HZ, size)
     cues = []
     for k in range(75):
-        writer.write(np.full((32, 32, 3), k, np.uint8))
+        writer.write(np.full((*size[::-1], 3), shade * k, np.uint8))
         lat_deg = 48.1 + NORTH_MPS * k / RATE_HZ / 111_200.0
         cues.append(CUE.format(n=k + 1, s=k // 25, ms=k % 25 * 40, lat=lat_deg, gimbal=gimbal))
     writer.release()

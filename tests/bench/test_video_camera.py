@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +10,7 @@ pytest.importorskip("pymavlink", reason="pymavlink is not installed")
 
 from bench.live.flights.video_camera import SIZE, Footage, ground_from_pixel, recorded_from_shown
 from bench.live.standin import State
-from tests.bench.test_recorded_flights import CUE
+from tests.bench.test_recorded_flights import video
 
 FRAME, FOCAL_PX = (852, 480), 680.0
 TAKEN = State(10.0, -20.0, 170.0, 0.0, 0.0, 104.0, 0.0, 0.0)
@@ -48,15 +47,7 @@ def test_a_pixel_is_on_the_same_ground_in_both_pictures():
 
 def test_the_picture_is_of_the_frame_that_was_taken_nearest(tmp_path):
     """Frames of one shade each, 0.36 m apart due north: the shade tells the frame."""
-    path, cues = tmp_path / "DJI_0001.mp4", []
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25.0, FRAME)
-    for k in range(75):
-        writer.write(np.full((FRAME[1], FRAME[0], 3), 3 * k, np.uint8))
-        lat_deg = 48.1 + 9.0 * k / 25.0 / 111_200.0
-        gimbal = "[gb_yaw: 0.0 gb_pitch: -90.0 gb_roll: 0.0]"
-        cues.append(CUE.format(n=k + 1, s=k // 25, ms=k % 25 * 40, lat=lat_deg, gimbal=gimbal))
-    writer.release()
-    (tmp_path / "DJI_0001.SRT").write_text("".join(cues))
+    path = video(tmp_path, "[gb_yaw: 0.0 gb_pitch: -90.0 gb_roll: 0.0]", FRAME, shade=3)
     footage = Footage(path, 64.1, every=5)
     for index in (0, 7, 14):
         shade = footage.picture(footage.states[index]).mean()

@@ -70,6 +70,7 @@ VEHICLE = VehicleState(
     up_velocity_mps=0.5, height_agl_m=120.0, alt_amsl_m=630.0, down_m=-120.0,
 )  # fmt: skip
 KINDS = [(firmware, kind) for firmware, kinds in MESSAGES.items() for kind in kinds]
+ORIGIN_1E7 = (336400000, 729900000, 510000)
 KEY = bytes(range(32))
 
 
@@ -884,6 +885,18 @@ def bridge_to():
         bridge.close()
 
 
+@pytest.fixture
+def loop(bridge_to):
+    """Makes a bridge in the loop with its navigator, and a stand-in autopilot, by default with an origin."""
+    with contextlib.ExitStack() as flown:
+
+        def make(options=None, pilot=None, **more):
+            made, stated = bridge_to(options, **more), {"origin": ORIGIN_1E7} if pilot is None else pilot
+            return made, flown.enter_context(Standin(made.port, **stated))
+
+        yield make
+
+
 def fly(bridge, until, *, timeout_s=120.0, every_s=0.02):
     """Pictures at 50 Hz until something holds; their captures."""
     image, captures, end = np.zeros((4, 4, 3), np.uint8), [], time.monotonic() + timeout_s
@@ -895,11 +908,10 @@ def fly(bridge, until, *, timeout_s=120.0, every_s=0.02):
     return captures
 
 
-def test_fixes_reach_the_autopilot_with_stamps_of_capture(bridge_to):
-    made = bridge_to()
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        captures = fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 40)
-        got = pilot.of("VISION_POSITION_ESTIMATE")
+def test_fixes_reach_the_autopilot_with_stamps_of_capture(loop):
+    made, pilot = loop()
+    captures = fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 40)
+    got = pilot.of("VISION_POSITION_ESTIMATE")
     stamps = [m.usec for m, _ in got]
     assert set(stamps) <= {c // 1000 for c in captures}
     assert all(b > a for a, b in itertools.pairwise(stamps))
@@ -916,8 +928,8 @@ def test_fixes_reach_the_autopilot_with_stamps_of_capture(bridge_to):
     assert all(captures[0] - 10**10 < m.tc1 < captures[-1] + 10**10 for m in answers)
 
 
-def test_a_packet_that_cannot_be_read_does_not_end_the_reading(bridge_to, monkeypatch, caplog):
-    made = bridge_to()
+def test_a_packet_that_cannot_be_read_does_not_end_the_reading(loop, monkeypatch, caplog):
+    made, pilot = loop()
     update, faults = made.bridge.telemetry.update, []
 
     def fail_thrice(message, now_ns):
@@ -927,32 +939,29 @@ def test_a_packet_that_cannot_be_read_does_not_end_the_reading(bridge_to, monkey
         update(message, now_ns)
 
     monkeypatch.setattr(made.bridge.telemetry, "update", fail_thrice)
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+    fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
     assert len(faults) == 3
     assert [record.exc_info[0] for record in caplog.records] == [ValueError]
 
 
 @pytest.mark.slow
-def test_fixes_come_at_4_hz_or_more(bridge_to):
-    made = bridge_to()
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 20, every_s=0.1)
-        got = pilot.of("VISION_POSITION_ESTIMATE")
+def test_fixes_come_at_4_hz_or_more(loop):
+    made, pilot = loop()
+    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 20, every_s=0.1)
+    got = pilot.of("VISION_POSITION_ESTIMATE")
     hz = (len(got) - 1) / ((got[-1][1] - got[0][1]) * 1e-9)
     assert hz >= MIN_RATE_HZ
 
 
-def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(bridge_to, monkeypatch):
+def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(loop, monkeypatch):
     """After 3 s of an autopilot that has had time to find a receiver, here a tenth of it."""
     monkeypatch.setattr(mavlink_requests, "_ORIGIN_TIMEOUT_NS", 300_000_000)
     monkeypatch.setattr(mavlink_requests, "_PERIOD_NS", 100_000_000)
-    made = bridge_to(origin=ORIGIN)
-    with Standin(made.port, uptime_ns=30_000_000_000) as pilot:
-        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
-        given = pilot.of("SET_GPS_GLOBAL_ORIGIN")
-        assert [(m.latitude, m.longitude, m.altitude) for m, _ in given[:1]] == [(336400000, 729900000, 510000)]
-        assert given[0][1] < pilot.of("VISION_POSITION_ESTIMATE")[0][1]
+    made, pilot = loop(origin=ORIGIN, pilot={"uptime_ns": 30_000_000_000})
+    fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+    given = pilot.of("SET_GPS_GLOBAL_ORIGIN")
+    assert [(m.latitude, m.longitude, m.altitude) for m, _ in given[:1]] == [(336400000, 729900000, 510000)]
+    assert given[0][1] < pilot.of("VISION_POSITION_ESTIMATE")[0][1]
     assert made.bridge.status.withheld["no origin"] > 0
 
 
@@ -1010,100 +1019,93 @@ def test_a_velocity_that_the_estimator_does_not_know_is_none(flags, known):
     assert (telemetry.vehicle(10_000_000_000).east_velocity_mps is not None) == known
 
 
-def test_each_firmware_is_asked_for_what_it_has(bridge_to):
-    made = bridge_to()
-    with Standin(made.port) as pilot:
-        fly(made.bridge, lambda: len(pilot.of("COMMAND_LONG")) >= 8)
-        asked = {
-            m.param1 for m, _ in pilot.of("COMMAND_LONG") if m.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
-        }
+def test_each_firmware_is_asked_for_what_it_has(loop):
+    made, pilot = loop(pilot={})
+    fly(made.bridge, lambda: len(pilot.of("COMMAND_LONG")) >= 8)
+    asked = {m.param1 for m, _ in pilot.of("COMMAND_LONG") if m.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     assert mavlink.MAVLINK_MSG_ID_ALTITUDE not in asked  # "No ap_message for mavlink id 141"
     assert mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT in asked
     assert mavlink.MAVLINK_MSG_ID_ALTITUDE in REQUESTED_RATES_HZ["px4"]
 
 
-def test_a_camera_that_sees_nothing_does_not_keep_the_vehicle_from_arming(bridge_to):
+def test_a_camera_that_sees_nothing_does_not_keep_the_vehicle_from_arming(loop):
     """ArduPilot's check wants a message of visual odometry in the last 0.3 s; its quality says it is no fix."""
-    made = bridge_to()
+    made, pilot = loop()
     made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        fly(made.bridge, lambda: len(pilot.of("ODOMETRY")) >= 5)
-        assert {m.quality for m, _ in pilot.of("ODOMETRY")} == {-1}
-        pilot.armed = True
-        fly(made.bridge, lambda: made.bridge.telemetry.armed)
-        before = len(pilot.of("ODOMETRY"))
-        fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
-        assert len(pilot.of("ODOMETRY")) <= before + 2  # in flight its health is that of the fixes
-        assert not pilot.of("VISION_POSITION_ESTIMATE")
+    fly(made.bridge, lambda: len(pilot.of("ODOMETRY")) >= 5)
+    assert {m.quality for m, _ in pilot.of("ODOMETRY")} == {-1}
+    pilot.armed = True
+    fly(made.bridge, lambda: made.bridge.telemetry.armed)
+    before = len(pilot.of("ODOMETRY"))
+    fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
+    assert len(pilot.of("ODOMETRY")) <= before + 2  # in flight its health is that of the fixes
+    assert not pilot.of("VISION_POSITION_ESTIMATE")
 
 
-def test_a_second_receiver_repeats_the_first_until_the_vehicle_is_armed(bridge_to):
+def test_a_second_receiver_repeats_the_first_until_the_vehicle_is_armed(loop):
     """ArduPilot's check wants a fix of every receiver, and on the ground a camera sees nothing."""
-    made = bridge_to(MavlinkOptions(message="gps_input", gps_id=1))
+    options, receiver = MavlinkOptions(message="gps_input", gps_id=1), (3, *ORIGIN_1E7[:2])
+    made, pilot = loop(options, pilot={"receiver": receiver})
     made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
-    with Standin(made.port, receiver=(3, 336400000, 729900000)) as pilot:
-        fly(made.bridge, lambda: len(pilot.of("GPS_INPUT")) >= 5)
-        repeated = pilot.of("GPS_INPUT")[-1][0]
-        assert (repeated.gps_id, repeated.fix_type, repeated.lat, repeated.lon) == (1, 3, 336400000, 729900000)
-        assert repeated.ignore_flags & mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
-        # The quickest message counts as the one without delay, and must be a fix.
-        assert repeated.time_usec <= time.monotonic_ns() // 1000 - 250_000
-        pilot.armed = True
-        fly(made.bridge, lambda: made.bridge.telemetry.armed)
-        before = len(pilot.of("GPS_INPUT"))
-        fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
-        assert len(pilot.of("GPS_INPUT")) <= before + 2  # in flight it has a fix where the camera has one
+    fly(made.bridge, lambda: len(pilot.of("GPS_INPUT")) >= 5)
+    repeated = pilot.of("GPS_INPUT")[-1][0]
+    assert (repeated.gps_id, repeated.fix_type, repeated.lat, repeated.lon) == (1, 3, 336400000, 729900000)
+    assert repeated.ignore_flags & mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
+    # The quickest message counts as the one without delay, and must be a fix.
+    assert repeated.time_usec <= time.monotonic_ns() // 1000 - 250_000
+    pilot.armed = True
+    fly(made.bridge, lambda: made.bridge.telemetry.armed)
+    before = len(pilot.of("GPS_INPUT"))
+    fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
+    assert len(pilot.of("GPS_INPUT")) <= before + 2  # in flight it has a fix where the camera has one
 
 
-def test_the_pilot_is_told_when_fixes_begin_and_stop(bridge_to, monkeypatch):
+def test_the_pilot_is_told_when_fixes_begin_and_stop(loop, monkeypatch):
     monkeypatch.setattr("scenematch.bridges.notices._STOPPED_S", 1.5)
-    made = bridge_to()
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        fly(made.bridge, lambda: pilot.of("STATUSTEXT"))
-        made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
-        fly(made.bridge, lambda: len(pilot.of("STATUSTEXT")) >= 2)
-        made.navigator.result = None
-        fly(made.bridge, lambda: len(pilot.of("STATUSTEXT")) >= 3)
-        texts = [m.text for m, _ in pilot.of("STATUSTEXT")]
+    made, pilot = loop()
+    fly(made.bridge, lambda: pilot.of("STATUSTEXT"))
+    made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
+    fly(made.bridge, lambda: len(pilot.of("STATUSTEXT")) >= 2)
+    made.navigator.result = None
+    fly(made.bridge, lambda: len(pilot.of("STATUSTEXT")) >= 3)
+    texts = [m.text for m, _ in pilot.of("STATUSTEXT")]
     assert texts[0] == texts[2] == "Scenematch: fixes begin"
     assert re.fullmatch(r"Scenematch: fixes stopped, \d+ refused: no texture", texts[1])
 
 
-def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(bridge_to):
-    made = bridge_to()
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
-        made.navigator.result = fix(east_m=40.0)
-        fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 10)
-        before = len(pilot.of("VISION_POSITION_ESTIMATE"))
-        assert any(m.text.startswith("Scenematch: map doubted, 40 m off") for m, _ in pilot.of("STATUSTEXT"))
-        station = autopilot(system=255, component=190)  # on the vehicle's link, as an autopilot passes it on
-        number = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(loop):
+    made, pilot = loop()
+    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
+    made.navigator.result = fix(east_m=40.0)
+    fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 10)
+    before = len(pilot.of("VISION_POSITION_ESTIMATE"))
+    assert any(m.text.startswith("Scenematch: map doubted, 40 m off") for m, _ in pilot.of("STATUSTEXT"))
+    station = autopilot(system=255, component=190)  # on the vehicle's link, as an autopilot passes it on
+    number = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+    word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
+    pilot.socket.send(word.pack(station))
+    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 5)
+    assert [m.result for m, _ in pilot.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED]
+
+
+def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(loop):
+    made, pilot = loop(component_id=194, use_velocity=False)
+    camera, station = autopilot(component=197), autopilot(system=255, component=190)
+    for number in (197, 194):
         word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
+        fly(made.bridge, lambda: pilot.of("HEARTBEAT"))
         pilot.socket.send(word.pack(station))
-        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 5)
-        assert [m.result for m, _ in pilot.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED]
 
+    def seen():
+        pilot.socket.send(odometry(2.0, 1.0, 0.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION).pack(camera))
+        frames = made.navigator.frames
+        return frames and frames[-1].east_velocity_mps is not None and pilot.of("COMMAND_ACK")
 
-def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(bridge_to):
-    made = bridge_to(component_id=194, use_velocity=False)
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        camera, station = autopilot(component=197), autopilot(system=255, component=190)
-        for number in (197, 194):
-            word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
-            fly(made.bridge, lambda: pilot.of("HEARTBEAT"))
-            pilot.socket.send(word.pack(station))
-
-        def seen():
-            pilot.socket.send(odometry(2.0, 1.0, 0.0, by=mavlink.MAV_ESTIMATOR_TYPE_VISION).pack(camera))
-            frames = made.navigator.frames
-            return frames and frames[-1].east_velocity_mps is not None and pilot.of("COMMAND_ACK")
-
-        fly(made.bridge, seen)
-        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
-        assert len(pilot.of("COMMAND_ACK")) == 1
-        for kind in ("HEARTBEAT", "COMMAND_ACK", "VISION_POSITION_ESTIMATE"):
-            assert {(m.get_srcSystem(), m.get_srcComponent()) for m, _ in pilot.of(kind)} == {(1, 194)}
+    fly(made.bridge, seen)
+    fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+    assert len(pilot.of("COMMAND_ACK")) == 1
+    for kind in ("HEARTBEAT", "COMMAND_ACK", "VISION_POSITION_ESTIMATE"):
+        assert {(m.get_srcSystem(), m.get_srcComponent()) for m, _ in pilot.of(kind)} == {(1, 194)}
 
 
 @pytest.mark.parametrize("number", ["1", "0", "256"])
@@ -1117,62 +1119,56 @@ def test_the_bridge_is_no_autopilot_and_no_broadcast(number, capsys):
 
 
 @pytest.mark.parametrize(("use_velocity", "by_camera"), [(True, False), (False, True), (False, False)])
-def test_velocities_arrive_from_a_camera_and_if_it_is_told_so_from_the_autopilot(
-    bridge_to, use_velocity, by_camera
-):
-    made = bridge_to(use_velocity=use_velocity)
-    with Standin(made.port) as pilot:
-        sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
+def test_velocities_arrive_from_a_camera_and_if_it_is_told_so_from_the_autopilot(loop, use_velocity, by_camera):
+    made, pilot = loop(use_velocity=use_velocity, pilot={})
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
 
-        def seen():
-            if by_camera:
-                pilot.socket.send(speed_estimate(3.0, -4.0, 0.5).pack(sender))
-            frames = made.navigator.frames
-            heard = bool(frames) and frames[-1].heading_deg is not None and len(frames) > 10
-            return heard and (not by_camera or frames[-1].east_velocity_mps is not None)
+    def seen():
+        if by_camera:
+            pilot.socket.send(speed_estimate(3.0, -4.0, 0.5).pack(sender))
+        frames = made.navigator.frames
+        heard = bool(frames) and frames[-1].heading_deg is not None and len(frames) > 10
+        return heard and (not by_camera or frames[-1].east_velocity_mps is not None)
 
-        fly(made.bridge, seen)
+    fly(made.bridge, seen)
     frame = made.navigator.frames[-1]
     stated = (frame.east_velocity_mps, frame.north_velocity_mps)
     assert stated == (pytest.approx((-4.0, 3.0)) if by_camera else (0.0, 0.0) if use_velocity else (None, None))
 
 
-def test_the_first_fixes_are_held_against_the_receiver(bridge_to):
+def test_the_first_fixes_are_held_against_the_receiver(loop):
     site = SimpleNamespace(frame=LocalFrame(33.64, 72.99))
-    made = bridge_to(site=site)
+    made, pilot = loop(site=site, pilot={"origin": ORIGIN_1E7, "receiver": (3, 336400000, 729900000)})
     made.navigator.result = fix(east_m=40.0)
-    with Standin(made.port, origin=(336400000, 729900000, 510000), receiver=(3, 336400000, 729900000)) as pilot:
-        fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
-        made.navigator.result = fix(east_m=1.0)
-        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
+    fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
+    made.navigator.result = fix(east_m=1.0)
+    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-def test_only_a_first_fix_waits_for_the_autopilots_word_on_its_receiver(bridge_to, resumed, monkeypatch):
+def test_only_a_first_fix_waits_for_the_autopilots_word_on_its_receiver(loop, resumed, monkeypatch):
     """The stand-in says nothing of a receiver; a bridge that goes on from its last fix asks for none."""
     monkeypatch.setattr("scenematch.bridges.mavlink._GNSS_STALE_NS", 10**15)
     start = Prior(lat_deg=33.64, lon_deg=72.99, sigma_m=20.0)
-    made = bridge_to(site=SimpleNamespace(frame=LocalFrame(33.64, 72.99)), start=start, resumed=resumed)
+    made, pilot = loop(site=SimpleNamespace(frame=LocalFrame(33.64, 72.99)), start=start, resumed=resumed)
     made.navigator.result = fix(east_m=400.0)
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
-        made.navigator.result = fix(east_m=1.0)
-        if resumed:
-            fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
-        else:
-            fly(made.bridge, lambda: made.bridge.status.withheld.get("receiver not heard yet", 0) > 5)
-            assert not pilot.of("VISION_POSITION_ESTIMATE")
+    fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
+    made.navigator.result = fix(east_m=1.0)
+    if resumed:
+        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
+    else:
+        fly(made.bridge, lambda: made.bridge.status.withheld.get("receiver not heard yet", 0) > 5)
+        assert not pilot.of("VISION_POSITION_ESTIMATE")
 
 
-def test_reset_counter_steps_once_per_relocalisation(bridge_to):
-    made = bridge_to()
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
-        made.navigator.reset_count = 1
-        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE")[-1][0].reset_counter == 1)
-        made.navigator.reset_count = 256
-        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE")[-1][0].reset_counter == 0)
-        counters = [m.reset_counter for m, _ in pilot.of("VISION_POSITION_ESTIMATE")]
+def test_reset_counter_steps_once_per_relocalisation(loop):
+    made, pilot = loop()
+    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
+    made.navigator.reset_count = 1
+    fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE")[-1][0].reset_counter == 1)
+    made.navigator.reset_count = 256
+    fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE")[-1][0].reset_counter == 0)
+    counters = [m.reset_counter for m, _ in pilot.of("VISION_POSITION_ESTIMATE")]
     assert [c for i, c in enumerate(counters) if i == 0 or c != counters[i - 1]] == [0, 1, 0]
 
 
@@ -1184,49 +1180,47 @@ def test_reset_counter_steps_once_per_relocalisation(bridge_to):
         ("px4", None, "other firmware"),
     ],
 )
-def test_nothing_is_sent_of_poor_fixes_and_refusals_and_to_the_other_firmware(bridge_to, firmware, result, why):
-    made = bridge_to(MavlinkOptions(firmware=firmware))
+def test_nothing_is_sent_of_poor_fixes_and_refusals_and_to_the_other_firmware(loop, firmware, result, why):
+    made, pilot = loop(MavlinkOptions(firmware=firmware))
     made.navigator.result = result
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        fly(made.bridge, lambda: (made.bridge.status.withheld | made.bridge.status.refused).get(why, 0) > 3)
-        assert not pilot.of("VISION_POSITION_ESTIMATE") + pilot.of("GLOBAL_POSITION_SENSOR")
+    fly(made.bridge, lambda: (made.bridge.status.withheld | made.bridge.status.refused).get(why, 0) > 3)
+    assert not pilot.of("VISION_POSITION_ESTIMATE") + pilot.of("GLOBAL_POSITION_SENSOR")
 
 
 def test_reconnects_after_silence_and_to_a_new_address(bridge_to, monkeypatch):
     monkeypatch.setattr("scenematch.bridges.mavlink._SILENCE_NS", 2_000_000_000)
     made = bridge_to()
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+    with Standin(made.port, origin=ORIGIN_1E7) as pilot:
         fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
         pilot.silent = True
         fly(made.bridge, lambda: not made.bridge.connected)
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+    with Standin(made.port, origin=ORIGIN_1E7) as pilot:
         fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
     assert made.bridge.status.reconnections == 1
 
 
 def test_with_a_key_an_unsigned_autopilot_is_not_answered(bridge_to):
     made = bridge_to(key=KEY)
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
+    with Standin(made.port, origin=ORIGIN_1E7) as pilot:
         fly(made.bridge, lambda: made.bridge.status.dropped > 20)
         assert not made.bridge.connected
         assert not pilot.got
-    with Standin(made.port, origin=(336400000, 729900000, 510000), key=KEY) as pilot:
+    with Standin(made.port, origin=ORIGIN_1E7, key=KEY) as pilot:
         fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
 
 
-def test_with_a_key_what_is_not_signed_cannot_steer_even_from_the_vehicles_own_address(bridge_to):
-    made = bridge_to(key=KEY)
-    with Standin(made.port, origin=(336400000, 729900000, 510000), key=KEY) as pilot:
-        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
-        liar = autopilot()
-        lies = mavlink.MAVLink_gps_global_origin_message(1, 1, 1).pack(liar) + beat(liar)
-        lies += mavlink.MAVLink_attitude_message(1, 1.0, 1.0, 1.0, 0, 0, 0).pack(liar)
-        before = made.bridge.status.dropped
-        for _ in range(50):
-            pilot.socket.send(lies)
-        fly(made.bridge, lambda: made.bridge.status.dropped >= before + 100)
-        fly(made.bridge, lambda: len(made.navigator.frames) > 5)
-        assert made.navigator.frames[-1].roll_deg == pytest.approx(0.0)
+def test_with_a_key_what_is_not_signed_cannot_steer_even_from_the_vehicles_own_address(loop):
+    made, pilot = loop(key=KEY, pilot={"origin": ORIGIN_1E7, "key": KEY})
+    fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+    liar = autopilot()
+    lies = mavlink.MAVLink_gps_global_origin_message(1, 1, 1).pack(liar) + beat(liar)
+    lies += mavlink.MAVLink_attitude_message(1, 1.0, 1.0, 1.0, 0, 0, 0).pack(liar)
+    before = made.bridge.status.dropped
+    for _ in range(50):
+        pilot.socket.send(lies)
+    fly(made.bridge, lambda: made.bridge.status.dropped >= before + 100)
+    fly(made.bridge, lambda: len(made.navigator.frames) > 5)
+    assert made.navigator.frames[-1].roll_deg == pytest.approx(0.0)
     assert made.bridge.telemetry.origin.lat_deg == pytest.approx(33.64)
 
 
@@ -1246,19 +1240,18 @@ def fd_is_there(fd):
     return os.path.lexists(f"/proc/self/fd/{fd}")
 
 
-def test_a_flood_and_a_stranger_do_not_steer_it(bridge_to):
-    made = bridge_to()
+def test_a_flood_and_a_stranger_do_not_steer_it(loop):
+    made, pilot = loop()
     rng = random.Random(4)
-    with Standin(made.port, origin=(336400000, 729900000, 510000)) as pilot:
-        fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
-        before = len(pilot.of("VISION_POSITION_ESTIMATE"))
-        stranger, flood = autopilot(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        flood.connect(("127.0.0.1", made.port))
-        lies = mavlink.MAVLink_gps_global_origin_message(1, 1, 1).pack(stranger) + beat(stranger)
-        for _ in range(2000):
-            flood.send(lies if rng.random() < 0.5 else rng.randbytes(300))
-        fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 10)
-        flood.close()
+    fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
+    before = len(pilot.of("VISION_POSITION_ESTIMATE"))
+    stranger, flood = autopilot(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    flood.connect(("127.0.0.1", made.port))
+    lies = mavlink.MAVLink_gps_global_origin_message(1, 1, 1).pack(stranger) + beat(stranger)
+    for _ in range(2000):
+        flood.send(lies if rng.random() < 0.5 else rng.randbytes(300))
+    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 10)
+    flood.close()
     assert made.bridge.telemetry.origin.lat_deg == pytest.approx(33.64)
 
 

@@ -38,6 +38,24 @@ class Slow:
         return fix(frame)
 
 
+class Gate:
+    """Where a navigator hangs until a test opens it."""
+
+    def __init__(self, leaves_after_s: float = 0.0):
+        self.begun, self.opened, self.left = threading.Event(), threading.Event(), []
+        self.leaves_after_s = leaves_after_s
+
+    def __call__(self):
+        self.begun.set()
+        self.opened.wait(60.0)
+        time.sleep(self.leaves_after_s)
+        self.left.append(True)
+
+
+def die():
+    raise ZeroDivisionError("a bug")
+
+
 class Sink:
     """Collects answers and lets a test wait for them."""
 
@@ -95,15 +113,13 @@ def test_each_frame_has_its_own_fix():
 
 
 def test_the_newest_wins_and_drops_are_counted():
-    gate, sink = threading.Event(), Sink()
-    navigator = Slow(0, {0: gate.wait})
-    with Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=60_000)) as live:
+    gate, sink = Gate(), Sink()
+    with Live(lambda start: Slow(0, {0: gate}), sink, options=LiveOptions(deadline_ms=60_000)) as live:
         live.submit(frame(0))
-        while not navigator.budgets:
-            time.sleep(0.001)
+        assert gate.begun.wait(60.0)
         for number in range(1, 8):
             live.submit(frame(number))
-        gate.set()
+        gate.opened.set()
         answers = sink.wait_for(2)
     assert [a.frame.timestamp_ns for a in answers] == [0, 7]
     assert live.counts.dropped == 6
@@ -130,12 +146,12 @@ def test_more_frames_than_it_can_take(times):
 
 
 def test_an_answer_comes_at_the_deadline_and_the_late_fix_never():
-    gate, sink = threading.Event(), Sink()
+    gate, sink = Gate(), Sink()
     options = LiveOptions(deadline_ms=50, patience_ms=60_000)
-    with Live(lambda start: Slow(0, {0: gate.wait}), sink, options=options) as live:
+    with Live(lambda start: Slow(0, {0: gate}), sink, options=options) as live:
         live.submit(frame(0))
         assert reasons(sink.wait_for(1)) == [Reason.LATE]
-        gate.set()
+        gate.opened.set()
         live.submit(frame(1))
         sink.wait_for(2)
     assert [a.frame.timestamp_ns for a in sink.answers] == [0, 1]
@@ -156,29 +172,25 @@ def test_the_navigator_is_given_what_is_left():
 
 
 def test_a_worker_that_hangs_is_replaced_and_starts_from_the_last_fix():
-    clock, gate, begun, sink, starts = Clock(), threading.Event(), threading.Event(), Sink(), []
-
-    def hang():
-        begun.set()
-        gate.wait()
+    clock, gate, sink, starts = Clock(), Gate(), Sink(), []
 
     def make(start):
         starts.append(start)
-        return Slow(0, {1: hang} if len(starts) == 1 else {})
+        return Slow(0, {1: gate} if len(starts) == 1 else {})
 
     options = LiveOptions(deadline_ms=1000, patience_ms=500)
     with Live(make, sink, options=options, clock_ns=clock, machine_ns=clock) as live:
         live.submit(frame(0))
         sink.wait_for(1)
         live.submit(frame(1))
-        assert begun.wait(60.0)
+        assert gate.begun.wait(60.0)
         clock.advance(1000)
         sink.wait_for(2)
         clock.advance(500)
         wait_until(lambda: live.counts.workers_replaced)
         live.submit(frame(2))
         sink.wait_for(3)
-        gate.set()  # the one that hung comes back, and is not heard
+        gate.opened.set()  # the one that hung comes back, and is not heard
         live.submit(frame(3))
         sink.wait_for(4)
     assert reasons(sink.answers) == ["fix", Reason.LATE, "fix", "fix"]
@@ -190,9 +202,6 @@ def test_a_worker_that_hangs_is_replaced_and_starts_from_the_last_fix():
 
 
 def test_a_worker_that_dies_is_replaced_and_its_frame_answered():
-    def die():
-        raise ZeroDivisionError("a bug")
-
     sink, made = Sink(), []
 
     def make(start):
@@ -225,9 +234,6 @@ def test_a_frame_that_cannot_be_used_costs_no_worker():
 @pytest.mark.slow
 def test_a_maker_that_fails_is_asked_again(caplog):
     sink, calls = Sink(), []
-
-    def die():
-        raise ZeroDivisionError
 
     def make(start):
         calls.append(start)
@@ -270,31 +276,27 @@ def test_after_closing_there_is_nothing_more():
     wait_until(no_threads)
 
 
-def test_closing_waits_for_a_worker_whose_frame_was_answered_without_it():
-    begun, gate, over, sink = threading.Event(), threading.Event(), [], Sink()
-
-    def work():
-        begun.set()
-        gate.wait(60.0)
-        over.append(True)
-
-    navigator = Slow(0, dict.fromkeys(range(1000), work))
-    live = Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=20, patience_ms=60_000))
+def submit_until_begun(live, sink, gate):
+    """On a machine that is busy a frame may be due before its work begins."""
     for number in range(1000):
         live.submit(frame(number))
         assert reasons(sink.wait_for(number + 1)) == [Reason.LATE] * (number + 1)
-        if begun.is_set():  # on a machine that is busy a frame may be due before its work begins
-            break
-    threading.Timer(0.1, gate.set).start()
+        if gate.begun.is_set():
+            return
+
+
+def test_closing_waits_for_a_worker_whose_frame_was_answered_without_it():
+    gate, sink = Gate(), Sink()
+    navigator = Slow(0, dict.fromkeys(range(1000), gate))
+    live = Live(lambda start: navigator, sink, options=LiveOptions(deadline_ms=20, patience_ms=60_000))
+    submit_until_begun(live, sink, gate)
+    threading.Timer(0.1, gate.opened.set).start()
     live.close()
-    assert over
+    assert gate.left
 
 
 def test_closing_ends_the_attempts_of_a_maker_that_fails(caplog):
     calls, sink = [], Sink()
-
-    def die():
-        raise ZeroDivisionError
 
     def make(start):
         calls.append(start)
@@ -315,66 +317,49 @@ def test_closing_ends_the_attempts_of_a_maker_that_fails(caplog):
 
 def test_closing_waits_for_a_worker_that_was_given_up():
     """A process that ends while a thread of its is within compiled code is aborted."""
-    gate, over, sink = threading.Event(), [], Sink()
-
-    begun = threading.Event()
-
-    def slow():
-        begun.set()
-        gate.wait(60.0)
-        time.sleep(0.3)
-        over.append(True)
-
-    navigator = Slow(0, dict.fromkeys(range(1000), slow))
+    gate, sink = Gate(leaves_after_s=0.3), Sink()
+    navigator = Slow(0, dict.fromkeys(range(1000), gate))
     with Live(lambda _: navigator, sink, options=LiveOptions(deadline_ms=20, patience_ms=30)) as live:
-        for number in range(1000):
-            live.submit(frame(number))
-            sink.wait_for(number + 1)
-            if begun.is_set():
-                break
+        submit_until_begun(live, sink, gate)
         wait_until(lambda: live.counts.workers_replaced > 0)
-        assert not over
-        gate.set()
-    assert over
+        assert not gate.left
+        gate.opened.set()
+    assert gate.left
 
 
 @pytest.mark.parametrize("name", ["deadline_ms", "patience_ms"])
-def test_nothing_is_waited_for_longer_than_a_minute(name):
-    with pytest.raises(OptionError, match=f"{name}: expected at most 60000, got 1e\\+13"):
-        LiveOptions(**{name: 1e13})
+@pytest.mark.parametrize(
+    ("value", "wanted"), [(1e13, "at most 60000, got 1e\\+13"), (0, "a number above 0, got 0")]
+)
+def test_what_is_waited_for_is_above_0_and_at_most_a_minute(name, value, wanted):
+    with pytest.raises(OptionError, match=f"{name}: expected {wanted}"):
+        LiveOptions(**{name: value})
 
 
 def test_closing_does_not_replace_a_worker_that_hangs(monkeypatch):
     monkeypatch.setattr("engine.navigation.live._JOIN_S", 0.05)
-    clock, gate, begun, sink, starts = Clock(), threading.Event(), threading.Event(), Sink(), []
-
-    def hang():
-        begun.set()
-        gate.wait()
+    clock, gate, sink, starts = Clock(), Gate(), Sink(), []
 
     def make(start):
         starts.append(start)
-        return Slow(0, {0: hang})
+        return Slow(0, {0: gate})
 
     options = LiveOptions(deadline_ms=500, patience_ms=100)
     with Live(make, sink, options=options, clock_ns=clock, machine_ns=clock) as live:
         live.submit(frame(0))
-        assert begun.wait(60.0)
+        assert gate.begun.wait(60.0)
         clock.advance(500)
         assert reasons(sink.wait_for(1)) == [Reason.LATE]
     clock.advance(100)
     wait_until(lambda: "scenematch-_watch" not in [thread.name for thread in threading.enumerate()])
     assert len(starts) == 1
     assert live.counts.workers_replaced == 0
-    gate.set()
+    gate.opened.set()
     wait_until(no_threads)
 
 
 def test_a_worker_that_hangs_in_making_its_navigator_is_replaced():
     clock, gate, sink, calls = Clock(), threading.Event(), Sink(), []
-
-    def die():
-        raise ZeroDivisionError
 
     def make(start):
         calls.append(clock() * 1e-6)
@@ -401,8 +386,3 @@ def test_a_worker_that_hangs_in_making_its_navigator_is_replaced():
     # A maker that is only slow comes through in the end: each is waited for twice as long as the one before.
     assert calls[2] - calls[1] >= 110.0
     assert calls[3] - calls[2] >= 220.0
-
-
-def test_options_are_checked():
-    with pytest.raises(OptionError, match="deadline_ms: expected a number above 0, got 0"):
-        LiveOptions(deadline_ms=0)
