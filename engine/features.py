@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from engine.runtime.tensors import torch
 
 _MAX_MAGNITUDE = 1e6  # of a pixel's value
-_MAX_SPREAD = 1000
 __all__ = ["Features", "Matches", "chosen_backend", "match", "plans_created", "prepare_plans", "sift"]
 
 
@@ -164,5 +163,5 @@ def _check_options(
         raise OptionError(f"upsample: expected 1 or 2, got {upsample}")
     if not contrast_threshold >= 0:
         raise OptionError(f"contrast_threshold: expected a number from 0 up, got {contrast_threshold}")
-    if not 1 <= spread <= _MAX_SPREAD:
-        raise OptionError(f"spread: expected 1 to {_MAX_SPREAD}, got {spread}")
+    if spread < 1:
+        raise OptionError(f"spread: expected 1 or more, got {spread}")

@@ -25,8 +25,6 @@ FloatImage = NDArray[np.float32]
 # Transforms of longer sides leave the cache, and cost twice as much per pixel.
 _CACHED_SIDE = 1152
 _MAX_BLOCKS = 16  # along one axis
-# Numbers per array that a thread keeps for the next call: those of a whole block.
-_MAX_KEPT = 2 * _CACHED_SIDE**2
 
 
 def ncc_surface(search: FloatImage, templates: FloatImage, *, zero_mean: bool) -> FloatImage:
@@ -231,7 +229,7 @@ def _scratch(name: str, shape: tuple[int, ...], kind: DTypeLike = np.float32) ->
     memory: NDArray[Any] | None = getattr(_kept, name, None)
     if memory is None or memory.size < count:
         memory = np.empty(count, kind)
-        if count <= _MAX_KEPT:
+        if count <= 2 * _CACHED_SIDE**2:  # complex numbers of one block; larger ones are not kept
             setattr(_kept, name, memory)
     return memory[:count].reshape(shape)
 

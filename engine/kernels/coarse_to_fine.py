@@ -31,7 +31,6 @@ WIDE_PX = 2_000_000
 _MIN_HALVED_PX = 128 * 128
 _CANDIDATES, _CANDIDATES_WIDE = 6, 64
 _SEPARATION_PX = 2  # of candidates, on the coarsest level
-_UPHILL_STEPS = 4  # within the reach of one LocalScores
 _MAX_LOSS = 0.5  # of a perfect match between pixels, on the coarsest level usable for a quick look
 
 
@@ -300,13 +299,13 @@ def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak 
     dx, dy, _ = fit_summit(scores[y - 1 : y + 2, x - 1 : x + 2].astype(np.float64))
     y, x = round(scale * (y + dy)), round(scale * (x + dx))
     scorer = LocalScores(part.image, model, (y, x), part.counts, levels.min_overlap)
-    for uphill in range(_UPHILL_STEPS + 1):
+    for steps_left in reversed(range(scorer.REACH)):  # each looks one pixel further
         if not all(2 <= v <= n - 2 for v, n in zip((y, x), scorer.limits, strict=True)):
             return None, False
         around = scorer.at(y + NEAR[0], x + NEAR[1]).reshape(3, 3)
         if around.max() <= -1.0:
             return None, False
-        if uphill == _UPHILL_STEPS:
+        if steps_left == 0:
             return Peak(x, y, float(around[1, 1]), -1.0, np.zeros((2, 2))), False
         best = int(around.argmax())
         if best == 4:

@@ -9,8 +9,9 @@ import numpy as np
 
 from engine.runtime.jit import compiled, inlined
 
-_BIWEIGHT = 4.685  # standard deviations at which the weight of Tukey's biweight reaches 0
-_MAD = 1.4826  # standard deviation of normal noise over its median absolute value
+# Median absolute differences at which the weight reaches 0: 4.685 standard deviations for Tukey's biweight, and
+# normal noise has one of 1.4826 such medians.
+_FAR = 4.685 * 1.4826
 _MEDIAN_STEP = 3  # the median uses every third difference
 
 
@@ -161,7 +162,7 @@ def _biweight(differences, weights):
                 sizes[index // _MEDIAN_STEP] = abs(differences[n])
             index += 1
     typical = median(sizes[: (index + _MEDIAN_STEP - 1) // _MEDIAN_STEP])
-    far = _BIWEIGHT * _MAD * max(typical, 1e-6)
+    far = _FAR * max(typical, 1e-6)
     out = np.empty(weights.size)
     for n in range(weights.size):
         agreement = max(1.0 - (differences[n] / far) ** 2, 0.0)

@@ -6,9 +6,6 @@ import numpy as np
 
 from engine.runtime.jit import compiled, inlined
 
-FORBIDDEN = -1e30
-"""In place of the cosine of a pair that is not allowed."""
-
 
 @compiled("(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4, f4, i8, f4[::1], i8[::1], f4[::1], b1[::1])")
 def two_nearest(cosine, own, other, least_cos, most_log, start, best, index, second, mutual):
@@ -49,13 +46,13 @@ def two_nearest(cosine, own, other, least_cos, most_log, start, best, index, sec
 @inlined
 def _forbid_scales(row, logs, own, most):
     """Forbid pairs of other scales, and by a comparison with NaN those that are not valid."""
-    forbidden = np.float32(FORBIDDEN)
+    forbidden = np.float32(-np.inf)
     for m in range(row.size):
         row[m] = row[m] if abs(logs[m] - own) <= most else forbidden
 
 
 @inlined
 def _forbid_angles(row, cos, sin, own_cos, own_sin, least):
-    forbidden = np.float32(FORBIDDEN)
+    forbidden = np.float32(-np.inf)
     for m in range(row.size):
         row[m] = row[m] if own_cos * cos[m] + own_sin * sin[m] >= least else forbidden

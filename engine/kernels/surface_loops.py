@@ -12,9 +12,6 @@ import numpy as np
 from engine.kernels.transform_sizes import FLAT_SHARE
 from engine.runtime.jit import compiled, inlined
 
-# The same as :data:`FLAT_SHARE` for a template, by the squares that its mean alone would have.
-_FLAT_TEMPLATE = 1e-24
-
 
 @compiled("(f4[:, ::1], b1)")
 def moments(picture, zero_mean):
@@ -45,7 +42,8 @@ def moments(picture, zero_mean):
 def unit(template, zero_mean):
     """A template (h, w) float32 scaled to a norm of 1, zeros where flat, and its sum of squares."""
     mean, energy = moments(template, zero_mean)
-    flat = energy <= _FLAT_TEMPLATE * template.size * mean * mean
+    # As of a patch, but of the template's mean and not of the squares in which that is squared already.
+    flat = energy <= FLAT_SHARE * FLAT_SHARE * template.size * mean * mean
     scale, model = 0.0 if flat else 1.0 / math.sqrt(energy), np.empty(template.shape, np.float32)
     for y in range(template.shape[0]):
         for x in range(template.shape[1]):

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from engine.maps.grids import Array, Grid, apply_affine
 from engine.maps.heights import part_grid
-from engine.maps.rasters import STRETCH_PERCENT, Source, map_errors, palette_of
+from engine.maps.rasters import STRETCH_PERCENT, Source, map_errors, palette_of, stretched
 from engine.values import Window
 
 Rgb = NDArray[np.uint8]
@@ -59,6 +59,4 @@ def _stretched(colour: NDArray[np.generic]) -> Rgb:
         return np.ascontiguousarray(colour, np.uint8)
     values = np.asarray(colour, np.float64)
     known = values[np.isfinite(values)]
-    low, high = np.percentile(known, STRETCH_PERCENT) if known.size else (0.0, 1.0)
-    scaled = (np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) * (255.0 / max(high - low, 1e-30))
-    return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
+    return stretched(values, np.percentile(known, STRETCH_PERCENT) if known.size else np.array([0.0, 1.0]))

@@ -15,6 +15,7 @@ import numpy as np
 from engine.learned import KeypointMatcher, Keypoints
 from engine.maps.landmarks import as_picture
 from engine.maps.recently_used import RecentlyUsed
+from engine.maps.tiles import HALO_PX, tile_at, tiles_under, widened
 from engine.runtime.device import CPU, as_tensor
 from engine.runtime.tensors import torch
 from engine.values import Window
@@ -24,8 +25,6 @@ if TYPE_CHECKING:  # avoids an import circle with the map
 
 TILE_PX = 512
 """Tiles begin on multiples of this in every level."""
-HALO_PX = 64
-"""Margin around a tile that is read for description."""
 PX_PER_KEYPOINT = 64
 """A tile has at most one keypoint per this many pixels."""
 MAX_KEYPOINTS = 1 << 18
@@ -65,28 +64,27 @@ class KeypointMap:
         """
         corner = np.array([window.x0, window.y0], np.float32)
         size = np.array([window.width_px, window.height_px], np.float32)
-        keys = _keys(window, level)
+        keys = [(level, row, column) for row, column in tiles_under(window, TILE_PX)]
         parts = []
         for tile in [self._tiles.get(key, partial(self._describe, *key)) for key in keys]:
             xy = tile.xy_px - tile.xy_px.new_tensor(corner)
             inside = ((xy >= 0.0) & (xy <= xy.new_tensor(size) - 1.0)).all(dim=1)
             parts.append(Keypoints(xy, tile.strength, tile.descriptors).only(inside))
-        self._tiles.evict(len, MAX_KEYPOINTS, keep=len(keys))
+        self._tiles.evict(lambda _, tile: len(tile), MAX_KEYPOINTS, keep=len(keys))
         share = min(1.0, count / max(1, sum(map(len, parts))))
         parts = [part.only(torch.arange(int(share * len(part)), device=part.xy_px.device)) for part in parts]
         return Keypoints(*(torch.cat(v) for v in zip(*map(_fields, parts), strict=True)))
 
     def _describe(self, level: int, row: int, column: int) -> Keypoints:
         """The keypoints of a tile, in pixels of the level."""
-        rows, columns = self._site.level_shape(level)
-        x0, y0 = column * TILE_PX, row * TILE_PX
-        x1, y1 = min(columns, x0 + TILE_PX), min(rows, y0 + TILE_PX)
-        left, top = max(0, x0 - HALO_PX), max(0, y0 - HALO_PX)
-        wide = Window(left, top, min(columns, x1 + HALO_PX) - left, min(rows, y1 + HALO_PX) - top)
+        shape = self._site.level_shape(level)
+        tile = tile_at(row, column, TILE_PX, shape)
+        wide = widened(tile, HALO_PX, shape)
         picture = as_tensor(as_picture(self._site.gray(wide, level), CPU))
         found = self._matcher.extract(picture, math.ceil(wide.area_px / PX_PER_KEYPOINT))
-        xy = found.xy_px + found.xy_px.new_tensor([left, top])
-        own = ((xy >= xy.new_tensor([x0, y0]) - 0.5) & (xy < xy.new_tensor([x1, y1]) - 0.5)).all(dim=1)
+        xy = found.xy_px + found.xy_px.new_tensor([wide.x0, wide.y0])
+        low, size = xy.new_tensor([tile.x0, tile.y0]), xy.new_tensor([tile.width_px, tile.height_px])
+        own = ((xy >= low - 0.5) & (xy < low + size - 0.5)).all(dim=1)
         if not self._site.fully_valid:
             own &= self._on_data(found, wide, level)
         return Keypoints(xy, found.strength, found.descriptors).only(own)
@@ -103,10 +101,3 @@ class KeypointMap:
 
 def _fields(points: Keypoints) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return points.xy_px, points.strength, points.descriptors
-
-
-def _keys(window: Window, level: int) -> list[_Key]:
-    """The tiles that a window of a level touches."""
-    rows = range(window.y0 // TILE_PX, (window.y0 + window.height_px - 1) // TILE_PX + 1)
-    columns = range(window.x0 // TILE_PX, (window.x0 + window.width_px - 1) // TILE_PX + 1)
-    return [(level, row, column) for row in rows for column in columns]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from engine.features import Features, chosen_backend, sift
 from engine.maps.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
 from engine.maps.recently_used import RecentlyUsed
+from engine.maps.tiles import HALO_PX, TILE_PX, tile_at, tiles_under, widened, within
 from engine.runtime.device import Device, Picture, all_on_host, all_placed, as_float, placed
 from engine.values import Window
 
@@ -30,10 +31,6 @@ DETECTOR_VERSION = 3
 """Part of the key of cached landmarks; raise it with every change of detector or descriptor."""
 MIN_CONTRAST = 0.005
 """Lowe's contrast threshold: bare ground has little; elsewhere the strongest are taken."""
-TILE_PX = 256
-"""Tiles begin on multiples of this in every level."""
-HALO_PX = 64
-"""Margin around a tile that is read for detection; the descriptor of nearly every keypoint ends within it."""
 CELL_PX = 64
 """Landmarks are ranked by strength within square cells of the level."""
 MAX_PER_CELL = 96
@@ -106,7 +103,7 @@ class LandmarkMap:
         """
         keys = _keys(window, level, upright)
         tiles = [self._tile(key) for key in keys]
-        self._tiles.evict(_count, self._max_landmarks, keep=len(keys))
+        self._tiles.evict(lambda _, tile: _count(tile), self._max_landmarks, keep=len(keys))
         max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
         return self._to_landmarks(_gathered(tiles, [_inside(tile, window, max_rank) for tile in tiles]))
 
@@ -155,12 +152,10 @@ class LandmarkMap:
 
     def _detect(self, level: int, upright: bool, row: int, column: int) -> NamedArrays:
         """Every keypoint on a tile, as detected in the whole level."""
-        rows, columns = self._site.level_shape(level)
-        x0, y0 = column * TILE_PX, row * TILE_PX
-        x1, y1 = min(columns, x0 + TILE_PX), min(rows, y0 + TILE_PX)
-        left, top = max(0, x0 - HALO_PX), max(0, y0 - HALO_PX)
-        wide = Window(left, top, min(columns, x1 + HALO_PX) - left, min(rows, y1 + HALO_PX) - top)
-        inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
+        shape = self._site.level_shape(level)
+        own = tile_at(row, column, TILE_PX, shape)
+        wide = widened(own, HALO_PX, shape)
+        inner = within(own, wide)
         mask = np.zeros((wide.height_px, wide.width_px), np.bool_)
         mask[inner] = True if self._site.fully_valid else self._site.valid(wide, level)[inner]
         if not mask.any():
@@ -177,7 +172,7 @@ class LandmarkMap:
         fields = (found.valid, found.xy_px, found.scale_px, found.angle_deg, found.descriptors)
         valid, *all_slots = all_on_host([values[0] for values in fields])
         positions, scale, angle, descriptors = (values[valid] for values in all_slots)
-        xy = positions + np.array([left, top], np.float32)
+        xy = positions + np.array([wide.x0, wide.y0], np.float32)
         rank = _rank_in_cells(xy)
         kept = np.flatnonzero(rank < MAX_PER_CELL)
         scale, angle, descriptors = scale[kept], angle[kept], descriptors[kept]
@@ -216,11 +211,7 @@ def as_picture(gray: NDArray[np.uint8], device: Device) -> Picture:
 
 
 def _keys(window: Window, level: int, upright: bool) -> list[_Key]:
-    """The tiles that a window of a level touches."""
-    bottom, right = window.y0 + window.height_px - 1, window.x0 + window.width_px - 1
-    rows = range(window.y0 // TILE_PX, bottom // TILE_PX + 1)
-    columns = range(window.x0 // TILE_PX, right // TILE_PX + 1)
-    return [(level, upright, row, column) for row in rows for column in columns]
+    return [(level, upright, row, column) for row, column in tiles_under(window, TILE_PX)]
 
 
 def _inside(tile: NamedArrays, window: Window, max_rank: int) -> NDArray[np.intp]:

@@ -27,7 +27,6 @@ from engine.maps.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_e
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
 
-MAX_SIDE_PX = 1_000_000
 GRID_VERSION = 1
 """Part of the key of cached copies; raise it with every change in how they are created."""
 TILE_PX = 8192
@@ -58,8 +57,10 @@ def _metric_grid(source: Grid) -> Grid:
     ):  # outside UTM's range coordinates are infinite; the check below refuses them
         step = float(min(np.linalg.norm(near[1] - near[0]), np.linalg.norm(near[3] - near[2])))
         size = (high - low) / step
-    if not (np.isfinite(size).all() and size.max() <= MAX_SIDE_PX):
-        raise MapError(f"map: expected at most {MAX_SIDE_PX} px a side on a UTM grid, got {size} of {step:.3g} m")
+    if not (np.isfinite(size).all() and size.max() <= xyz_tiles.MAX_SIDE_PX):
+        raise MapError(
+            f"map: expected at most {xyz_tiles.MAX_SIDE_PX} px a side on a UTM grid, got {size} of {step:.3g} m"
+        )
     matrix = np.array([[step, 0.0, low[0] + step / 2.0], [0.0, -step, high[1] - step / 2.0]])
     return Grid(math.ceil(size[0] - 1e-6), math.ceil(size[1] - 1e-6), matrix, utm)
 

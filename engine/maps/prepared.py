@@ -6,15 +6,16 @@ The least recently used regions are evicted.
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.scores import enhance
+from engine.maps.recently_used import RecentlyUsed
+from engine.maps.tiles import TILE_PX, widened, within
 from engine.ncc_fft import Search, prepare
 from engine.runtime.device import Device, Picture, on_host, placed
 from engine.values import Window
@@ -24,9 +25,6 @@ if TYPE_CHECKING:  # a map is built on what lies here
 
 FloatImage = NDArray[np.float32]
 
-CELL_PX = 256
-"""Regions begin and end on multiples of this, and at least half of it beyond the requested window, so that the
-next windows of a flight fall in the same region."""
 WHOLE_LEVEL_PX = 1 << 23
 """Levels of at most this many pixels are prepared as a whole."""
 MAX_REGION_PX = 6 << 20
@@ -64,11 +62,12 @@ class PreparedMap:
 
     def __init__(self, site: OrthoMap, device: Device, radius_px: int, score: str = "local") -> None:
         self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
-        self._regions: OrderedDict[tuple[int, Window], Region] = OrderedDict()  # the most recently used is last
-        # Guards the regions, not their preparation: a thread that hangs there must not block others.
-        self._lock = threading.Lock()
-        self.created = 0
+        self._regions: RecentlyUsed[tuple[int, Window], Region] = RecentlyUsed()
+
+    @property
+    def created(self) -> int:
         """Regions prepared so far."""
+        return self._regions.created
 
     def cut(self, window: Window, level: int) -> Region:
         """The prepared part of a level that contains a window, cropped to it.
@@ -85,7 +84,7 @@ class PreparedMap:
         region = self._region(aligned, level)
         i, j = aligned.x0 - region.window.x0, aligned.y0 - region.window.y0
         search = region.search.crop(i, j, aligned.width_px, aligned.height_px)
-        part = np.s_[j : j + aligned.height_px, i : i + aligned.width_px]
+        part = within(aligned, region.window)
         if region.valid is None or region.mask is None or region.mask[part].all():
             return Region(aligned, replace(search, counts=None), None)
         return Region(aligned, search, region.valid[part], region.mask[part])
@@ -101,45 +100,26 @@ class PreparedMap:
             (H, W) float32, and (H, W) bool, False on nodata; None if all pixels are valid.
         """
         region = self.cut(window, level)
-        inner = np.s_[window.y0 - region.window.y0 :, window.x0 - region.window.x0 :]
+        inner = within(window, region.window)
         return on_host(region.search.image)[inner], None if region.mask is None else region.mask[inner]
 
     def _region(self, window: Window, level: int) -> Region:
-        with self._lock:
-            region = self._cached(window, level)
-        if region is not None:
-            return region
+        """The most recently used region that contains a window, or a new one."""
+        held = (key for key in reversed(list(self._regions)) if key[0] == level and _contains(key[1], window))
+        found = next(held, None)
+        if found is not None:
+            return self._regions.get(found, partial(self._prepare, found[1], level))
         rows, columns = self._site.level_shape(level)
-        if rows * columns <= WHOLE_LEVEL_PX:
-            target = Window(0, 0, columns, rows)
-        else:
-            target = _on_grid(window, columns, rows)
-        region = self._prepare(target, level)
-        with self._lock:
-            self.created += 1
-            self._regions[level, target] = region
-            self._evict()
+        is_whole = rows * columns <= WHOLE_LEVEL_PX
+        target = Window(0, 0, columns, rows) if is_whole else _on_grid(window, columns, rows)
+        region = self._regions.get((level, target), partial(self._prepare, target, level))
+        self._regions.evict(self._evictable_px, MAX_REGION_PX, keep=1)
         return region
 
-    def _cached(self, window: Window, level: int) -> Region | None:
-        """The most recently used region that contains a window, now the most recent; or None."""
-        for key in reversed(self._regions):
-            if key[0] == level and _contains(key[1], window):
-                self._regions.move_to_end(key)
-                return self._regions[key]
-        return None
-
-    def _evict(self) -> None:
-        """Evict the least recently used regions down to the limit; the newest and whole levels stay."""
-        parts = [
-            key for key in self._regions if (key[1].height_px, key[1].width_px) != self._site.level_shape(key[0])
-        ]
-        used = sum(window.area_px for _, window in parts)
-        for key in parts[:-1]:
-            if used <= MAX_REGION_PX:
-                break
-            used -= key[1].area_px
-            del self._regions[key]
+    def _evictable_px(self, key: tuple[int, Window], region: Region) -> int:
+        """Pixels of a region; 0 of a whole level, which stays."""
+        window = region.window
+        return 0 if (window.height_px, window.width_px) == self._site.level_shape(key[0]) else window.area_px
 
     def _prepare(self, window: Window, level: int) -> Region:
         picture, mask = enhanced_part(self._site, self._radius_px, self._score, window, level)
@@ -164,20 +144,14 @@ def enhanced_part(
     Returns:
         (H, W) float32, and (H, W) bool, False on nodata; None if all pixels are valid.
     """
-    rows, columns = site.level_shape(level)
-    margin = radius_px + 2  # reach of the box, plus one for the gradient and one for the smoothing
-    x0, y0 = max(0, window.x0 - margin), max(0, window.y0 - margin)
-    x1 = min(columns, window.x0 + window.width_px + margin)
-    y1 = min(rows, window.y0 + window.height_px + margin)
-    wide = Window(x0, y0, x1 - x0, y1 - y0)
+    margin_px = radius_px + 2  # reach of the box, plus one for the gradient and one for the smoothing
+    wide = widened(window, margin_px, site.level_shape(level))
     mask: NDArray[np.bool_] | None = None
     if not site.fully_valid:
         mask = site.valid(wide, level)
         mask = None if mask.all() else mask
     picture = enhance(site.gray(wide, level), radius_px=radius_px, score=score, valid=mask)
-    inner = np.s_[
-        window.y0 - y0 : window.y0 - y0 + window.height_px, window.x0 - x0 : window.x0 - x0 + window.width_px
-    ]
+    inner = within(window, wide)
     own = None if mask is None or mask[inner].all() else np.ascontiguousarray(mask[inner])
     return np.ascontiguousarray(picture[inner]), own
 
@@ -189,9 +163,9 @@ def _contains(region: Window, window: Window) -> bool:
 
 
 def _on_grid(window: Window, columns: int, rows: int) -> Window:
-    """The window extended by half a cell to each side, then to whole cells, and clipped at the level's edge."""
-    ahead = CELL_PX // 2
-    x0, y0 = (max(0, low - ahead) // CELL_PX * CELL_PX for low in (window.x0, window.y0))
-    x1 = min(columns, -(-(window.x0 + window.width_px + ahead) // CELL_PX) * CELL_PX)
-    y1 = min(rows, -(-(window.y0 + window.height_px + ahead) // CELL_PX) * CELL_PX)
+    """The window extended by half a tile to each side, then to whole tiles, and clipped at the level's edge."""
+    ahead = TILE_PX // 2  # the next windows of a flight fall in the same region
+    x0, y0 = (max(0, low - ahead) // TILE_PX * TILE_PX for low in (window.x0, window.y0))
+    x1 = min(columns, -(-(window.x0 + window.width_px + ahead) // TILE_PX) * TILE_PX)
+    y1 = min(rows, -(-(window.y0 + window.height_px + ahead) // TILE_PX) * TILE_PX)
     return Window(x0, y0, x1 - x0, y1 - y0)

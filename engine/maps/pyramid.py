@@ -49,15 +49,13 @@ class ArrayReader:
 
     Attributes:
         gray: (H, W) uint8.
-        valid: (H, W) bool.
-        levels: only 0.
-        all_valid: False, since nodata is looked up in ``valid``.
+        valid: (H, W) bool, in which nodata is looked up.
     """
 
     gray: Gray
     valid: Mask
-    levels: tuple[int, ...] = (0,)
-    all_valid: bool = False
+    levels = (0,)
+    all_valid = False
 
     def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
         """Read a window.

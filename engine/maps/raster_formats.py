@@ -196,24 +196,18 @@ def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
 
 
 def _check_beside(first: _Tile, tile: _Tile, argument: str) -> None:
-    def pixel(one: _Tile) -> list[float]:
-        t = one.transform
-        return [t.a, t.b, t.d, t.e]
-
-    names = ("CRS", "size of a pixel", "bands, element type, nodata, scale and offset")
-    size_px = max(abs(v) for v in pixel(first))
-    same_pixel = all(abs(a - b) <= 1e-7 * size_px for a, b in zip(pixel(first), pixel(tile), strict=True))
-    for name, same, got in zip(
-        names,
-        (first.crs == tile.crs, same_pixel, first.kind == tile.kind),
-        ((first.crs, tile.crs), (pixel(first), pixel(tile)), (first.kind, tile.kind)),
-        strict=True,
+    (a, b, _, d, e, *_), (p, q, _, s, t, *_) = first.transform, tile.transform
+    pixels = [a, b, d, e], [p, q, s, t]
+    step = 1e-7 * max(map(abs, pixels[0]))
+    same_pixel = all(abs(one - other) <= step for one, other in zip(*pixels, strict=True))
+    for name, (one, other), same in (
+        ("CRS", (first.crs, tile.crs), first.crs == tile.crs),
+        ("size of a pixel", pixels, same_pixel),
+        ("bands, element type, nodata, scale and offset", (first.kind, tile.kind), first.kind == tile.kind),
     ):
         if not same:
-            a, b = (str(v) for v in got)
-            raise MapError(
-                f"{argument}: expected tiles of one {name}, got {a} in {first.path.name} and {b} in {tile.path}"
-            )
+            found = f"{one} in {first.path.name} and {other} in {tile.path}"
+            raise MapError(f"{argument}: expected tiles of one {name}, got {found}")
 
 
 def _position(first: _Tile, tile: _Tile, argument: str) -> tuple[int, int]:

@@ -314,9 +314,7 @@ class GrayReader:
         luma = _luma(data)
         if self._limits is None:
             return luma, valid
-        low, high = self._limits
-        scaled = (np.nan_to_num(luma, nan=low, posinf=high, neginf=low) - low) * (255.0 / max(high - low, 1e-30))
-        return np.clip(np.rint(scaled), 0, 255).astype(np.uint8), valid
+        return stretched(luma, self._limits), valid
 
 
 def scaled_window(window: Window, levels: int) -> Window:
@@ -345,6 +343,13 @@ def palette_of(dataset: Any) -> Gray | None:
     for index, colour in dataset.colormap(1).items():
         table[:, index] = colour[:3]
     return table
+
+
+def stretched(values: NDArray[Any], limits: Array) -> Gray:
+    """Values stretched linearly from two limits to 0 and 255."""
+    low, high = limits
+    scaled = (np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) * (255.0 / max(high - low, 1e-30))
+    return np.asarray(np.clip(np.rint(scaled), 0, 255), np.uint8)
 
 
 def _luma(data: NDArray[Any]) -> NDArray[Any]:

@@ -24,7 +24,9 @@ class RecentlyUsed(Generic[K, V]):
         return key in self._entries
 
     def __iter__(self) -> Iterator[K]:
-        return iter(self._entries)
+        """The keys, that of the least recently used entry first."""
+        with self._lock:
+            return iter(list(self._entries))
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -53,9 +55,17 @@ class RecentlyUsed(Generic[K, V]):
             self._entries.move_to_end(key)
         return made
 
-    def evict(self, size: Callable[[V], int], limit: int, keep: int) -> None:
-        """Evict the least recently used entries until their sizes fit a limit, but not the last ``keep``."""
+    def evict(self, size: Callable[[K, V], int], limit: int, keep: int) -> None:
+        """Evict the least recently used entries until their sizes fit a limit, but not the last ``keep``.
+
+        Entries of size 0 stay.
+        """
         with self._lock:
-            used = sum(map(size, self._entries.values()))
-            while used > limit and len(self._entries) > keep:
-                used -= size(self._entries.popitem(last=False)[1])
+            used = sum(size(*entry) for entry in self._entries.items())
+            for key in list(self._entries)[: len(self._entries) - keep]:
+                if used <= limit:
+                    break
+                freed = size(key, self._entries[key])
+                if freed:
+                    used -= freed
+                    del self._entries[key]

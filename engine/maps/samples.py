@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from engine.kernels.dense import Samples
 from engine.maps.prepared import WHOLE_LEVEL_PX, FloatImage
 from engine.maps.recently_used import RecentlyUsed
+from engine.maps.tiles import TILE_PX, tile_at, tiles_under
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -23,8 +24,6 @@ Enhanced = Callable[[Window, int], tuple[FloatImage, NDArray[np.bool_] | None]]
 
 BLOCK_PX = 4
 """Every block with this side gives one sample: the pixel with the steepest gradient."""
-CELL_PX = 256
-"""A large level is sampled cell by cell, on the cells of the prepared map."""
 MAX_CELLS = 256
 MAX_SAMPLES = 2000
 _ROUGH_REACH_PX = 1.5  # pixels of the level from a sample at which roughness is measured
@@ -77,21 +76,17 @@ class SampleMap:
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _cells_under(self, window: Window, level: int) -> list[Window]:
-        height, width = self._site.level_shape(level)
+        height, width = shape = self._site.level_shape(level)
         if width * height <= WHOLE_LEVEL_PX:
             return [Window(0, 0, width, height)]
-        cells = [
-            Window(x, y, min(CELL_PX, width - x), min(CELL_PX, height - y))
-            for y in range(window.y0 // CELL_PX * CELL_PX, window.y0 + window.height_px, CELL_PX)
-            for x in range(window.x0 // CELL_PX * CELL_PX, window.x0 + window.width_px, CELL_PX)
-        ]
+        cells = [tile_at(*place, TILE_PX, shape) for place in tiles_under(window, TILE_PX)]
         # The remainder beyond a level's last whole cell may be narrower than a block: it gives no sample.
         return [cell for cell in cells if min(cell.width_px, cell.height_px) >= BLOCK_PX]
 
     def _cell(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
         """Samples of a cell, row by row, and the number of their rows and columns."""
         found = self._cells.get((level, cell), partial(self._sampled, cell, level))
-        self._cells.evict(lambda _: 1, MAX_CELLS, keep=0)
+        self._cells.evict(lambda *_: 1, MAX_CELLS, keep=0)
         return found
 
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,19 +11,17 @@ from numpy.typing import NDArray
 from engine.maps.grids import Array, Grid, Warp, warp_between
 from engine.maps.heights import SURFACE_LIMIT_PX, part_grid, read_heights, read_surface, surface_part
 from engine.maps.rasters import COARSE_LIMIT_PX, Source
+from engine.maps.tiles import TILE_PX
 from engine.values import Window
 
 Heights = NDArray[np.float32]
 
 GROUND_PERCENT = 20.0
 """Percentile of the surface used as the ground level."""
-TILE_PX = 256
-"""Patches of a large surface begin and end on multiples of this."""
 MAX_SPAN = 6
 """Lookups that span fewer tiles than this per side are read as one patch."""
 MAX_PATCHES = 16
 """Number of patches that are cached, of at most 9 MiB each."""
-_Patch = tuple[int, int, int, int]  # first row and column of tiles, and the last ones
 _LATTICE = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 15)] * 2), axis=-1).reshape(-1, 2)
 """Sample positions of a plane fit, relative to half the side of the square."""
 _ROUNDS = 8
@@ -40,7 +38,7 @@ class HeightTiles:
 
     def __init__(self, source: Source, part: Window) -> None:
         self._source, self._part, self._lock = source, part, threading.Lock()
-        self._patches: OrderedDict[_Patch, Heights] = OrderedDict()  # the most recently used is last
+        self._patch = lru_cache(MAX_PATCHES)(self._read)
         self.shape = (part.height_px, part.width_px)
 
     def __getitem__(self, index: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Heights:
@@ -49,30 +47,21 @@ class HeightTiles:
             return np.empty(rows.shape, np.float32)
         y0, x0, y1, x1 = (int(v) // TILE_PX for v in (rows.min(), columns.min(), rows.max(), columns.max()))
         if max(y1 - y0, x1 - x0) < MAX_SPAN:
-            return self._patch((y0, x0, y1, x1))[rows - y0 * TILE_PX, columns - x0 * TILE_PX]
+            return self._patch(y0, x0, y1, x1)[rows - y0 * TILE_PX, columns - x0 * TILE_PX]
         out = np.empty(rows.shape, np.float32)
         tiles = (rows // TILE_PX << 32) + columns // TILE_PX
         for y, x in (divmod(int(tile), 1 << 32) for tile in np.unique(tiles)):
             here = tiles == (y << 32) + x
-            out[here] = self._patch((y, x, y, x))[rows[here] - y * TILE_PX, columns[here] - x * TILE_PX]
+            out[here] = self._patch(y, x, y, x)[rows[here] - y * TILE_PX, columns[here] - x * TILE_PX]
         return out
 
-    def _patch(self, key: _Patch) -> Heights:
-        """The heights from one tile (row, column) to another."""
+    def _read(self, top: int, left: int, bottom: int, right: int) -> Heights:
+        """The heights from one row and column of tiles to another."""
+        y, x = top * TILE_PX, left * TILE_PX
+        size = min((bottom + 1) * TILE_PX, self.shape[0]) - y, min((right + 1) * TILE_PX, self.shape[1]) - x
+        window = Window(self._part.x0 + x, self._part.y0 + y, size[1], size[0])
         with self._lock:  # a GDAL dataset serves one thread at a time
-            patch = self._patches.pop(key, None)
-            if patch is None:
-                y, x = key[0] * TILE_PX, key[1] * TILE_PX
-                size = (
-                    min((key[2] + 1) * TILE_PX, self.shape[0]) - y,
-                    min((key[3] + 1) * TILE_PX, self.shape[1]) - x,
-                )
-                window = Window(self._part.x0 + x, self._part.y0 + y, size[1], size[0])
-                patch = read_heights(self._source, window, size)
-            self._patches[key] = patch
-            if len(self._patches) > MAX_PATCHES:
-                self._patches.popitem(last=False)
-        return patch
+            return read_heights(self._source, window, size)
 
 
 class SurfaceModel:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import MapError
+from engine.geo import WGS84_A_M
 
 Tiles = dict[int, NDArray[np.int64]]
 """Column, row as named, and index of the ending, (N, 3) by zoom level."""
@@ -33,7 +34,7 @@ DRIVER = "WMS"
 """GDAL's, of no other map."""
 MAX_ZOOM = 30
 MAX_SIDE_PX = 1_000_000
-"""Largest side of the map that the tiles span."""
+"""Largest side of a map."""
 RESOURCE = "tilemapresource.xml"
 _MERCATOR_CODES = (
     "3857",
@@ -43,7 +44,7 @@ _MERCATOR_CODES = (
     "102100",
     "102113",
 )  # current and former codes of Web Mercator
-_HALF_WORLD_M = math.pi * 6378137.0
+_HALF_WORLD_M = math.pi * WGS84_A_M
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # Pillow's, of eight bits or fewer
 _NO_TILE_CODES = "200,204,404"  # of HTTP; of a file, 200 says that it is empty
 

@@ -20,7 +20,7 @@ from engine.errors import BackendError, OptionError
 
 _log = logging.getLogger("scenematch")
 
-_MLOCK_CURRENT, _MLOCK_FUTURE, _MLOCK_ON_FAULT = 1, 2, 4  # of mlockall(2); the last: only pages that are used
+_MLOCK = 1 | 2 | 4  # of mlockall(2): current and future pages, but only those that are used
 _CAP_IPC_LOCK = 14
 _KERNEL = Path("/proc/sys/kernel")
 _MAX_LOAD = 0.9  # load of a core above which the kernel's limit for real-time threads is near
@@ -232,7 +232,7 @@ def _check_lockable() -> None:
 
 def _lock_memory() -> None:
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_MLOCK_CURRENT | _MLOCK_FUTURE | _MLOCK_ON_FAULT) != 0:
+    if libc.mlockall(_MLOCK) != 0:
         cause = os.strerror(ctypes.get_errno())
         raise BackendError(f"realtime: memory cannot be locked ({cause}); it needs {_MEMORY_CURE}")
 

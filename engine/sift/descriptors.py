@@ -9,12 +9,10 @@ Floats = NDArray[np.float32]
 
 ORIENT_STEP = 0.75
 """Sigmas between the samples of an orientation."""
-CELL_SIGMAS = 3.0
-CELL_SAMPLES = 3
 _ANGLE_BINS = 36
 _ORIENT_SAMPLES = 13  # per side: Lowe's window of 4.5 sigma
 _CELLS = 4
-_DESC_SAMPLES = 12
+_CELL_SAMPLES = 3  # per side of a cell, one a sigma
 
 
 @lru_cache(maxsize=1)
@@ -30,7 +28,8 @@ def orientation_weights() -> tuple[Floats, Floats]:
 @lru_cache(maxsize=1)
 def tents() -> Floats:
     """Return (cells, samples): bilinear weights along one axis, times a Gaussian of half the width."""
-    ramp = (np.arange(_DESC_SAMPLES) - (_DESC_SAMPLES - 1) / 2) / CELL_SAMPLES
+    samples = _CELLS * _CELL_SAMPLES
+    ramp = (np.arange(samples) - (samples - 1) / 2) / _CELL_SAMPLES
     centres = np.arange(_CELLS) - (_CELLS - 1) / 2
     weights = np.maximum(0, 1 - np.abs(ramp - centres[:, None])) * np.exp(-0.5 * (ramp / (_CELLS / 2)) ** 2)
     return np.asarray(weights, np.float32)

@@ -18,7 +18,7 @@ from engine.kernels.sift_extrema import TAPS, find_extrema
 from engine.kernels.sift_refinement import refine_extrema
 from engine.kernels.sift_selection import spread_out
 from engine.runtime import threads
-from engine.sift.descriptors import CELL_SAMPLES, CELL_SIGMAS, ORIENT_STEP, orientation_weights, tents
+from engine.sift.descriptors import ORIENT_STEP, orientation_weights, tents
 from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, Octave, octaves_of, reach_px
 from engine.sift.values import Features, SiftChoice
 
@@ -213,8 +213,6 @@ def strongest(
         allowed = mask[row, column]
         keypoints, x, y = keypoints[allowed], x[allowed], y[allowed]
     order = np.argsort(-keypoints[:, _CONTRAST] * np.sqrt(scale_px(keypoints)), kind="stable")
-    if spread == 1:
-        return np.asarray(keypoints[order[:max_keypoints]], np.float32)
     octave = plan.octaves[0][0]
     column = np.clip((x * (plan.upsample * spread / octave.width)).astype(np.int64), 0, spread - 1)
     row = np.clip((y * (plan.upsample * spread / octave.height)).astype(np.int64), 0, spread - 1)
@@ -254,10 +252,9 @@ def describe(gaussians: Floats, keypoints: Floats, angle_rad: Floats, plan: Loop
     Returns:
         (K, 128) of unit L2 norm.
     """
-    step = np.float32(CELL_SIGMAS / CELL_SAMPLES) * plan.first_sigma
     return _in_parts(
         lambda part: sift_descriptors.descriptors(
-            gaussians, plan.table, keypoints[slice(*part)], angle_rad[slice(*part)], step, tents()
+            gaussians, plan.table, keypoints[slice(*part)], angle_rad[slice(*part)], plan.first_sigma, tents()
         ),
         threads.parts(len(keypoints), len(keypoints) // _POINTS_PER_THREAD),
     )

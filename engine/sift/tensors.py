@@ -16,7 +16,6 @@ from engine.sift.scale_space import EDGE_RATIO, SCALES
 from engine.sift.values import Features, SiftChoice
 
 _PX_PER_EXTREMUM = 4  # highest density of extrema; the weakest beyond it are dropped
-_MIN_EXTREMA = 256
 _FRAME_SIGMAS = 6.0  # half the side of kornia's frames
 
 
@@ -62,7 +61,7 @@ def find_features(images: Tensor, mask: Tensor | None, choice: SiftChoice) -> Fe
     """
     network = _network(images.device)
     with torch.inference_mode():
-        slots = max(_MIN_EXTREMA, images[0].numel() // _PX_PER_EXTREMUM)
+        slots = math.ceil(images[0].numel() / _PX_PER_EXTREMUM)
         detect = network.detector._detect_with_pyramid
         contrast, lafs, filled, pyramid, octave, level = detect(images[:, None], slots)
         found = _Extrema(lafs, contrast, filled, octave, level)
@@ -115,8 +114,6 @@ def _strongest(
     x, y = (along.gather(1, order) for along in found.xy_px.unbind(2))
     column, row = ((v * (side / n)).long().clamp_(0, side - 1) for v, n in ((x, shape[1]), (y, shape[0])))
     is_crowded = _rank((row * side + column).where(valid, side * side)) >= 2 * choice.max_keypoints / side**2
-    if side == 1:
-        is_crowded = torch.zeros_like(is_crowded)
     place = torch.where(valid, is_crowded.long(), 2).argsort(dim=1, stable=True)[:, : choice.max_keypoints]
     return order.gather(1, place), valid.gather(1, place)
 

@@ -10,7 +10,8 @@ from rasterio.transform import Affine
 from engine import OrthoMap
 from engine.features import sift
 from engine.maps import landmark_cache, landmarks
-from engine.maps.landmarks import CELL_PX, MAX_PER_CELL, TILE_PX, LandmarkMap, as_picture
+from engine.maps.landmarks import CELL_PX, MAX_PER_CELL, LandmarkMap, as_picture
+from engine.maps.tiles import TILE_PX
 from engine.runtime.device import CPU
 from engine.values import Window
 from tests.support.ground import Ground

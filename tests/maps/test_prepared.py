@@ -45,7 +45,7 @@ def holes():
 @pytest.fixture
 def by_cells(monkeypatch):
     """Levels are prepared in cells of 128 pixels, none as a whole."""
-    monkeypatch.setattr(prepared, "CELL_PX", 128)
+    monkeypatch.setattr(prepared, "TILE_PX", 128)
     monkeypatch.setattr(prepared, "WHOLE_LEVEL_PX", 0)
 
 

@@ -15,7 +15,8 @@ from engine import OrthoMap
 from engine.kernels.dense import Samples
 from engine.maps import prepared, samples
 from engine.maps.prepared import PreparedMap
-from engine.maps.samples import BLOCK_PX, CELL_PX, SampleMap
+from engine.maps.samples import BLOCK_PX, SampleMap
+from engine.maps.tiles import TILE_PX
 from engine.values import Window
 
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])
@@ -38,7 +39,7 @@ def by_cells(monkeypatch):
 @pytest.mark.parametrize("more_px", [0, 1, 2, 3, 4, 5])
 def test_a_level_may_end_anywhere_beyond_a_cell(more_px, by_cells):
     """The last cells may be narrower than a block, at the right edge, at the bottom and in the corner."""
-    width_px, height_px = CELL_PX + more_px, CELL_PX + BLOCK_PX + 1 - more_px % BLOCK_PX
+    width_px, height_px = TILE_PX + more_px, TILE_PX + BLOCK_PX + 1 - more_px % BLOCK_PX
     sampled, site = make_map(height_px, width_px)
     window = Window(width_px - 40, height_px - 30, 40, 30)
     xy = site.pixel_from_enu(sampled.find(window, 0).points_m[:, :2])
@@ -53,12 +54,12 @@ def test_a_level_may_end_anywhere_beyond_a_cell(more_px, by_cells):
 @pytest.mark.slow
 def test_several_threads_may_take_samples_at_once(by_cells, monkeypatch):
     """The worker that a live flight left behind may still be at work beside the one that replaced it."""
-    sampled, _ = make_map(3 * CELL_PX, 3 * CELL_PX)
+    sampled, _ = make_map(3 * TILE_PX, 3 * TILE_PX)
     rng = np.random.default_rng(0)
     one = Samples(np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), np.ones(1))
     monkeypatch.setattr(samples, "MAX_CELLS", 1)
     monkeypatch.setattr(sampled, "_sampled", lambda cell, level: (one, (1, 1)))
-    windows = [Window(x, y, 40, 40) for x, y in rng.integers(0, 3 * CELL_PX - 40, (6000, 2)).tolist()]
+    windows = [Window(x, y, 40, 40) for x, y in rng.integers(0, 3 * TILE_PX - 40, (6000, 2)).tolist()]
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     try:
@@ -72,7 +73,7 @@ def test_several_threads_may_take_samples_at_once(by_cells, monkeypatch):
 
 def test_samples_are_the_same_with_and_without_a_prepared_map(by_cells):
     """A method that does not correlate enhances the map for its samples alone."""
-    sampled, site = make_map(2 * CELL_PX, 2 * CELL_PX)
+    sampled, site = make_map(2 * TILE_PX, 2 * TILE_PX)
     alone = SampleMap(site, partial(prepared.enhanced_part, site, 8, "local"))
     for window, level in ((Window(100, 90, 300, 280), 0), (Window(20, 30, 120, 100), 1)):
         for field in fields(Samples):

@@ -402,7 +402,7 @@ def test_known_rotation_and_scale_leave_out_contradictions():
         (torch.zeros(1, 1, 9, 9), {"upsample": 3}, OptionError, "upsample: expected 1 or 2, got 3"),
         (torch.zeros(1, 1, 9, 9), {"backend": "opencv"}, OptionError,
          "backend: expected one of auto, compiled, kornia, got 'opencv'"),
-        (torch.zeros(1, 1, 9, 9), {"spread": 0}, OptionError, "spread: expected 1 to 1000, got 0"),
+        (torch.zeros(1, 1, 9, 9), {"spread": 0}, OptionError, "spread: expected 1 or more, got 0"),
         (torch.zeros(1, 1, 9, 9), {"contrast_threshold": -1}, OptionError, "contrast_threshold"),
         (torch.zeros(1, 1, 9, 9), {"mask": torch.ones(1, 1, 9, 8, dtype=torch.bool)}, ShapeError,
          "mask: expected"),

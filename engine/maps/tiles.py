@@ -1,0 +1,40 @@
+"""Square tiles of a level of the map, in which what is large is read, prepared and described."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from engine.values import Window
+
+TILE_PX = 256
+"""Side of the tiles of a level in which it is prepared, described and sampled, and of those of a surface."""
+HALO_PX = 64
+"""Margin around a tile that is read for description; the descriptor of nearly every keypoint ends within it."""
+
+
+def tiles_under(window: Window, side_px: int) -> list[tuple[int, int]]:
+    """Row and column of the tiles that a window touches, row by row; they begin on multiples of their side."""
+    bottom, right = window.y0 + window.height_px - 1, window.x0 + window.width_px - 1
+    rows = range(window.y0 // side_px, bottom // side_px + 1)
+    columns = range(window.x0 // side_px, right // side_px + 1)
+    return [(row, column) for row in rows for column in columns]
+
+
+def tile_at(row: int, column: int, side_px: int, shape: tuple[int, int]) -> Window:
+    """One tile of a level with this shape; the last ones are smaller."""
+    x0, y0 = column * side_px, row * side_px
+    return Window(x0, y0, min(side_px, shape[1] - x0), min(side_px, shape[0] - y0))
+
+
+def widened(window: Window, margin_px: int, shape: tuple[int, int]) -> Window:
+    """A window with a margin around it, inside a level with this shape."""
+    x0, y0 = max(0, window.x0 - margin_px), max(0, window.y0 - margin_px)
+    x1 = min(shape[1], window.x0 + window.width_px + margin_px)
+    y1 = min(shape[0], window.y0 + window.height_px + margin_px)
+    return Window(x0, y0, x1 - x0, y1 - y0)
+
+
+def within(part: Window, whole: Window) -> tuple[slice, slice]:
+    """Where a window lies in arrays (H, W) of one that contains it."""
+    x0, y0 = part.x0 - whole.x0, part.y0 - whole.y0
+    return np.s_[y0 : y0 + part.height_px, x0 : x0 + part.width_px]
