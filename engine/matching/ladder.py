@@ -41,6 +41,8 @@ def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Result:
     """
     answer: Result | None = None
     for rung in rungs:
+        if not query.scheduler.deadline.met:
+            break  # no step is refused for its cost
         works = rung.offers(answer)
         with query.scheduler.with_fix() if isinstance(answer, Fix) else nullcontext(), suppress(OutOfTime):
             step = _affordable(query.scheduler, works)
