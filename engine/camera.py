@@ -243,8 +243,7 @@ class Camera:
     def frame_rays(self) -> Array:
         """(5, 3) optical rays of the frame's outer corners, clockwise from the top left, and of its middle."""
         w, h = self.width_px - 0.5, self.height_px - 0.5
-        pixels = [[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h], [(w - 0.5) / 2, (h - 0.5) / 2]]
-        return np.asarray(np.c_[pixels, np.ones(5)] @ np.linalg.inv(self.matrix).T, dtype=np.float64)
+        return self._rays(np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h], [(w - 0.5) / 2, (h - 0.5) / 2]]))
 
     @cached_property
     def border_rays(self) -> Array:
@@ -253,9 +252,11 @@ class Camera:
         zero, one = np.zeros_like(share), np.ones_like(share)
         sides = [(share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share)]
         xy = np.concatenate([np.stack(side, axis=1) for side in sides] + [np.array([[0.5, 0.5]])])
-        pixels = xy * [self.width_px - 1, self.height_px - 1]
-        rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(self.matrix).T
-        return np.asarray(rays, np.float64)
+        return self._rays(xy * [self.width_px - 1, self.height_px - 1])
+
+    def _rays(self, xy_px: Array) -> Array:
+        """(N, 3) optical rays of pixels (N, 2)."""
+        return np.asarray(np.c_[xy_px, np.ones(len(xy_px))] @ np.linalg.inv(self.matrix).T, np.float64)
 
     @property
     def distorts(self) -> bool:

@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from engine.errors import OptionError
 from engine.kernels import surface_loops
-from engine.kernels.transform_sizes import FLOAT32_NORM_RATIO, fast_length
+from engine.kernels.accuracy import FLOAT32_NORM_RATIO
 from engine.runtime.threads import in_parallel
 
 FloatImage = NDArray[np.float32]
@@ -136,7 +136,7 @@ def correlate(
     blocks = in_parallel(prepared, range(ny * nx))
 
     def one_template(t: int) -> None:
-        spectra = {kind: _spectrum(models[t], size, kind) for kind in {block.spectrum.dtype for block in blocks}}
+        spectra = {kind: spectrum_of(models[t], size, kind) for kind in {block.spectrum.dtype for block in blocks}}
 
         def one_block(block: _Block) -> None:
             part, spectrum = (block.rows, block.columns), block.spectrum
@@ -159,7 +159,7 @@ def _write_pair(
     mean, energy = moments
     if _is_weak(energy, float(inverse_norms.max())):
         spectrum = _window_spectrum(window, mean, size, inverse_norms)
-        _write_scores(out, spectrum, _spectrum(model, size, spectrum.dtype), inverse_norms)
+        _write_scores(out, spectrum, spectrum_of(model, size, spectrum.dtype), inverse_norms)
         return
     packed, products = _scratch("packed", (*size, 2)), _scratch("products", size)
     surface_loops.pack(packed, window, mean, 1.0 / math.sqrt(energy) if energy > 0.0 else 0.0, model)
@@ -186,7 +186,7 @@ def _division(count: int, model: int) -> tuple[int, int]:
 def fast_side(n: int) -> int:
     """The next side that is transformed fast: without prime factors above 5, and even, for the packed orders."""
     step = 16 if n >= 64 else 2
-    return step * fast_length(-(-n // step))
+    return step * int(cv2.getOptimalDFTSize(-(-n // step)))
 
 
 def _window_spectrum(
@@ -201,7 +201,17 @@ def _window_spectrum(
     return values
 
 
-def _spectrum(model: FloatImage, size: tuple[int, int], kind: np.dtype[np.floating]) -> NDArray[np.floating]:
+def spectrum_of(model: NDArray[Any], size: tuple[int, int], kind: DTypeLike) -> NDArray[np.floating]:
+    """The transform of a template with zeros beyond it.
+
+    Args:
+        model: (h, w).
+        size: rows and columns of the transform.
+        kind: its floating type.
+
+    Returns:
+        (rows, columns) in the packed order of OpenCV's real transforms.
+    """
     values = np.zeros(size, kind)
     values[: model.shape[0], : model.shape[1]] = model
     transform(values, 0, model.shape[0])

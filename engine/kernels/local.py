@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.kernels.accuracy import FLAT_SHARE
 from engine.kernels.sums import counts_inside
-from engine.kernels.transform_sizes import FLAT_SHARE
 
 FloatImage = NDArray[np.float32]
 Sums = NDArray[np.float64]

@@ -5,13 +5,15 @@ Sums of whole grey levels, counted from middle grey, are exact in int32.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from engine.runtime.jit import compiled, inlined
 
-MAX_RADIUS_PX = 180
-"""Radius of the largest neighbourhood whose sum of squares fits into int32."""
 _MIDDLE = 128  # subtracted from levels, so that squares lose fewer digits
+MAX_RADIUS_PX = (math.isqrt(np.iinfo(np.int32).max // _MIDDLE**2) - 1) // 2
+"""Radius of the largest neighbourhood whose sum of squares fits into int32."""
 
 
 @compiled("(u1[:, ::1], i8, f8)")

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels import blocks, surface_loops
-from engine.kernels.blocks import fast_side, transform
+from engine.kernels.accuracy import FLAT_SHARE
+from engine.kernels.blocks import fast_side, spectrum_of, transform
 from engine.kernels.sums import check_finite, counts, counts_inside, integrals
-from engine.kernels.transform_sizes import FLAT_SHARE
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -30,8 +30,8 @@ class _Model(NamedTuple):
     """A template about its mean in float64, its sum of squares, and transforms of both that the blocks share."""
 
     energy: float
-    values: Array
-    squares: Array
+    values: NDArray[np.floating]
+    squares: NDArray[np.floating]
 
 
 def ncc_surface(
@@ -155,13 +155,7 @@ def _model(template: NDArray[Any], size: tuple[int, int]) -> _Model:
     values -= values[0, 0]  # of one level are exact zeros
     values -= values.mean()
     squares = values * values
-    return _Model(float(squares.sum()), _spectrum(values, size), _spectrum(squares, size))
-
-
-def _spectrum(values: Array, size: tuple[int, int]) -> Array:
-    out = np.empty(size)
-    _write_spectrum(out, values)
-    return out
+    return _Model(float(squares.sum()), *(spectrum_of(part, size, np.float64) for part in (values, squares)))
 
 
 def _write_spectrum(out: Array, values: NDArray[Any]) -> None:

@@ -7,8 +7,10 @@ their differences cancel, so all of it is in float64.
 
 from __future__ import annotations
 
+import cv2
+
+from engine.kernels.accuracy import FLAT_SHARE
 from engine.kernels.tensors import check_finite
-from engine.kernels.transform_sizes import FLAT_SHARE, fast_length
 from engine.runtime.tensors import Tensor, torch
 
 
@@ -28,7 +30,7 @@ def ncc_surface(search: Tensor, search_valid: Tensor, templates: Tensor, *, min_
         OptionError: NaN or infinity.
     """
     (H, W), (h, w) = search.shape[-2:], templates.shape[-2:]
-    size = (fast_length(H), fast_length(W))
+    size = (cv2.getOptimalDFTSize(H), cv2.getOptimalDFTSize(W))
 
     def sums(a: Tensor, b: Tensor) -> Tensor:
         product: Tensor = torch.fft.irfft2(a * b.conj(), s=size)

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from engine.kernels.transform_sizes import FLAT_SHARE
+from engine.kernels.accuracy import FLAT_SHARE
 from engine.runtime.jit import compiled, inlined
 
 

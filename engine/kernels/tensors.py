@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 
+import cv2
+
 from engine.errors import OptionError
 from engine.kernels import sums
-from engine.kernels.transform_sizes import FLAT_SHARE, FLOAT32_NORM_RATIO, fast_length
+from engine.kernels.accuracy import FLAT_SHARE, FLOAT32_NORM_RATIO
 from engine.runtime.tensors import Tensor, torch
 
 # Lower bound on a template's norm; a template of zeros scores 0.
@@ -144,7 +146,7 @@ def correlate(search: Tensor, templates: Tensor) -> Tensor:
         (T, H-h+1, W-w+1) sums of products.
     """
     (H, W), (h, w) = search.shape, templates.shape[1:]
-    rows, columns = size = fast_length(H), fast_length(W)
+    rows, columns = size = cv2.getOptimalDFTSize(H), cv2.getOptimalDFTSize(W)
     count = max(1, _CHUNK_NUMBERS // (2 * rows * (columns // 2 + 1)))
     spectrum = torch.fft.rfft2(search, s=size)
     parts = [

@@ -137,8 +137,8 @@ class LandmarkMap:
         name = cache_key(settings, (self._site.gray(whole, level), self._site.valid(whole, level)))
         stored = load_arrays(name, _STORED)
         if stored is None:
-            found = _concatenated([self._tile(key) for key in keys])
-            save_arrays(name, {field: found[field] for field in _STORED})
+            tiles = [self._tile(key) for key in keys]
+            save_arrays(name, {field: np.concatenate([tile[field] for tile in tiles]) for field in _STORED})
             return
         at = np.rint(stored["xy_px"]).astype(np.int64) // TILE_PX
         for key in keys:
@@ -231,10 +231,6 @@ def _gathered(parts: list[NamedArrays], indices: list[NDArray[np.intp]]) -> Name
             out = found[name][end - len(index) : end]
             values.take(index, axis=0, out=out, mode="clip")  # "raise" would copy twice
     return found
-
-
-def _concatenated(parts: list[NamedArrays]) -> NamedArrays:
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _rank_in_cells(xy_px: NDArray[np.float32]) -> NDArray[np.int64]:

@@ -1,8 +1,8 @@
 """The metric copy of a map, used for matching: north-up in UTM, created once and cached on disk.
 
-A map in degrees, rotated or with oblong pixels is resampled; a large one without overviews gets them. A large copy
-is a folder of tiles. Each is written and renamed in one step, and a list records the hash of its content, so that
-an interrupted copy can continue and a damaged tile is created again.
+A map in degrees, rotated or with oblong pixels is resampled; a large one without overviews gets them. A copy is a
+folder of tiles. Each is written and renamed in one step, and a list records the hash of its content, so that an
+interrupted copy can continue and a damaged tile is created again.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from engine.values import Window
 GRID_VERSION = 1
 """Part of the key of cached copies; raise it with every change in how they are created."""
 TILE_PX = 8192
-"""Side of the tiles of a large copy; each has overviews down to a thirty-second."""
+"""Side of the tiles of a copy; those of a large one have overviews down to a thirty-second."""
 COARSEST_PX = 16384
 """A large file whose smallest overview has a longer side than this is copied."""
 LIST = "tiles.txt"
-"""In the folder of a large copy: a line per tile, its name and its SHA-256, or "-" if it has no valid pixel."""
+"""In the folder of a copy: a line per tile, its name and its SHA-256, or "-" if it has no valid pixel."""
 ProgressCallback = Callable[[int, int], None]
 """Called while a copy is created, with the number of pixels done and in all."""
 _CACHED_HASH_BYTES = 1 << 22  # the hashes of larger files are cached by size and time
@@ -144,8 +144,8 @@ def open_metric_copy(
     """The source on its metric grid, from the cache if it has a copy.
 
     The key is the SHA-256 of the content of the file and of the files beside it that GDAL uses, of the
-    georeference, and of the version of this format. A cached file that does not fit or cannot be read is created
-    again; if the cache cannot be written, the copy stays in the temporary directory while the map is open.
+    georeference, and of the version of this format. If the cache cannot be written, the copy stays in the
+    temporary directory while the map is open.
 
     Args:
         source: the map.
@@ -156,13 +156,12 @@ def open_metric_copy(
     grid = source.grid if source.grid.is_metric else _metric_grid(source.grid)
     cache = cache_folder() if cache_dir is None else Path(cache_dir)
     name = _key(source, cache)
-    build, name = (_tiled, name) if is_large(grid) else (_single, f"{name}.tif")
     try:
-        return build(cache / name, source, reader, grid, on_progress)
+        return _built(cache / name, source, reader, grid, on_progress)
     except OSError:
         folder = tempfile.mkdtemp(prefix="scenematch-")
     with map_errors("map", source.path):
-        copy = build(Path(folder) / name, source, reader, grid, on_progress)
+        copy = _built(Path(folder) / name, source, reader, grid, on_progress)
     weakref.finalize(copy, shutil.rmtree, folder, ignore_errors=True)
     return copy
 
@@ -196,30 +195,10 @@ def _file_hash(path: Path, cache: Path) -> str:
     return digest
 
 
-def _single(
-    target: Path, source: Source, reader: GrayReader | None, grid: Grid, on_progress: ProgressCallback | None
-) -> Source:
-    """A copy in one file.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    cached = _cached(target, grid)
-    if cached is not None:
-        return cached
-    target.parent.mkdir(parents=True, exist_ok=True)
-    whole, progress = Window(0, 0, grid.width_px, grid.height_px), _Progress(grid, on_progress)
-    _write(target, reader or GrayReader(source), source.grid, grid, whole, progress)
-    copy = _cached(target, grid)
-    if copy is None:
-        raise OSError(f"{target} could not be read back")
-    return copy
-
-
-def _tiled(
+def _built(
     folder: Path, source: Source, reader: GrayReader | None, grid: Grid, on_progress: ProgressCallback | None
 ) -> Source:
-    """Create a large copy: write tiles that are missing or differ from the list, keep the others.
+    """The copy in a folder, after tiles that are missing or differ from the list were written.
 
     Raises:
         OSError: a tile cannot be written.
@@ -236,8 +215,8 @@ def _tiled(
         progress.add(0)  # reports progress before the first block is done
         reader = reader or GrayReader(source)
         corner = tile in (tiles[0], tiles[-1])  # they define the extent of the grid
-        holds_map = _write(target, reader, source.grid, grid, tile, progress, even_empty=corner)
-        recorded = _file_hash(target, folder.parent) if holds_map else "-"
+        is_kept = _write(target, reader, source.grid, grid, tile, progress, is_corner=corner)
+        recorded = _file_hash(target, folder.parent) if is_kept else "-"
         with (folder / LIST).open("a", encoding="ascii") as stream:
             stream.write(f"{target.name} {recorded}\n")
     return open_source(folder)
@@ -249,22 +228,6 @@ def _read_list(path: Path) -> dict[str, str]:
         return {}
     lines = (line.split() for line in path.read_text(encoding="ascii", errors="replace").splitlines())
     return {words[0]: words[1] for words in lines if len(words) == 2}
-
-
-def _cached(path: Path, grid: Grid) -> Source | None:
-    """The cached file, or None if it is missing, broken or of another grid."""
-    try:
-        source = open_source(path)
-        same = np.allclose(source.grid.pixel_to_crs, grid.pixel_to_crs, rtol=0, atol=1e-6)
-        size = (source.grid.width_px, source.grid.height_px)
-        if not same or size != (grid.width_px, grid.height_px) or source.dataset.count != 2:
-            return None
-        with map_errors("map", path):  # the last rows reveal a truncated file
-            whole = size[0] * size[1] <= MEMORY_LIMIT_PX
-            source.dataset.read(window=((0 if whole else size[1] - 1, size[1]), (0, size[0])))
-    except (MapError, OSError):
-        return None
-    return source
 
 
 def _profile(grid: Grid, part: Window) -> dict[str, Any]:
@@ -286,9 +249,12 @@ def _write(
     part: Window,
     progress: _Progress,
     *,
-    even_empty: bool = True,
+    is_corner: bool,
 ) -> bool:
-    """Write a part of the copy under a temporary name and rename it; return whether it has any valid pixel.
+    """Write a part of the copy under a temporary name and rename it, if it has a valid pixel or is a corner.
+
+    Returns:
+        Whether it was written.
 
     Raises:
         OSError: it cannot be written.
@@ -297,24 +263,23 @@ def _write(
     from rasterio.enums import ColorInterp, Resampling
     from rasterio.windows import Window as RasterWindow
 
-    is_tile = (part.width_px, part.height_px) != (grid.width_px, grid.height_px)
     handle, name = tempfile.mkstemp(suffix=".part", dir=target.parent)
     os.close(handle)
-    holds_map = False
+    is_kept = is_corner
     try:
         with rasterio.open(name, "w", **_profile(grid, part)) as dataset:
             dataset.colorinterp = (ColorInterp.gray, ColorInterp.alpha)
             for window, block in _copied(reader, source, grid, part):
                 corner = (window.x0 - part.x0, window.y0 - part.y0)
                 dataset.write(block, window=RasterWindow(*corner, window.width_px, window.height_px))
-                holds_map = holds_map or bool(block[1].any())
+                is_kept = is_kept or bool(block[1].any())
                 progress.add(window.area_px)
-            if is_tile:
+            if is_large(grid):
                 dataset.build_overviews(_FACTORS, Resampling.average)
-        if holds_map or even_empty:
+        if is_kept:
             os.replace(name, target)
         else:
             target.unlink(missing_ok=True)
     finally:
         Path(name).unlink(missing_ok=True)
-    return holds_map or even_empty
+    return is_kept

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.scores import enhance
+from engine.kernels.search_levels import MAX_HALVINGS
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import TILE_PX, widened, within
 from engine.ncc_fft import Search, prepare
@@ -30,7 +31,6 @@ WHOLE_LEVEL_PX = 1 << 23
 MAX_REGION_PX = 6 << 20
 """Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 6 bytes, 11 with nodata,
 and on a GPU 20."""
-_HALVING_PX = 8  # windows begin on multiples of this within a region, so that three half-resolution levels fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,8 @@ class PreparedMap:
         Returns:
             Region: begins up to 7 pixels before the window and ends with it.
         """
-        x0, y0 = window.x0 & -_HALVING_PX, window.y0 & -_HALVING_PX
+        step_px = 1 << MAX_HALVINGS  # so that the half-resolution levels fit
+        x0, y0 = window.x0 & -step_px, window.y0 & -step_px
         aligned = Window(x0, y0, window.x0 + window.width_px - x0, window.y0 + window.height_px - y0)
         region = self._region(aligned, level)
         i, j = aligned.x0 - region.window.x0, aligned.y0 - region.window.y0

@@ -346,7 +346,15 @@ def palette_of(dataset: Any) -> Gray | None:
 
 
 def stretched(values: NDArray[Any], limits: Array) -> Gray:
-    """Values stretched linearly from two limits to 0 and 255."""
+    """Values as grey levels.
+
+    Args:
+        values: of any shape; NaN is the lower limit.
+        limits: (2,) values that become 0 and 255.
+
+    Returns:
+        The same shape, uint8.
+    """
     low, high = limits
     scaled = (np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) * (255.0 / max(high - low, 1e-30))
     return np.asarray(np.clip(np.rint(scaled), 0, 255), np.uint8)

@@ -121,14 +121,3 @@ def test_kernels_write_every_cell(name, monkeypatch):
         torch.rand(2, 33, 21, generator=rng), torch.rand(2, 3, 8, 5, generator=rng), zero_mean=True
     )
     assert torch.isfinite(scores).all()
-
-
-def test_fast_length_is_the_next_number_without_prime_factors_above_five():
-    def smooth(n):
-        for prime in (2, 3, 5):
-            while n % prime == 0:
-                n //= prime
-        return n == 1
-
-    for n in range(1, 1200):
-        assert tensors.fast_length(n) == next(m for m in range(n, 2 * n + 1) if smooth(m))
