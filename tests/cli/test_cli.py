@@ -178,7 +178,9 @@ def test_evaluate_takes_another_truth(done, flight, tmp_path, capsys):
 def test_start_comes_before_the_telemetry(copy, tmp_path):
     truth = cells(copy / "truth.csv")[0]
     lines = (copy / "telemetry.csv").read_text(encoding="utf-8").splitlines(keepends=True)
-    (copy / "telemetry.csv").write_text("".join(lines[:2]), encoding="utf-8")  # of the first frame alone
+    (copy / "telemetry.csv").write_text("".join(lines[:2]), encoding="utf-8")
+    for later in sorted((copy / "frames").iterdir())[1:]:
+        later.unlink()
     # So far from the truth, and so sure of it, that nothing but the start itself can lead astray.
     lat = float(truth["lat_deg"]) + 0.002
     out = tmp_path / "out"
@@ -363,13 +365,14 @@ def test_an_output_folder_is_not_overwritten(done, flight, tmp_path, capsys):
     assert str(file) in error_line(capsys, track(flight, file / "deeper", "--force"), 2)
 
 
-def test_force_replaces_results_and_touches_nothing_else(flight, tmp_path):
-    out = tmp_path / "out"
-    assert run(track(flight, out, "--method=sift")) == 0
+def test_force_replaces_results_and_touches_nothing_else(done, flight, tmp_path):
+    out = Path(shutil.copytree(done, tmp_path / "out"))
     (out / "notes.txt").write_text("mine", encoding="utf-8")
+    for name in WRITTEN:
+        (out / name).write_text("of another run", encoding="utf-8")
     assert run(track(flight, out, "--force")) == 0
     assert {file.name for file in out.iterdir()} == {"notes.txt"} | WRITTEN
-    assert {row["method"] for row in cells(out / "track.csv")} == {"ncc"}
+    assert not [name for name in WRITTEN if "of another run" in (out / name).read_text(encoding="utf-8")]
 
 
 # ---------------------------------------------------------------------------------------------- wrong input
