@@ -197,26 +197,25 @@ def test_aliked_is_of_the_size_of_its_file(name, tmp_path):
 
 
 def test_what_makes_no_matcher_is_told(files, tmp_path):
+    def kept(name, state):
+        torch.save(state, tmp_path / name)
+        return tmp_path / name
+
     disk, lightglue, loftr = (files / name for name in ("disk.pth", "lightglue.pth", "loftr.ckpt"))
-    with pytest.raises(OptionError, match=r"weights: expected the files of LoFTR, or LightGlue .* got none"):
-        load_matcher([])
-    for paths, got in (
-        ([disk], "DISK"),
-        ([disk, disk], "DISK and DISK"),
-        ([loftr, lightglue], "LightGlue and LoFTR"),
+    wide = LightGlue(features=None, input_dim=256, n_layers=1).state_dict()
+    scaled = LightGlue(features=None, input_dim=128, n_layers=1, add_scale_ori=True).state_dict()
+    other = {"layer.weight": torch.zeros(2)}
+    for paths, words in (
+        ([], r"weights: expected the files of LoFTR, or LightGlue .* got none"),
+        ([disk], r"weights: expected .*, got DISK$"),
+        ([disk, disk], r"weights: expected .*, got DISK and DISK$"),
+        ([loftr, lightglue], r"weights: expected .*, got LightGlue and LoFTR$"),
+        ([disk, kept("a.pth", other)], r"a.pth: expected DISK, ALIKED, .* got tensors named layer.weight"),
+        ([disk, kept("b.pth", wide)], r"b.pth: expected LightGlue for descriptors of 128 numbers, .* 256"),
+        ([disk, kept("c.pth", scaled)], r"c.pth: expected LightGlue for DISK.* scales or shapes"),
     ):
-        with pytest.raises(OptionError, match=rf"weights: expected .*, got {got}$"):
+        with pytest.raises(OptionError, match=words):
             load_matcher(paths, device="cpu")
-    torch.save({"layer.weight": torch.zeros(2)}, tmp_path / "other.pth")
-    with pytest.raises(OptionError, match=r"other.pth: expected DISK, ALIKED, .* got tensors named layer.weight"):
-        load_matcher([disk, tmp_path / "other.pth"], device="cpu")
-    torch.save(LightGlue(features=None, input_dim=256, n_layers=1).state_dict(), tmp_path / "wide.pth")
-    with pytest.raises(OptionError, match=r"wide.pth: expected LightGlue for descriptors of 128 numbers, .* 256"):
-        load_matcher([disk, tmp_path / "wide.pth"], device="cpu")
-    scaled = LightGlue(features=None, input_dim=128, n_layers=1, add_scale_ori=True)
-    torch.save(scaled.state_dict(), tmp_path / "scaled.pth")
-    with pytest.raises(OptionError, match=r"scaled.pth: expected LightGlue for DISK.* scales or shapes"):
-        load_matcher([disk, tmp_path / "scaled.pth"], device="cpu")
 
 
 # SuperPoint.
@@ -270,16 +269,14 @@ def test_a_pickle_that_runs_code_is_refused(by, tmp_path):
 
 
 def test_files_that_are_no_weights_are_named(files, tmp_path):
-    with pytest.raises(OptionError, match=r"weights: no such file: .*missing.pth"):
-        load_loftr(tmp_path / "missing.pth")
-    with pytest.raises(OptionError, match="no such file"):
-        load_loftr(tmp_path)  # a folder
+    for path in (tmp_path / "missing.pth", tmp_path):
+        with pytest.raises(OptionError, match=rf"weights: no such file: .*{path.name}"):
+            load_loftr(path)
     whole = (files / "disk.pth").read_bytes()
     for name, content in {"empty.pth": b"", "text.pth": b"hello", "cut.pth": whole[: len(whole) // 2]}.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(OptionError, match=rf"weights: \S*{name}") as caught:
+        with pytest.raises(OptionError, match=rf"\Aweights: \S*{name}[^\n]*\Z"):
             load_loftr(tmp_path / name)
-        assert "\n" not in str(caught.value)
     for content in ([1, 2], {}, {"state_dict": {"a": 1}}, torch.zeros(3)):
         torch.save(content, tmp_path / "other.pth")
         with pytest.raises(OptionError, match=r"other.pth: expected a state dict"):
@@ -301,14 +298,14 @@ def test_weights_of_another_network_are_named(files, tmp_path):
 
 
 def test_wrong_arguments_are_named(files):
-    matcher = Loftr(Brightest())
-    good = torch.zeros(1, 1, 20, 20)
-    with pytest.raises(ShapeError, match=r"frame: expected \(1, 1, H, W\), got \(20, 20\)"):
-        matcher(good[0, 0], good)
-    with pytest.raises(ShapeError, match="crop"):
-        matcher(good, good.expand(2, -1, -1, -1))
-    with pytest.raises(DtypeError, match="crop: expected floating point"):
-        matcher(good, good.to(torch.uint8))
+    matcher, good = Loftr(Brightest()), torch.zeros(1, 1, 20, 20)
+    for frame, crop, error, words in (
+        (good[0, 0], good, ShapeError, r"frame: expected \(1, 1, H, W\), got \(20, 20\)"),
+        (good, good.expand(2, -1, -1, -1), ShapeError, "crop"),
+        (good, good.to(torch.uint8), DtypeError, "crop: expected floating point"),
+    ):
+        with pytest.raises(error, match=words):
+            matcher(frame, crop)
     with pytest.raises(OptionError, match="min_confidence"):
         load_loftr(files / "loftr.ckpt", min_confidence=1.5)
     with pytest.raises(OptionError, match="max_keypoints"):

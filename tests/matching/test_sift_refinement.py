@@ -47,6 +47,10 @@ def refuse_to_refine(monkeypatch):
         monkeypatch.setattr(Refinement, name, lambda _self, _fix: None)
 
 
+def out_of_time(_self, _given):
+    raise OutOfTime
+
+
 def shot(ground, camera, nadir_px=NADIR, heading_deg=25.0):
     return ground.frame(camera, nadir_px, heading_deg=heading_deg, roll_deg=3.0, pitch_deg=-2.0)
 
@@ -95,24 +99,19 @@ def test_doubtful_few_features_give_way_to_all(ground, camera, matcher, monkeypa
     assert apart_m < by_few.relative_sigma_m  # the same picture agrees with the map at the same pose
 
 
-def test_where_refinement_fails_all_features_give_the_pose(ground, camera, matcher, plain, monkeypatch):
+@pytest.mark.parametrize("abandoned", [False, True])
+def test_where_refinement_fails_or_is_abandoned_all_features_give_the_pose(
+    ground, camera, matcher, plain, monkeypatch, abandoned
+):
     frame, prior = shot(ground, camera), ground.prior(NADIR)
     expected = plain.locate(frame, prior)
     refuse_to_refine(monkeypatch)
+    if abandoned:
+        monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
     fix = matcher.locate(frame, prior)
     assert fix.stage == "fine"
     assert (fix.east_m, fix.north_m, fix.up_m) == (expected.east_m, expected.north_m, expected.up_m)
     np.testing.assert_array_equal(fix.covariance_m2, expected.covariance_m2)
-
-
-def test_a_refinement_that_is_abandoned_leaves_the_fix(ground, camera, matcher, monkeypatch):
-    def out_of_time(_self, _fix):
-        raise OutOfTime
-
-    monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
-    fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
-    assert isinstance(fix, Fix)
-    assert fix.stage == "fine"
 
 
 @pytest.fixture
@@ -208,9 +207,6 @@ def test_few_features_leave_the_time_for_all(ground, camera, site, monkeypatch):
 
 
 def test_certain_few_features_are_kept_where_all_come_too_late(ground, camera, matcher, monkeypatch):
-    def out_of_time(_self, _query):
-        raise OutOfTime
-
     refuse_to_refine(monkeypatch)
     monkeypatch.setattr(Sift, "_by_all_features", out_of_time)
     fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
