@@ -8,7 +8,6 @@ import pytest
 
 from engine import Budget, Fix, SceneMatcher
 from engine.budget import Deadline
-from engine.errors import OptionError
 from engine.matching import feature_matching
 from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.refinement import Refinement
@@ -16,7 +15,6 @@ from engine.matching.sift import Sift
 from engine.matching.views import drawn_px
 from engine.options import MatcherOptions, SiftOptions
 from engine.runtime.scheduler import OutOfTime
-from engine.values import NoFix, Reason
 from tests.matching.test_scheduler import FixedCosts
 
 NADIR = np.array([310.0, 305.0])
@@ -156,13 +154,6 @@ def test_wrong_telemetry_does_not_draw_the_pose_away(ground, camera, matcher, pl
     assert off_m @ np.linalg.solve(fix.covariance_m2[:2, :2], off_m) < 9.21  # of 2 degrees of freedom, 99 %
 
 
-def test_foreign_ground_is_refused_as_before(ground, camera, matcher):
-    frame = replace(shot(ground, camera), image=np.ascontiguousarray(shot(ground, camera).image[:, ::-1]))
-    result = matcher.locate(frame, ground.prior(NADIR))
-    assert isinstance(result, NoFix)
-    assert result.reason in (Reason.BAD_POSE, Reason.TOO_FEW_MATCHES, Reason.AMBIGUOUS)
-
-
 @pytest.mark.parametrize("heading_off_deg", [pytest.param(0.0, marks=pytest.mark.slow), 6.0])
 def test_after_the_warm_up_nothing_is_prepared_in_flight(ground, site, camera, heading_off_deg):
     """Also where refinement has to begin on a coarser level."""
@@ -235,12 +226,6 @@ def test_a_pose_refined_to_another_height_is_not_taken(ground, camera, matcher, 
     fix, by_features = (one.locate(frame, ground.prior(NADIR)) for one in (matcher, plain))
     sigma_m = np.sqrt(fix.covariance_m2[2, 2] + by_features.covariance_m2[2, 2])
     assert abs(fix.up_m - by_features.up_m) < 4.0 * sigma_m
-
-
-def test_upsampling_is_once_or_twice():
-    for value in (0, 3):
-        with pytest.raises(OptionError, match=f"upsample: expected 1 or 2, got {value}"):
-            SiftOptions(upsample=value)
 
 
 def test_samples_of_another_method_are_shared(site, camera):
