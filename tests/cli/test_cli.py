@@ -276,15 +276,11 @@ def test_a_map_that_lies_badly_makes_a_fix_doubtful(flight, capsys):
     assert "--settings input.map_sigma_m: expected a number above 0" in line
 
 
-def test_locate_at_a_start_and_its_refusals(flight, capsys):
-    image = flight / "frames" / "000000.jpg"
-    base = ["locate", image, f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
-    assert "--height-agl" in error_line(capsys, [*base, "--height-agl=-3"], 2)
-    assert "--heading" in error_line(capsys, [*base, "--heading=nan"], 2)
-    assert "--start" in error_line(capsys, [*base, "--start=10,10"], 2)
-    assert "--method" in error_line(capsys, [*base, "--method=orb"], 2)
-    missing = flight / "none.jpg"
-    assert str(missing) in error_line(capsys, ["locate", missing, *base[2:]], 1)
+def test_a_start_off_the_map_and_a_picture_that_is_missing_are_refused(flight, tmp_path, capsys):
+    refused(capsys, flight, tmp_path / "out", 2, "--start", more=["--start=10,10"])
+    missing, files = flight / "none.jpg", [f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
+    assert "--start" in error_line(capsys, ["locate", flight / "frames/000000.jpg", *files, "--start=10,10"], 2)
+    assert str(missing) in error_line(capsys, ["locate", missing, *files], 1)
 
 
 def test_map_info(flight, capsys):
