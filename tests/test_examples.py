@@ -43,6 +43,7 @@ def test_an_example_is_short(script):
     assert len(code) <= 20
 
 
+@pytest.mark.usefixtures("bare_runs")
 def test_your_own_loop_fixes_every_frame(flight, monkeypatch, capsys):
     monkeypatch.chdir(flight)
     runpy.run_path(str(EXAMPLES / "your_own_loop.py"))

@@ -94,7 +94,7 @@ def uav_visloc(root, in_degrees, taken, *, cut=None):
 
 
 def followed(flight, out, taken):
-    summary = track(FlightFiles.in_folder(flight), out, TrackSettings(), report=False)
+    summary = track(FlightFiles.in_folder(flight), out, TrackSettings(method="ncc"), report=False)
     assert summary["fixes"] == summary["scored_fixes"] == len(taken)
     assert summary["max_m"] < 3.0  # without a surface model roofs lean
     for row, (_, true) in zip(read_truth(flight / "truth.csv"), taken, strict=True):

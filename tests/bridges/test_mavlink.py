@@ -141,35 +141,32 @@ def test_stamps_are_of_capture_whenever_it_is_sent(firmware, kind):
         assert stamp_us - waited_us == 12_345_678
 
 
-def test_ardupilot_finds_the_fix_again_by_its_own_scale():
+def by_ardupilot(north, east, origin):
+    """Degrees by the scale of its Location, metres per 1e-7 degrees, and the cosine of the middle latitude."""
+    lat = origin.lat_deg + north / 0.011131884502145034 * 1e-7
+    middle = math.radians(0.5 * (lat + origin.lat_deg))
+    return lat, origin.lon_deg + east / 0.011131884502145034 / math.cos(middle) * 1e-7
+
+
+def by_px4(north, east, origin):
+    """Degrees by the inverse of the azimuthal projection."""
+    distance, lat0 = math.hypot(north, east), math.radians(origin.lat_deg)
+    c, along, across = distance / 6371000.0, north / distance, east / distance
+    back = math.asin(math.cos(c) * math.sin(lat0) + along * math.sin(c) * math.cos(lat0))
+    turn = math.atan2(across * math.sin(c), math.cos(lat0) * math.cos(c) - along * math.sin(lat0) * math.sin(c))
+    return math.degrees(back), origin.lon_deg + math.degrees(turn)
+
+
+@pytest.mark.parametrize(("firmware", "back"), [("ardupilot", by_ardupilot), ("px4", by_px4)])
+def test_a_firmware_finds_the_fix_again_by_its_own_projection(firmware, back):
     rng = np.random.default_rng(1)
-    scale = 0.011131884502145034  # of ArduPilot's Location, metres per 1e-7 degrees
     for _ in range(50):
         origin = NedOrigin(rng.uniform(-70, 70), rng.uniform(-180, 180), 0.0)
         lat, lon = origin.lat_deg + rng.uniform(-0.05, 0.05), origin.lon_deg + rng.uniform(-0.05, 0.05)
-        north, east = north_east_m(lat, lon, origin, "ardupilot")
-        back_lat = origin.lat_deg + north / scale * 1e-7
-        middle = 0.5 * (back_lat + origin.lat_deg)
-        back_lon = origin.lon_deg + east / scale / math.cos(math.radians(middle)) * 1e-7
+        back_lat, back_lon = back(*north_east_m(lat, lon, origin, firmware), origin)
         assert back_lat == pytest.approx(lat, abs=1e-9)
         assert math.remainder(back_lon - lon, 360.0) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_px4_finds_the_fix_again_by_its_own_projection():
-    rng = np.random.default_rng(2)
-    for _ in range(50):
-        origin = NedOrigin(rng.uniform(-70, 70), rng.uniform(-180, 180), 0.0)
-        lat, lon = origin.lat_deg + rng.uniform(-0.05, 0.05), origin.lon_deg + rng.uniform(-0.05, 0.05)
-        north, east = north_east_m(lat, lon, origin, "px4")
-        c = math.hypot(north, east) / 6371000.0  # the inverse of the azimuthal projection
-        lat0 = math.radians(origin.lat_deg)
-        along = north / math.hypot(north, east)
-        back = math.asin(math.cos(c) * math.sin(lat0) + along * math.sin(c) * math.cos(lat0))
-        across = east / math.hypot(north, east) * math.sin(c)
-        turn = math.atan2(across, math.cos(lat0) * math.cos(c) - along * math.sin(lat0) * math.sin(c))
-        assert math.degrees(back) == pytest.approx(lat, abs=1e-9)
-        assert math.remainder(origin.lon_deg + math.degrees(turn) - lon, 360.0) == pytest.approx(0.0, abs=1e-9)
-    assert north_east_m(10.0, 20.0, NedOrigin(10.0, 20.0, 0.0), "px4") == (0.0, 0.0)
+    assert north_east_m(10.0, 20.0, NedOrigin(10.0, 20.0, 0.0), firmware) == (0.0, 0.0)
 
 
 def test_the_height_does_not_drown_the_covariance():
@@ -1108,16 +1105,6 @@ def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(loo
         assert {(m.get_srcSystem(), m.get_srcComponent()) for m, _ in pilot.of(kind)} == {(1, 194)}
 
 
-@pytest.mark.parametrize("number", ["1", "0", "256"])
-def test_the_bridge_is_no_autopilot_and_no_broadcast(number, capsys):
-    given = ["--connect", "udp:14550", "--map", "m.tif", "--frames", "f", "--camera", "c.yaml"]
-    assert main(["bridge", "mavlink", *given, "--settings", f"mavlink.component_id={number}"]) == 2
-    assert (
-        f"--settings mavlink.component_id: expected 2 to 255 (1 is the autopilot), got {number}"
-        in capsys.readouterr().err
-    )
-
-
 @pytest.mark.parametrize(("use_velocity", "by_camera"), [(True, False), (False, True), (False, False)])
 def test_velocities_arrive_from_a_camera_and_if_it_is_told_so_from_the_autopilot(loop, use_velocity, by_camera):
     made, pilot = loop(use_velocity=use_velocity, pilot={})
@@ -1227,17 +1214,14 @@ def test_with_a_key_what_is_not_signed_cannot_steer_even_from_the_vehicles_own_a
 @pytest.mark.skipif(not Path("/proc/net/udp").exists(), reason="asks Linux which sockets are open")
 def test_the_open_sockets_are_those_of_loopback(bridge_to):
     bridge_to()
-    own = {os.readlink(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd") if fd_is_there(fd)}
+    links = [f"/proc/self/fd/{number}" for number in os.listdir("/proc/self/fd")]
+    own = {os.readlink(link) for link in links if os.path.lexists(link)}
     addresses = []
     for table in ("udp", "udp6", "tcp", "tcp6"):
         rows = [line.split() for line in Path(f"/proc/net/{table}").read_text(encoding="ascii").splitlines()[1:]]
         addresses += [(table, row[1].split(":")[0]) for row in rows if f"socket:[{row[9]}]" in own]
     assert addresses
     assert set(addresses) <= {("udp", "0100007F"), ("tcp", "0100007F")}  # 127.0.0.1, as the kernel writes it
-
-
-def fd_is_there(fd):
-    return os.path.lexists(f"/proc/self/fd/{fd}")
 
 
 def test_a_flood_and_a_stranger_do_not_steer_it(loop):

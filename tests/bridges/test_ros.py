@@ -1047,7 +1047,6 @@ def test_a_ros_that_is_not_there_is_one_line(monkeypatch, capsys, flight):
         capsys.readouterr()
         assert main(["bridge", "ros", "--ros", version, "--map", str(flight / "map.tif")]) == code
         assert stated in capsys.readouterr().err
-    assert main(["bridge", "ros", "--map", str(flight / "map.tif"), "--firmware", "x"]) == 2
 
 
 @pytest.mark.parametrize(
@@ -1071,14 +1070,6 @@ def test_arguments_of_another_ros_are_refused(capsys, tmp_path):
     ):
         assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "m.tif"), *given]) == 2
         assert stated in capsys.readouterr().err
-
-
-def test_an_odometry_of_another_message_is_refused(capsys, tmp_path):
-    given = ["--settings", "ros.topics.odometry=/vio", "--settings", "ros.topics.odometry_type=PoseStamped"]
-    assert main(["bridge", "ros", "--map", str(tmp_path / "m.tif"), *given]) == 2
-    names = "Odometry, TwistWithCovarianceStamped, TwistStamped"
-    stated = f"ros.topics.odometry_type: expected one of {names}, got 'PoseStamped'"
-    assert stated in capsys.readouterr().err
 
 
 def test_the_settings_name_the_topics_of_the_code(capsys):

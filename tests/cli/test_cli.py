@@ -178,7 +178,9 @@ def test_evaluate_takes_another_truth(done, flight, tmp_path, capsys):
 def test_start_comes_before_the_telemetry(copy, tmp_path):
     truth = cells(copy / "truth.csv")[0]
     lines = (copy / "telemetry.csv").read_text(encoding="utf-8").splitlines(keepends=True)
-    (copy / "telemetry.csv").write_text("".join(lines[:2]), encoding="utf-8")  # of the first frame alone
+    (copy / "telemetry.csv").write_text("".join(lines[:2]), encoding="utf-8")
+    for later in sorted((copy / "frames").iterdir())[1:]:
+        later.unlink()
     # So far from the truth, and so sure of it, that nothing but the start itself can lead astray.
     lat = float(truth["lat_deg"]) + 0.002
     out = tmp_path / "out"
@@ -274,15 +276,11 @@ def test_a_map_that_lies_badly_makes_a_fix_doubtful(flight, capsys):
     assert "--settings input.map_sigma_m: expected a number above 0" in line
 
 
-def test_locate_at_a_start_and_its_refusals(flight, capsys):
-    image = flight / "frames" / "000000.jpg"
-    base = ["locate", image, f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
-    assert "--height-agl" in error_line(capsys, [*base, "--height-agl=-3"], 2)
-    assert "--heading" in error_line(capsys, [*base, "--heading=nan"], 2)
-    assert "--start" in error_line(capsys, [*base, "--start=10,10"], 2)
-    assert "--method" in error_line(capsys, [*base, "--method=orb"], 2)
-    missing = flight / "none.jpg"
-    assert str(missing) in error_line(capsys, ["locate", missing, *base[2:]], 1)
+def test_a_start_off_the_map_and_a_picture_that_is_missing_are_refused(flight, tmp_path, capsys):
+    refused(capsys, flight, tmp_path / "out", 2, "--start", more=["--start=10,10"])
+    missing, files = flight / "none.jpg", [f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
+    assert "--start" in error_line(capsys, ["locate", flight / "frames/000000.jpg", *files, "--start=10,10"], 2)
+    assert str(missing) in error_line(capsys, ["locate", missing, *files], 1)
 
 
 def test_map_info(flight, capsys):
@@ -363,13 +361,14 @@ def test_an_output_folder_is_not_overwritten(done, flight, tmp_path, capsys):
     assert str(file) in error_line(capsys, track(flight, file / "deeper", "--force"), 2)
 
 
-def test_force_replaces_results_and_touches_nothing_else(flight, tmp_path):
-    out = tmp_path / "out"
-    assert run(track(flight, out, "--method=sift")) == 0
+def test_force_replaces_results_and_touches_nothing_else(done, flight, tmp_path):
+    out = Path(shutil.copytree(done, tmp_path / "out"))
     (out / "notes.txt").write_text("mine", encoding="utf-8")
+    for name in WRITTEN:
+        (out / name).write_text("of another run", encoding="utf-8")
     assert run(track(flight, out, "--force")) == 0
     assert {file.name for file in out.iterdir()} == {"notes.txt"} | WRITTEN
-    assert {row["method"] for row in cells(out / "track.csv")} == {"ncc"}
+    assert not [name for name in WRITTEN if "of another run" in (out / name).read_text(encoding="utf-8")]
 
 
 # ---------------------------------------------------------------------------------------------- wrong input

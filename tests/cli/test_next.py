@@ -70,9 +70,8 @@ def test_others_name_commands_that_exist(flight, capsys):
 
 def test_check_looks_at_one_frame_in_n_and_track_is_named_with_the_same(flight, capsys):
     given = ["check", *files_of(flight)]
-    for every, looked_at in ((1, 2), (2, 1)):
-        assert run([*given, f"--settings=input.every={every}", "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["looked_at"] == looked_at
+    assert run([*given, "--settings=input.every=2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["looked_at"] == 1
     words = next_of(capsys, [*given, "--settings=input.every=2"])
     assert parsed(words) == "track"
     assert words[words.index("--settings") + 1] == "input.every=2"

@@ -53,7 +53,9 @@ def said(capsys, arguments, code=2):
         (LOCATE, "--start", "48,16,1e200"),
         *((TRACK, "--start", value) for value in ("here", "33", "33,35,1,2")),
         *((TRACK, "--budget-ms", value) for value in ("0", "-5", "nan")),
-        (TRACK, "--method", "orb"),
+        *((command, "--method", "orb") for command in (TRACK, LOCATE)),
+        (LOCATE, "--height-agl", "-3"),
+        (LOCATE, "--heading", "nan"),
         (TRACK, "--profile", "fast"),
         ([*TRACK, "--profile=paper"], "--method", "auto"),
         *((SIMULATE, "--relief-m", value) for value in ("nan", "-5", "81")),
@@ -62,11 +64,12 @@ def said(capsys, arguments, code=2):
         (PLAYED, "--firmware", "x"),
         (PLAYED, "mavlink.message", "x"),
         (PLAYED, "mavlink.max_sigma_m", "1e308"),
+        *((PLAYED, "mavlink.component_id", value) for value in ("1", "0", "256")),  # an autopilot, a broadcast
         (ROS, "--firmware", "x"),
     ],
 )
 def test_a_value_out_of_range_is_refused_by_its_option(command, option, value, tmp_path, monkeypatch, capsys):
-    if option in ("--firmware", "mavlink.message", "mavlink.max_sigma_m"):
+    if option.startswith(("--firmware", "mavlink.")):
         pytest.importorskip("pymavlink", reason="pymavlink is not installed")
     monkeypatch.chdir(tmp_path)
     name = option if option.startswith("--") else f"--settings {option}"
@@ -93,9 +96,11 @@ def test_an_option_that_would_say_nothing_is_refused(command, option, wanted, ca
     assert said(capsys, command) == f"{option}: expected with {wanted} only\n"
 
 
-def test_a_topic_is_of_a_bag_and_a_start_on_the_earth(capsys):
+def test_a_topic_is_of_a_bag_an_odometry_of_known_type_and_a_start_on_the_earth(capsys):
     line = said(capsys, [*TRACK, "--settings=input.image_topic=/down"])
     assert line == "--settings input.image_topic: expected a bag as frames, got f\n"
+    given = [*ROS, "--settings=ros.topics.odometry=/vio", "--settings=ros.topics.odometry_type=PoseStamped"]
+    assert said(capsys, given).startswith("ros.topics.odometry_type: expected one of Odometry, Twist")
     for start in ("nan,35", "95,35", "33,35,-1"):
         assert said(capsys, [*TRACK, f"--start={start}"]).startswith("--start: ")
 

@@ -37,6 +37,7 @@ def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
     else:
         assert isinstance(result, NoFix)
         assert result.reason is Reason.INCONSISTENT
+        assert "m apart" in result.detail
 
 
 def test_few_features_that_disagree_are_not_the_second_opinion(ground, site, camera, monkeypatch):

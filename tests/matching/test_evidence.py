@@ -129,12 +129,6 @@ def test_a_score_is_counted_in_sigmas_of_fishers_z():
     assert independent_places(0.0) == pytest.approx(math.e)
 
 
-@given(st.floats(-1, 1), st.floats(-1, 1), st.floats(1e-3, 1), st.floats(3.0, 1e12), known)
-def test_every_peak_has_a_probability(score, second, sigma, places, off):
-    evidence = Evidence(surprise_of(score, sigma), surprise_of(second, sigma), places, places, off)
-    assert 0.0 < probability(evidence.nats) < 1.0
-
-
 def test_a_place_is_held_against_the_errors_of_both():
     fix = Fix(
         timestamp_ns=None, lat_deg=0.0, lon_deg=0.0, east_m=3.0, north_m=4.0, up_m=None,

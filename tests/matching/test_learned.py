@@ -66,6 +66,11 @@ def matcher(_stand_in, ground, camera):
     return SceneMatcher(ground.site, camera, "learned", "cpu", WITH_WEIGHTS)
 
 
+@pytest.fixture(scope="module")
+def frame(ground, camera):
+    return ground.frame(camera, NADIR, heading_deg=25.0, timestamp_ns=77)
+
+
 @pytest.mark.parametrize("heading_deg", [0.0, 140.0, 265.0])
 def test_a_frame_at_any_heading_reaches_the_network_upright(matcher, ground, camera, heading_deg):
     frame = ground.frame(camera, NADIR, heading_deg=heading_deg, roll_deg=5.0, pitch_deg=-4.0, timestamp_ns=77)
@@ -95,16 +100,14 @@ def test_another_place_is_refused(matcher, ground, camera):
 
 
 @pytest.mark.usefixtures("_stand_in")
-def test_a_window_too_large_for_a_network_is_refused(ground, camera):
+def test_a_window_too_large_for_a_network_is_refused(ground, camera, frame):
     options = MatcherOptions(learned=LearnedOptions(weights=("stand-in",), max_window_px=10_000))
-    frame = ground.frame(camera, NADIR, timestamp_ns=77)
     refusal = SceneMatcher(ground.site, camera, "learned", "cpu", options).locate(frame, ground.prior(NADIR))
     assert isinstance(refusal, NoFix)
     assert refusal.reason is Reason.MAP_TOO_LARGE
 
 
-def test_the_map_is_described_once(matcher, ground, camera):
-    frame = ground.frame(camera, NADIR, heading_deg=25.0, timestamp_ns=77)
+def test_the_map_is_described_once(matcher, ground, frame):
     matcher.locate(frame, ground.prior(NADIR))
     created = matcher.cache_counters["keypoint tiles"]
     assert created > 0
@@ -112,8 +115,7 @@ def test_the_map_is_described_once(matcher, ground, camera):
     assert matcher.cache_counters["keypoint tiles"] == created
 
 
-def test_an_explanation_shows_the_matches_of_the_fix(matcher, ground, camera):
-    frame = ground.frame(camera, NADIR, heading_deg=25.0, timestamp_ns=77)
+def test_an_explanation_shows_the_matches_of_the_fix(matcher, ground, frame):
     fix = matcher.locate(frame, ground.prior(NADIR))
     shown = matcher.explain(frame, fix.window).matches
     assert shown.agree.mean() == pytest.approx(fix.score, abs=0.1)
@@ -135,20 +137,15 @@ def test_keypoints_of_a_window_are_the_level_s_own_in_the_windows_pixels(ground,
     known = KeypointMap(site, KeypointMatcher(bright, Nearest(), 2048))
     window = Window(50, 70, 300, 260)
     found = known.find(window, 0, 1 << 20)
-    picture = torch.from_numpy(site.gray(Window(0, 0, site.width_px, site.height_px), 0))[None, None] / 255.0
-    whole = bright(picture, 1 << 20)
-    xy = whole.xy_px - torch.tensor([50.0, 70.0])
+    gray = torch.from_numpy(site.gray(Window(0, 0, site.width_px, site.height_px), 0)) / 255.0
+    xy = bright(gray[None, None], 1 << 20).xy_px - torch.tensor([50.0, 70.0])
     inside = ((xy >= 0) & (xy <= torch.tensor([299.0, 259.0]))).all(dim=1)
     assert len(found) > 100
     assert set(map(tuple, found.xy_px.tolist())) == set(map(tuple, xy[inside].tolist()))
-    assert torch.equal(site_gray_at(site, found.xy_px + torch.tensor([50.0, 70.0])), found.descriptors[:, 0])
+    x, y = found.xy_px.long().T + torch.tensor([[50], [70]])
+    assert torch.equal(gray[y, x], found.descriptors[:, 0])
     few = known.find(window, 0, 50)
     assert 20 <= len(few) <= 50
-
-
-def site_gray_at(site, xy):
-    whole = torch.from_numpy(site.gray(Window(0, 0, site.width_px, site.height_px), 0))
-    return whole[xy[:, 1].long(), xy[:, 0].long()] / 255.0
 
 
 # Without weights, and with those of nothing.

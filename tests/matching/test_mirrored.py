@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from engine import Fix, MatcherOptions, NoFix, Reason, SceneMatcher
-from engine.matching.acceptance import judge_pose
-from engine.matching.evidence import Evidence
 from tests.support.ground import Ground
 
 NADIR = np.array([310.0, 305.0])
@@ -49,11 +45,3 @@ def test_a_frame_that_is_its_own_mirror_image_is_refused(symmetrical, camera):
     assert isinstance(result, NoFix)
     assert result.reason is Reason.AMBIGUOUS
     assert "the mirrored frame fits the map as well" in result.detail
-
-
-def test_the_null_hypothesis_takes_away_what_it_reaches():
-    alone = Evidence(50.0, 4.0, 1e3, 1e3, 0.5, 0.5)
-    assert judge_pose(alone, 1e-4) is None
-    assert judge_pose(replace(alone, null=12.0), 1e-4) is None
-    assert judge_pose(replace(alone, null=50.0), 1e-4)[0] is Reason.AMBIGUOUS
-    assert judge_pose(replace(alone, surprise=10.0), 1e-4)[0] is Reason.BAD_POSE

@@ -13,17 +13,14 @@ from engine import (
     Budget,
     Fix,
     MatcherOptions,
-    Navigator,
     NccOptions,
     NoFix,
-    Prior,
     Reason,
     SceneMatcher,
 )
 from engine.budget import Deadline
 from engine.matching.ncc import Looks, Ncc
 from engine.matching.refinement import Refinement
-from engine.matching.sift import Sift
 from engine.runtime import scheduler, threads
 from engine.runtime.device import Device
 from engine.runtime.scheduler import Costs, OutOfTime, Scheduler
@@ -248,37 +245,11 @@ def test_what_cannot_be_in_time_is_not_begun(make, frame, prior, method):
     assert list(result.timings.stages_ms) == ["grey"]
 
 
-def test_both_methods_verify_each_other(ground, make, frame, prior):
-    fix = make("auto").locate(frame, prior)
-    assert off_m(ground, fix) < 1.0
-    assert fix.stage == "verified"
-
-
 @pytest.mark.parametrize(("costs", "method"), [({"sift": 1e9}, "ncc"), ({"ncc": 1e9}, "sift")])
 def test_with_time_for_one_method_there_is_one(ground, make, frame, prior, costs, method):
     fix = make("auto", **costs).locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 1.0
     assert (fix.stage, fix.method) == ("refined", method)
-
-
-def test_two_fixes_of_two_places_are_none(make, frame, prior, monkeypatch):
-    honest = Sift.locate
-
-    def elsewhere(*args):
-        fix = honest(*args)
-        return replace(fix, east_m=fix.east_m + 40.0)
-
-    monkeypatch.setattr(Sift, "locate", elsewhere)
-    result = make("auto").locate(frame, prior)
-    assert isinstance(result, NoFix)
-    assert result.reason is Reason.INCONSISTENT
-    assert "m apart" in result.detail
-
-
-def test_unknown_height_leaves_features(ground, make, frame, prior):
-    fix = make("auto").locate(replace(frame, height_agl_m=None), prior)
-    assert off_m(ground, fix) < 1.5
-    assert (fix.stage, fix.method) == ("fine", "sift")
 
 
 def test_a_search_of_the_whole_map_has_a_budget_of_its_own(ground, make, frame):
@@ -353,17 +324,6 @@ def test_after_warmup_no_loop_is_compiled_for_a_refused_frame_or_one_without_til
     noise = np.random.default_rng(0).integers(0, 255, frame.image.shape, np.uint8)
     assert isinstance(matcher.locate(replace(frame, image=noise), prior), NoFix)
     assert matcher.cache_counters == before
-
-
-def test_a_late_frame_is_no_sign_of_being_lost(ground, make, frame, prior):
-    matcher = make("ncc", ncc=1e9)
-    priors = []
-    honest = matcher.locate
-    matcher.locate = lambda *args: priors.append(args[1]) or honest(*args)
-    navigator = Navigator(matcher, prior, HURRY)
-    for number in range(30):
-        assert navigator.update(replace(frame, timestamp_ns=number)).reason is Reason.LATE
-    assert all(isinstance(p, Prior) for p in priors)
 
 
 def test_warmup_knows_the_cost_of_a_search(site, camera):

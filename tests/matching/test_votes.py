@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engine.kernels.clusters import count_apart, count_near_pairs, densest
-from engine.matching.votes import SCALES, TURNS_DEG, _binomial_surprise, similarity, vote
+from engine.matching.votes import SCALES, TURNS_DEG, similarity, vote
 
 RADIUS_PX, DISTINCT_PX = 4.0, 2.0
 
@@ -111,9 +111,3 @@ def test_without_matches_nothing_is_voted_for():
     alone = vote(np.zeros((1, 2)), np.ones((1, 2)), RADIUS_PX, DISTINCT_PX)
     assert np.count_nonzero(alone.voters) == 1
     assert alone.surprise == 0.0 < math.log(alone.tried)
-
-
-def test_the_tail_is_bounded_from_above():
-    for n, k, p in ((40, 6, 0.01), (200, 20, 0.02), (10, 10, 0.3), (50, 1, 0.5)):
-        exact = sum(math.comb(n, i) * p**i * (1 - p) ** (n - i) for i in range(k, n + 1))
-        assert 0.0 <= _binomial_surprise(n, k, p) <= -math.log(exact)

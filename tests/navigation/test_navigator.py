@@ -334,6 +334,10 @@ def test_lost_after_enough_refusals_it_searches_the_whole_map_and_then_confirms(
     assert navigator.reset_count == 1
 
 
+def test_late_frames_are_no_sign_of_being_lost():
+    assert all(prior is not None for prior in flown(*[Reason.LATE] * 30)[1])
+
+
 def test_lost_over_a_map_too_large_to_search_it_looks_where_dead_reckoning_leads():
     options = NavigatorOptions(lost_after=4, search_every=2, lost_sigma_m=3.0)
     _, priors, navigator = flown((10.0, 20.0), *[None] * 9, site=a_site(is_searchable=False), options=options)

@@ -45,12 +45,13 @@ def flown(stated=lambda v: v, *, seconds=60.0, rate_hz=5.0, speed_mps=7.0, seed=
     return check, doubted
 
 
-@pytest.mark.parametrize("rate_hz", [1.0, *(pytest.param(hz, marks=pytest.mark.slow) for hz in (5.0, 30.0))])
-def test_a_right_velocity_is_believed(rate_hz):
+@pytest.mark.parametrize(
+    ("rate_hz", "seeds"),
+    [(1.0, 30), *(pytest.param(hz, 150 / hz, marks=pytest.mark.slow) for hz in (1.0, 5.0, 30.0))],
+)
+def test_a_right_velocity_is_believed(rate_hz, seeds):
     """Some 30,000 matches in all: the rate of false alarms that is stated is 1 in 10,000."""
-    assert [flown(rate_hz=rate_hz, seed=seed)[1] for seed in range(round(150 / rate_hz))] == [
-        [] for _ in range(round(150 / rate_hz))
-    ]
+    assert not any(flown(rate_hz=rate_hz, seed=seed)[1] for seed in range(round(seeds)))
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -109,24 +109,12 @@ def _image_points(rng: np.random.Generator, count: int) -> Array:
     return rng.uniform(0, SIZE_PX - 1, (count, 2))
 
 
-def _plane(rng: np.random.Generator) -> Matches:
-    count = int(rng.integers(10, 150))
-    return _map_points(rng, count), _image_points(rng, count)
+def _anywhere(fewest: int, most: int, *reliefs_m: float) -> Callable[[np.random.Generator], Matches]:
+    def draw(rng: np.random.Generator) -> Matches:
+        count = int(rng.integers(fewest, most))
+        return _map_points(rng, count, rng.choice(reliefs_m)), _image_points(rng, count)
 
-
-def _relief(rng: np.random.Generator) -> Matches:
-    count = int(rng.integers(10, 150))
-    return _map_points(rng, count, 40.0), _image_points(rng, count)
-
-
-def _few(rng: np.random.Generator) -> Matches:
-    count = int(rng.integers(4, 11))
-    return _map_points(rng, count, rng.choice([0.0, 40.0])), _image_points(rng, count)
-
-
-def _many(rng: np.random.Generator) -> Matches:
-    count = int(rng.integers(200, 301))
-    return _map_points(rng, count, rng.choice([0.0, 40.0])), _image_points(rng, count)
+    return draw
 
 
 def _clustered(rng: np.random.Generator) -> Matches:
@@ -148,7 +136,7 @@ def _line(rng: np.random.Generator) -> Matches:
 
 def _repeated(rng: np.random.Generator) -> Matches:
     """A few matches, each found again and again within a pixel or two."""
-    points, pixels = _few(rng)
+    points, pixels = _anywhere(4, 11, 0.0, 40.0)(rng)
     index = rng.integers(0, len(points), int(rng.integers(20, 150)))
     jitter = rng.normal(0, rng.uniform(0, 1.5), (len(index), 2))
     return points[index], pixels[index] + jitter
@@ -189,7 +177,7 @@ def _periodic(rng: np.random.Generator) -> Matches:
 
 def _false_cluster(rng: np.random.Generator) -> Matches:
     """One small thing is found whole, elsewhere (two equal cars), among matches that point anywhere."""
-    points, pixels = _plane(rng)
+    points, pixels = _anywhere(10, 150, 0.0)(rng)
     count = int(rng.integers(3, 13))
     around, turn = rng.uniform(-8, 8, (count, 2)), rng.uniform(0, math.tau)
     spin = np.array([[math.cos(turn), math.sin(turn)], [math.sin(turn), -math.cos(turn)]])
@@ -209,7 +197,8 @@ def _seen(rng: np.random.Generator, points: Array) -> Matches:
 
 
 WRONG: dict[str, Callable[[np.random.Generator], Matches]] = {
-    "plane": _plane, "relief": _relief, "4 to 10": _few, "200 to 300": _many, "clustered": _clustered,
+    "plane": _anywhere(10, 150, 0.0), "relief": _anywhere(10, 150, 40.0), "4 to 10": _anywhere(4, 11, 0.0, 40.0),
+    "200 to 300": _anywhere(200, 301, 0.0, 40.0), "clustered": _clustered,
     "on a road": _line, "repeated": _repeated, "one to many": _one_to_many, "many to one": _many_to_one,
     "permuted": _permuted, "another period": _periodic, "a false cluster": _false_cluster,
 }  # fmt: skip
