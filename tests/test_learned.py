@@ -10,7 +10,7 @@ from kornia.feature import DISK, LightGlue, LoFTR
 from torch import nn
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.learned import KeypointMatcher, Loftr, load_disk_lightglue, load_loftr, load_matcher
+from engine.learned import KeypointMatcher, Loftr, load_matcher
 from engine.learned.keypoints import Disk, SuperPointKeypoints
 from engine.learned.superpoint import SuperPoint, sample, strongest
 
@@ -123,7 +123,7 @@ class Reversed(nn.Module):
 def test_sparse_points_come_back_in_pairs_and_unmoved():
     points = [[[0.0, 0.0], [5.0, 6.0], [9.0, 3.0]], [[1.0, 1.0], [20.0, 30.0], [40.0, 7.0]]]
     lightglue = Reversed()
-    matcher = KeypointMatcher(Disk(Corners(points)), lightglue)
+    matcher = KeypointMatcher(Disk(Corners(points)), lightglue, 2048)
     first, second = matcher(torch.zeros(1, 1, 45, 61), torch.zeros(1, 1, 50, 70))
     assert first.tolist() == [[0, 0], [5, 6]]
     assert second.tolist() == [[40, 7], [20, 30]]
@@ -131,7 +131,7 @@ def test_sparse_points_come_back_in_pairs_and_unmoved():
 
 
 def test_nothing_found_is_no_match():
-    matcher = KeypointMatcher(Disk(Corners([[[0.0, 0.0]], []])), Reversed())
+    matcher = KeypointMatcher(Disk(Corners([[[0.0, 0.0]], []])), Reversed(), 2048)
     first, second = matcher(torch.zeros(1, 1, 45, 61), torch.zeros(1, 1, 50, 70))
     assert first.shape == second.shape == (0, 2)
 
@@ -141,7 +141,7 @@ def test_nothing_found_is_no_match():
 
 @pytest.mark.slow
 def test_loftr_is_what_the_file_says(files):
-    matcher = load_loftr(files / "loftr.ckpt", device="cpu", min_confidence=0.0)
+    matcher = load_matcher([files / "loftr.ckpt"], device="cpu", min_confidence=0.0)
     stored = torch.load(files / "loftr.ckpt", weights_only=True)["state_dict"]
     assert not matcher.network.training
     assert all(torch.equal(value, stored[name]) for name, value in matcher.network.state_dict().items())
@@ -152,7 +152,7 @@ def test_loftr_is_what_the_file_says(files):
 
 
 def test_disk_and_lightglue_are_what_the_files_say(files, tmp_path):
-    matcher = load_disk_lightglue(files / "disk.pth", files / "lightglue.pth", device="cpu", max_keypoints=50)
+    matcher = load_matcher([files / "disk.pth", files / "lightglue.pth"], device="cpu", max_keypoints=50)
     image = picture(77, 93)
     first, second = matcher(image, image)
     assert first.shape == second.shape
@@ -168,7 +168,7 @@ def test_disk_and_lightglue_are_what_the_files_say(files, tmp_path):
     assert "self_attn.0.Wqkv.weight" in published
     published |= {f"log_assignment.{i}.r": torch.ones(1) for i in range(2)}  # left over from training
     torch.save(published, tmp_path / "published.pth")
-    again = load_disk_lightglue(files / "disk.pth", tmp_path / "published.pth", device="cpu")
+    again = load_matcher([files / "disk.pth", tmp_path / "published.pth"], device="cpu")
     assert all(torch.equal(value, now[name]) for name, value in again.lightglue.state_dict().items())
 
 
@@ -197,25 +197,26 @@ def test_aliked_is_of_the_size_of_its_file(name, tmp_path):
 
 
 def test_what_makes_no_matcher_is_told(files, tmp_path):
-    def kept(name, state):
-        torch.save(state, tmp_path / name)
-        return tmp_path / name
-
     disk, lightglue, loftr = (files / name for name in ("disk.pth", "lightglue.pth", "loftr.ckpt"))
-    wide = LightGlue(features=None, input_dim=256, n_layers=1).state_dict()
-    scaled = LightGlue(features=None, input_dim=128, n_layers=1, add_scale_ori=True).state_dict()
-    other = {"layer.weight": torch.zeros(2)}
-    for paths, words in (
-        ([], r"weights: expected the files of LoFTR, or LightGlue .* got none"),
-        ([disk], r"weights: expected .*, got DISK$"),
-        ([disk, disk], r"weights: expected .*, got DISK and DISK$"),
-        ([loftr, lightglue], r"weights: expected .*, got LightGlue and LoFTR$"),
-        ([disk, kept("a.pth", other)], r"a.pth: expected DISK, ALIKED, .* got tensors named layer.weight"),
-        ([disk, kept("b.pth", wide)], r"b.pth: expected LightGlue for descriptors of 128 numbers, .* 256"),
-        ([disk, kept("c.pth", scaled)], r"c.pth: expected LightGlue for DISK.* scales or shapes"),
+    with pytest.raises(OptionError, match=r"weights: expected the files of LoFTR, or LightGlue .* got none"):
+        load_matcher([])
+    for paths, got in (
+        ([disk], "DISK"),
+        ([disk, disk], "DISK and DISK"),
+        ([loftr, lightglue], "LightGlue and LoFTR"),
     ):
-        with pytest.raises(OptionError, match=words):
+        with pytest.raises(OptionError, match=rf"weights: expected .*, got {got}$"):
             load_matcher(paths, device="cpu")
+    torch.save({"layer.weight": torch.zeros(2)}, tmp_path / "other.pth")
+    with pytest.raises(OptionError, match=r"other.pth: expected DISK, ALIKED, .* got tensors named layer.weight"):
+        load_matcher([disk, tmp_path / "other.pth"], device="cpu")
+    torch.save(LightGlue(features=None, input_dim=256, n_layers=1).state_dict(), tmp_path / "wide.pth")
+    with pytest.raises(OptionError, match=r"wide.pth: expected LightGlue for descriptors of 128 numbers, .* 256"):
+        load_matcher([disk, tmp_path / "wide.pth"], device="cpu")
+    scaled = LightGlue(features=None, input_dim=128, n_layers=1, add_scale_ori=True)
+    torch.save(scaled.state_dict(), tmp_path / "scaled.pth")
+    with pytest.raises(OptionError, match=r"scaled.pth: expected LightGlue for DISK.* scales or shapes"):
+        load_matcher([disk, tmp_path / "scaled.pth"], device="cpu")
 
 
 # SuperPoint.
@@ -262,51 +263,61 @@ def test_a_pickle_that_runs_code_is_refused(by, tmp_path):
     else:
         path.write_bytes(pickle.dumps(Malicious(mark), protocol=2))
     with pytest.raises(OptionError, match=r"evil.pth: expected tensors alone"):
-        load_loftr(path, device="cpu")
+        load_matcher([path], device="cpu")
     assert not mark.exists()
     torch.load(path, weights_only=False) if by == "torch" else pickle.loads(path.read_bytes())
     assert mark.exists()  # it would have run
 
 
 def test_files_that_are_no_weights_are_named(files, tmp_path):
-    for path in (tmp_path / "missing.pth", tmp_path):
-        with pytest.raises(OptionError, match=rf"weights: no such file: .*{path.name}"):
-            load_loftr(path)
+    with pytest.raises(OptionError, match=r"weights: no such file: .*missing.pth"):
+        load_matcher([tmp_path / "missing.pth"])
+    with pytest.raises(OptionError, match="no such file"):
+        load_matcher([tmp_path])  # a folder
     whole = (files / "disk.pth").read_bytes()
     for name, content in {"empty.pth": b"", "text.pth": b"hello", "cut.pth": whole[: len(whole) // 2]}.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(OptionError, match=rf"\Aweights: \S*{name}[^\n]*\Z"):
-            load_loftr(tmp_path / name)
+        with pytest.raises(OptionError, match=rf"weights: \S*{name}") as caught:
+            load_matcher([tmp_path / name])
+        assert "\n" not in str(caught.value)
     for content in ([1, 2], {}, {"state_dict": {"a": 1}}, torch.zeros(3)):
         torch.save(content, tmp_path / "other.pth")
         with pytest.raises(OptionError, match=r"other.pth: expected a state dict"):
-            load_loftr(tmp_path / "other.pth")
+            load_matcher([tmp_path / "other.pth"])
 
 
 def test_weights_of_another_network_are_named(files, tmp_path):
-    with pytest.raises(OptionError, match=r"does not fit LoFTR: lacks .* more; has unknown unet\."):
-        load_loftr(files / "disk.pth", device="cpu")
+    mixed = torch.load(files / "lightglue.pth", weights_only=True)
+    lost = [name for name in mixed if name.startswith("transformers.1.")]
+    torch.save(
+        {name: mixed[name] for name in mixed if name not in lost} | {"unet.x": torch.zeros(1)},
+        tmp_path / "mixed.pth",
+    )
+    with pytest.raises(
+        OptionError, match=r"does not fit LightGlue: lacks transformers.* more; has unknown unet\.x"
+    ):
+        load_matcher([files / "disk.pth", tmp_path / "mixed.pth"], device="cpu")
     state = torch.load(files / "disk.pth", weights_only=True)["extractor"]
     name = next(iter(state))
     state[name] = state[name][:1, :1]
     torch.save(state, tmp_path / "bent.pth")
     with pytest.raises(OptionError, match=rf"does not fit DISK: has other shapes of {name}$"):
-        load_disk_lightglue(tmp_path / "bent.pth", files / "lightglue.pth", device="cpu")
+        load_matcher([tmp_path / "bent.pth", files / "lightglue.pth"], device="cpu")
 
 
 # Wrong use.
 
 
 def test_wrong_arguments_are_named(files):
-    matcher, good = Loftr(Brightest()), torch.zeros(1, 1, 20, 20)
-    for frame, crop, error, words in (
-        (good[0, 0], good, ShapeError, r"frame: expected \(1, 1, H, W\), got \(20, 20\)"),
-        (good, good.expand(2, -1, -1, -1), ShapeError, "crop"),
-        (good, good.to(torch.uint8), DtypeError, "crop: expected floating point"),
-    ):
-        with pytest.raises(error, match=words):
-            matcher(frame, crop)
+    matcher = Loftr(Brightest(), 0.5)
+    good = torch.zeros(1, 1, 20, 20)
+    with pytest.raises(ShapeError, match=r"frame: expected \(1, 1, H, W\), got \(20, 20\)"):
+        matcher(good[0, 0], good)
+    with pytest.raises(ShapeError, match="crop"):
+        matcher(good, good.expand(2, -1, -1, -1))
+    with pytest.raises(DtypeError, match="crop: expected floating point"):
+        matcher(good, good.to(torch.uint8))
     with pytest.raises(OptionError, match="min_confidence"):
-        load_loftr(files / "loftr.ckpt", min_confidence=1.5)
+        load_matcher([files / "loftr.ckpt"], min_confidence=1.5)
     with pytest.raises(OptionError, match="max_keypoints"):
-        load_disk_lightglue(files / "disk.pth", files / "lightglue.pth", max_keypoints=1)
+        load_matcher([files / "disk.pth", files / "lightglue.pth"], max_keypoints=1)

@@ -45,7 +45,7 @@ def refuse_to_refine(monkeypatch):
         monkeypatch.setattr(Refinement, name, lambda _self, _fix: None)
 
 
-def out_of_time(_self, _given):
+def out_of_time(*_):
     raise OutOfTime
 
 
