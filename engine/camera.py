@@ -155,9 +155,7 @@ class Camera:
             return cls._from_camera_info(content)
         except KeyError as error:
             raise CalibrationError(f"camera: {path} lacks the field {error.args[0]}") from None
-        except CalibrationError as error:
-            raise CalibrationError(f"camera: {path}: {error}") from None
-        except (TypeError, ValueError) as error:
+        except (CalibrationError, TypeError, ValueError) as error:
             raise CalibrationError(f"camera: {path}: {str(error).splitlines()[0]}") from None
 
     @classmethod

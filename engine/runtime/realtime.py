@@ -12,7 +12,8 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -198,26 +199,27 @@ def _pin(cores: tuple[int, ...]) -> None:
 
 
 def _use_fifo(priority: int) -> None:
-    try:
+    # Root lacks the right where the kernel has RT_GROUP_SCHED.
+    where = "; root may if its control group has real-time budget (cpu.rt_runtime_us)" if os.geteuid() == 0 else ""
+    with _permission("SCHED_FIFO", _FIFO_CURE + where):
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
-    except OSError as error:
-        if not isinstance(error, PermissionError):
-            raise BackendError(f"realtime: this system has no SCHED_FIFO: {error.strerror}") from None
-        where = ""
-        if os.geteuid() == 0:  # the kernel has RT_GROUP_SCHED
-            where = "; root may if its control group has real-time budget (cpu.rt_runtime_us)"
-        raise BackendError(f"realtime: SCHED_FIFO is not permitted; it needs {_FIFO_CURE}{where}") from None
 
 
 def _use_nice(nice: int) -> None:
-    try:
+    with _permission(f"a nice value of {nice}", _NICE_CURE):
         # What the thread starts has a nice value of 0 again.
         os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
         os.setpriority(os.PRIO_PROCESS, 0, nice)  # on Linux of the calling thread
+
+
+@contextmanager
+def _permission(what: str, cure: str) -> Iterator[None]:
+    try:
+        yield
+    except PermissionError:
+        raise BackendError(f"realtime: {what} is not permitted; it needs {cure}") from None
     except OSError as error:
-        if not isinstance(error, PermissionError):
-            raise BackendError(f"realtime: a nice value of {nice} cannot be set: {error.strerror}") from None
-        raise BackendError(f"realtime: a nice value of {nice} is not permitted; it needs {_NICE_CURE}") from None
+        raise BackendError(f"realtime: {what} cannot be set: {error.strerror}") from None
 
 
 def _check_lockable() -> None:
