@@ -132,16 +132,6 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(ground, make, f
     assert apart_m < by_fine.relative_sigma_m
 
 
-def test_a_refinement_that_is_abandoned_leaves_the_coarse_fix(ground, make, frame, prior, monkeypatch):
-    def out_of_time(self, fix):
-        raise OutOfTime
-
-    monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
-    fix = make("ncc").locate(frame, prior, HURRY)
-    assert off_m(ground, fix) < 3.0
-    assert fix.stage == "coarse"
-
-
 @pytest.mark.parametrize(
     ("reason", "off_m", "is_fixed"),
     [
@@ -198,17 +188,24 @@ def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_coarser_level(
     assert (fix.relative_sigma_m > 3.5) == (fix.stage == "coarse")
 
 
-def test_refinement_at_once_is_begun_only_where_there_is_time_for_it(ground, make, frame, prior, monkeypatch):
+@pytest.mark.parametrize("abandoned", [True, False])
+def test_refinement_at_once_that_is_abandoned_or_has_no_time_leaves_the_coarse_fix(
+    ground, make, frame, prior, monkeypatch, abandoned
+):
     """What comes before it may have taken longer than thought."""
-    matcher = make("ncc")
-    by_coarse_peak = Ncc._by_coarse_peak
+    matcher, by_coarse_peak = make("ncc"), Ncc._by_coarse_peak
 
     def slow(self, query):
         found = by_coarse_peak(self, query)
-        matcher._costs.per_unit = {"refinement": 1e9, "ncc": 1e9}
+        matcher._costs.per_unit = {} if abandoned else {"refinement": 1e9, "ncc": 1e9}
         return found
 
+    def out_of_time(self, fix):
+        raise OutOfTime
+
     monkeypatch.setattr(Ncc, "_by_coarse_peak", slow)
+    if abandoned:
+        monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
     fix = matcher.locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 3.0
     assert fix.stage == "coarse"
