@@ -101,6 +101,16 @@ def sim_flight(sim_town):
 
 
 @pytest.fixture(scope="session")
+def flight(tmp_path_factory):
+    """The folder of a flight of six frames, to be read and not written."""
+    from scenematch.runs.simulation import write_flight
+
+    folder = tmp_path_factory.mktemp("flight")
+    write_flight(folder, plan_flight(town=drawn_town(), frames=6))
+    return folder
+
+
+@pytest.fixture(scope="session")
 def sim_site(sim_town):
     """The town's map with its surface model."""
     return site_of(sim_town)

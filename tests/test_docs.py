@@ -5,17 +5,16 @@ import tomllib
 from collections import Counter
 
 import pytest
-from typer.main import get_command
 
 from docs.draw_architecture import drawn, members, picture
 from docs.site_commands import with_options
 from docs.site_roles import on_page_content
 from engine.options import AssumedErrors, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, SiftOptions
 from engine.values import Reason
-from scenematch.cli.app import app
 from scenematch.files.track import COLUMNS
 from scenematch.runs.simulation import write_flight
 from scenematch.simulator import plan_flight
+from tests.cli.test_json import LEAVES
 from tests.support.paths import ROOT
 from tests.support.towns import drawn_town
 
@@ -189,23 +188,15 @@ def test_columns_of_the_track_are_listed():
 
 def test_every_command_has_its_section():
     stated = set(re.findall(r"^## (.+)$", read("docs/command-line.md"), re.MULTILINE))
-    commands = {(info.callback.__name__ if info.callback else "") for info in app.registered_commands}
-    for group in app.registered_groups:
-        commands |= {f"{group.name} {info.name}" for info in group.typer_instance.registered_commands}
-    assert stated == commands
+    assert stated == {" ".join(words) for words, _ in LEAVES}
 
 
 def command_options():
     """Options by command, without those that the page tells once for all."""
-    pending = [("", get_command(app))]
-    while pending:
-        name, command = pending.pop()
-        if hasattr(command, "commands"):
-            pending += [(f"{name} {word}".strip(), each) for word, each in command.commands.items()]
-            continue
+    for name, command in LEAVES:
         words = {word for option in command.params for word in (*option.opts, *option.secondary_opts)}
         options = {word for word in words if word.startswith("--")}
-        yield name, sorted(options - {"--help", "--json", "--force"})
+        yield " ".join(name), sorted(options - {"--help", "--json", "--force"})
 
 
 @pytest.mark.parametrize(("command", "options"), sorted(command_options()), ids=lambda value: str(value)[:20])

@@ -61,34 +61,14 @@ def fresh():
     return {"printed": before + done.stderr, **json.loads(found)}
 
 
-def test_importing_the_engine_prints_nothing(fresh):
+def test_importing_the_engine_prints_nothing_and_its_names_load_what_they_use_alone(fresh):
     assert fresh["printed"] == ""
-
-
-def test_importing_the_engine_alone_loads_no_package(fresh):
     assert not HEAVY.intersection(fresh["bare"])
-
-
-def test_values_options_cameras_and_maps_need_no_torch(fresh):
     assert "numpy" in fresh["values"]
     assert not {"torch", *UNUSED}.intersection(fresh["values"])
-
-
-@pytest.mark.parametrize("package", UNUSED)
-def test_the_public_names_do_not_load(fresh, package):
-    assert package not in fresh["loaded"]
-
-
-def test_nothing_of_rerun_is_loaded_where_nobody_watches(fresh):
-    assert fresh["rerun"] is False
-
-
-def test_the_public_names_do_not_touch_the_gpu(fresh):
-    assert fresh["cuda"] is False
-
-
-def test_the_engine_loads_nothing_of_the_product(fresh):
+    assert not set(UNUSED).intersection(fresh["loaded"])
     assert not [name for name in fresh["modules"] if name.split(".")[0] == "scenematch"]
+    assert (fresh["rerun"], fresh["cuda"]) == (False, False)
 
 
 def test_functions_on_tensors_are_reached_through_their_modules(fresh):

@@ -43,12 +43,9 @@ from scenematch.files.ros.messages import (
 from scenematch.runs.cameras import CameraInput
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
 from tests.support.fixes import a_fix
 from tests.support.ground import body_axes
 from tests.support.odometries import odometry_message, twist_message
-from tests.support.towns import drawn_town
 
 STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
 NOW_NS = 1_700_000_000_123_456_789
@@ -74,14 +71,6 @@ def ros(request):
 @pytest.fixture
 def maker(ros):
     return maker_of(ros)
-
-
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """A folder with a map and a camera."""
-    folder = tmp_path_factory.mktemp("flight")
-    write_flight(folder, plan_flight(town=drawn_town(), frames=1))
-    return folder
 
 
 # ------------------------------------------------------------------------------------------------- pictures

@@ -8,10 +8,7 @@ import tomllib
 import pytest
 
 from scenematch.cli.app import run
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
 from tests.support.paths import ROOT
-from tests.support.towns import drawn_town
 
 OF_DESKS = ("matplotlib",)
 """The packages of the extra `desk`."""
@@ -24,13 +21,6 @@ scenematch.runs.mavlink_bridge._AUTOPILOT_TIMEOUT_S = 0.1  # there is none
 from scenematch.cli.app import run
 print("CODES", json.dumps([run(line) for line in {lines}]))
 """
-
-
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("flight")
-    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
-    return folder
 
 
 @pytest.fixture

@@ -21,28 +21,17 @@ from scenematch.cli import console
 from scenematch.cli.app import run
 from scenematch.files.geotiff import write_geotiff
 from scenematch.runs import tracking as track_module
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
-from tests.support.towns import drawn_town
 
 COLUMNS = (
     "timestamp_ns,frame,status,reason,lat_deg,lon_deg,east_m,north_m,up_m,sigma_east_m,sigma_north_m,"
     "covariance_en_m2,score,method,window_width_px,window_height_px,latency_ms,deadline_met"
 )
-FRAMES = 6
+FRAMES = 6  # of `flight`
 FILES = {"map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames",
          "telemetry": "telemetry.csv"}  # fmt: skip
 WRITTEN = {"track.csv", "summary.json", "notes.csv", "report.html"}
 pytestmark = pytest.mark.usefixtures("bare_runs")  # but for `done`, which is drawn before it
 SCRIPT = Path(sys.executable).with_name("scenematch")
-
-
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """A flight folder of six frames, to be read and not written."""
-    folder = tmp_path_factory.mktemp("flight")
-    write_flight(folder, plan_flight(town=drawn_town(), frames=FRAMES))
-    return folder
 
 
 @pytest.fixture

@@ -154,23 +154,18 @@ def test_an_error_of_somebody_elses_code_is_theirs_and_names_the_frame(ground, c
     assert "It is of frames[0]." in caught.value.__notes__
 
 
-def test_workers_are_refused_by_what_there_is(matchers, ground, camera, questions, monkeypatch):
-    frames, priors = questions
+def test_workers_are_refused_by_what_there_is(matchers, ground, questions, monkeypatch):
     matcher = matchers["ncc"]
-    with pytest.raises(OptionError, match=r"^workers: expected 1 or more, got 0$"):
-        matcher.locate_many(frames, priors, workers=0)
-    with monkeypatch.context() as patch:
-        patch.setattr("engine.runtime.workers.sys.platform", "darwin")
-        with pytest.raises(OptionError, match=r"^workers: expected 1 here: only Linux forks"):
-            matcher.locate_many(frames, priors, workers=2)
-    with monkeypatch.context() as patch:
-        patch.setattr(matcher, "device", torch.device("cuda:0"))
-        with pytest.raises(OptionError, match=r"^workers: expected 1 on cuda:0, got 2$"):
-            matcher.locate_many(frames, priors, workers=2)
-    with monkeypatch.context() as patch:
-        patch.setattr(type(ground.site), "reads_files", True)
-        with pytest.raises(OptionError, match=r"^workers: expected 1 with .*, which is read from its file"):
-            matcher.locate_many(frames, priors, workers=2)
+    for owner, name, value, workers, words in (
+        (matcher, "device", matcher.device, 0, r"1 or more, got 0$"),
+        (processes.sys, "platform", "darwin", 2, r"1 here: only Linux forks"),
+        (matcher, "device", torch.device("cuda:0"), 2, r"1 on cuda:0, got 2$"),
+        (type(ground.site), "reads_files", True, 2, r"1 with .*, which is read from its file"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, value)
+            with pytest.raises(OptionError, match=rf"^workers: expected {words}"):
+                matcher.locate_many(*questions, workers=workers)
 
 
 def test_nothing_is_forked_beside_other_threads():

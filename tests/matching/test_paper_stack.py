@@ -85,8 +85,8 @@ def test_the_nose_is_north_and_the_ground_is_under_it_as_each_plugin_has_its_wor
 
 
 def test_steps_are_short_enough_for_arducopters_loop():
-    for path, name in ((STACK / "worlds/paper.world", "physics"), (ROS2 / "worlds/paper.sdf", "physics")):
-        assert float(ElementTree.parse(path).getroot().find(f".//{name}/max_step_size").text) <= 1.0 / 800.0
+    for path in (STACK / "worlds/paper.world", ROS2 / "worlds/paper.sdf"):
+        assert float(ElementTree.parse(path).getroot().find(".//physics/max_step_size").text) <= 1.0 / 800.0
 
 
 def test_the_topics_of_the_bridge_are_those_of_the_models_and_the_node():
@@ -112,15 +112,16 @@ class Parameters:
         return self.given.get(name, default)
 
 
-def ros2_node_module():
-    spec = importlib.util.spec_from_file_location("ros2_node", ROS2 / "scenematch_ros/node.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+def loaded(path):
+    """A script of the stack as a module, whatever its name."""
+    loader = importlib.machinery.SourceFileLoader(f"stack_{path.stem}", str(path))
+    module = importlib.util.module_from_spec(importlib.util.spec_from_loader(loader.name, loader))
+    loader.exec_module(module)
     return module
 
 
 def test_the_node_of_ros_2_takes_the_parameters_of_its_file():
-    module = ros2_node_module()
+    module = loaded(ROS2 / "scenematch_ros/node.py")
     node = Parameters(map="site.tif", method="ncc", image_topic="down/image_raw", deadline_ms=200.0)
     ros, matching = module.settings_of(node)
     assert (str(ros.map.map), ros.version, ros.topics.image, matching.method, matching.deadline_ms) == (
@@ -150,9 +151,7 @@ def test_the_simulated_camera_is_the_calibrated_one(stack):
 @pytest.fixture(scope="module")
 def ground(tmp_path_factory, sim_town):
     """The model of a simulated town, the map that it was made of, and the mesh as a reader of the file has it."""
-    spec = importlib.util.spec_from_file_location("make_world", STACK / "make_world.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = loaded(STACK / "make_world.py")
     folder = tmp_path_factory.mktemp("world")
     write_geotiff(folder / "map.tif", sim_town.ortho, sim_town.pixel_to_crs, sim_town.crs_epsg)
     write_geotiff(
@@ -201,13 +200,6 @@ def test_the_picture_is_the_maps(ground, sim_town):
     assert (folder / "meshes" / named).resolve() == (folder / "materials/textures/map.png").resolve()
 
 
-def script(name):
-    loader = importlib.machinery.SourceFileLoader(f"stack_{name}", str(STACK / "scripts" / name))
-    module = importlib.util.module_from_spec(importlib.util.spec_from_loader(loader.name, loader))
-    loader.exec_module(module)
-    return module
-
-
 @pytest.fixture
 def truth_script(monkeypatch):
     """scripts/truth without ROS."""
@@ -219,7 +211,7 @@ def truth_script(monkeypatch):
         for one in classes:
             setattr(module, one, SimpleNamespace)
         monkeypatch.setitem(sys.modules, f"{name}.msg", module)
-    return script("truth")
+    return loaded(STACK / "scripts/truth")
 
 
 def test_the_truth_is_the_vehicles_in_degrees_as_ardupilot_has_them(truth_script):
@@ -256,7 +248,7 @@ def test_positions_in_a_bag_are_compared_with_its_truth(tmp_path, capsys, monkey
                 write(topic, maker.position(time_ns, "", *map(float, place), np.eye(3)), time_ns)
             write("/truth/height_agl", maker.float64(100.0), time_ns)
     monkeypatch.setattr(sys, "argv", ["compare", str(tmp_path / "flight.bag")])
-    script("compare").main()
+    loaded(STACK / "scripts/compare").main()
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[1:]]
     assert [(row[0], row[1], row[2], row[3], row[-1]) for row in rows] == [
         ("scenematch", "20", "10.0", "1.50", "0"),

@@ -54,13 +54,13 @@ def test_the_maps_error_cancels_between_fixes_on_it():
     assert navigator.prediction.sigma_m == pytest.approx(math.sqrt(0.5 + 9.0))  # of a place in the world
 
 
-def test_a_position_of_another_source_is_searched_with_the_maps_error():
+@pytest.mark.parametrize("is_start", [True, False])
+def test_a_position_of_another_source_is_searched_with_the_maps_error(is_start):
     """Known to centimetres in the world, it is known to 3 m on a map that states nothing."""
-    centimetres = [Prior(east_m=4.0, north_m=3.0, sigma_m=0.02)]
-    script = scripted((0.0, 0.0))
-    navigator = Navigator(script)
-    assert isinstance(navigator.update(Frame(IMAGE, 0, 100.0, 0.0, **STILL), centimetres[0]), Fix)
-    assert script.priors[0].sigma_m == pytest.approx(3.0, rel=1e-3)
+    known, matcher = Prior(east_m=4.0, north_m=3.0, sigma_m=0.02), scripted((0.0, 0.0))
+    start, given = (known, None) if is_start else (None, known)
+    assert isinstance(Navigator(matcher, start).update(Frame(IMAGE, 0, 100.0, 0.0, **STILL), given), Fix)
+    assert matcher.priors[0].sigma_m == pytest.approx(3.0, rel=1e-3)
 
 
 def test_the_offset_is_estimated_in_flight_and_moves_no_fix():

@@ -70,12 +70,18 @@ def seen(moved_m, begin=LEVEL, end=None):
     return motion_between(*shown)
 
 
-def noisy(image, sigma, rng=np.random.default_rng(9)):  # noqa: B008
+def noisy(image, sigma, rng=None):
+    rng = rng or np.random.default_rng(9)
     return np.clip(np.round(image + rng.normal(0.0, sigma, image.shape)), 0, 255).astype(np.uint8)
 
 
+def between(first, second, camera=CAMERA):
+    """The motion between two pictures."""
+    return motion_between(frame(first), frame(second, INTERVAL_S), camera)
+
+
 def refused(first, second, reason):
-    motion = motion_between(first, second)
+    motion = between(first, second) if isinstance(first, np.ndarray) else motion_between(first, second)
     assert isinstance(motion, NoMotion)
     assert reason in motion.reason
 
@@ -135,14 +141,14 @@ def test_a_distorting_lens_shows_the_same_motion():
     images = [
         cv2.remap(picture(place, LEVEL, camera=wide), at, None, cv2.INTER_LINEAR) for place in ((0, 0), (9, 5))
     ]
-    motion = motion_between(frame(images[0]), frame(images[1], INTERVAL_S), camera=lens)
+    motion = between(*images, camera=lens)
     assert motion.moved_m == pytest.approx([9.0, 5.0], abs=0.3)
 
 
 def test_large_pictures_are_followed_smaller_with_the_same_answer():
     camera = Camera.from_fov(1280, 960, 60.0)
     images = [picture(place, LEVEL, camera=camera) for place in ((0, 0), (6, -7))]
-    motion = motion_between(frame(images[0]), frame(images[1], INTERVAL_S), camera=camera)
+    motion = between(*images, camera=camera)
     assert motion.moved_m == pytest.approx([6.0, -7.0], abs=0.3)
 
 
@@ -150,7 +156,7 @@ def test_something_fixed_to_the_camera_does_not_stop_the_ground():
     moved = [picture(place, LEVEL) for place in ((0, 0), (10, 0))]
     for image in moved:
         image[:80, :120] = GROUND[:80, :120]
-    assert motion_between(frame(moved[0]), frame(moved[1], INTERVAL_S)).moved_m == pytest.approx([10, 0], abs=0.3)
+    assert between(*moved).moved_m == pytest.approx([10, 0], abs=0.3)
 
 
 # What is refused
@@ -158,15 +164,11 @@ def test_something_fixed_to_the_camera_does_not_stop_the_ground():
 
 def test_pictures_that_show_no_one_motion_are_refused():
     rng = np.random.default_rng(1)
-    ground = picture((0, 0), LEVEL)
-    refused(
-        frame(np.full((240, 320), 90, np.uint8)), frame(np.full((240, 320), 91, np.uint8), INTERVAL_S), "0 points"
-    )
-    waves = [picture((0, 0), LEVEL, ground=texture(seed)) for seed in (1, 2)]
-    refused(frame(waves[0]), frame(waves[1], INTERVAL_S), "agree on one motion")
+    refused(*(np.full((240, 320), level, np.uint8) for level in (90, 91)), "0 points")
+    refused(*(picture((0, 0), LEVEL, ground=texture(seed)) for seed in (1, 2)), "agree on one motion")
     dark = [np.clip(rng.normal(6.0, 2.0, (240, 320)), 0, 255).astype(np.uint8) for _ in range(2)]
-    refused(frame(dark[0]), frame(dark[1], INTERVAL_S), "agree on one motion")
-    refused(frame(ground), frame(ground, INTERVAL_S), "repeats the last one")
+    refused(*dark, "agree on one motion")
+    refused(*[picture((0, 0), LEVEL)] * 2, "repeats the last one")
 
 
 def test_what_is_fixed_to_the_camera_over_water_is_no_hover():
@@ -174,7 +176,7 @@ def test_what_is_fixed_to_the_camera_over_water_is_no_hover():
     shown = [np.full((240, 320), grey, np.uint8) for grey in (90, 92)]
     for image in shown:
         image[:80, :100] = GROUND[:80, :100]
-    refused(frame(shown[0]), frame(shown[1], INTERVAL_S), "small part")
+    refused(*shown, "small part")
 
 
 def test_telemetry_that_does_not_support_a_motion_is_refused():
@@ -185,15 +187,13 @@ def test_telemetry_that_does_not_support_a_motion_is_refused():
     refused(first, replace(second, timestamp_ns=9_000_000_000), "9.0 s apart")
     refused(first, replace(second, east_velocity_mps=1.0, north_velocity_mps=1.0), "velocity is known")
     refused(replace(first, pitch_deg=55.0), replace(second, pitch_deg=55.0), "too obliquely")  # 78 at an edge
-    assert isinstance(
-        motion_between(replace(first, pitch_deg=40.0), replace(second, pitch_deg=40.0)), GroundMotion
-    )
+    oblique = (replace(shown, pitch_deg=40.0) for shown in (first, second))
+    assert isinstance(motion_between(*oblique), GroundMotion)
 
 
 def test_a_velocity_that_is_too_uncertain_is_refused(monkeypatch):
     monkeypatch.setattr("engine.navigation.odometry._MAX_SIGMA_MPS", 1e-6)
-    shown = frame(picture((0, 0), LEVEL)), frame(picture((5, 0), LEVEL), INTERVAL_S)
-    assert "uncertain" in motion_between(*shown).reason
+    assert "uncertain" in between(picture((0, 0), LEVEL), picture((5, 0), LEVEL)).reason
 
 
 @pytest.mark.parametrize("as_given", [np.asarray, torch.from_numpy])

@@ -35,7 +35,8 @@ SECOND = 1_000_000_000
 SPEED_PX_S = 10
 METHODS = ("ncc", "sift", "auto")
 
-IMAGES = ("right", "noise", "flat", "black", "saturated", "small", "float", "rgba", "empty")
+LEVELS = {"flat": 90, "black": 0, "saturated": 255}
+IMAGES = ("right", "noise", *LEVELS, "small", "float", "rgba", "empty")
 STAMPS = ("next", "gap", "same", "before", "long before", "none", "far future")
 PRIORS = ("none", "right", "wide", "wrong", "off the map", "far away", "NaN", "both", "negative")
 TELEMETRY = (
@@ -83,19 +84,16 @@ class Ground:
         """The frame of a step; the vehicle flies along the map's diagonal and back."""
         x = y = self.corner_px(time_ns)
         image: Any = self.gray[y : y + SIDE_PX, x : x + SIDE_PX]
-        if step.image == "noise":
-            image = np.random.default_rng(abs(time_ns)).integers(0, 256, image.shape, dtype=np.uint8)
-        elif step.image in ("flat", "black", "saturated"):
-            image = np.full_like(image, {"flat": 90, "black": 0, "saturated": 255}[step.image])
-        elif step.image == "small":
-            image = image[: SIDE_PX // 2]
-        elif step.image == "float":
-            image = image.astype(np.float32)
-        elif step.image == "rgba":
-            image = np.repeat(image[..., None], 4, axis=2)
-        elif step.image == "empty":
-            image = image[:0]
-        return Frame(image, stamp_ns, **self.telemetry(step))
+        images = {
+            "right": image,
+            "noise": np.random.default_rng(abs(time_ns)).integers(0, 256, image.shape, dtype=np.uint8),
+            **{name: np.full_like(image, level) for name, level in LEVELS.items()},
+            "small": image[: SIDE_PX // 2],
+            "float": image.astype(np.float32),
+            "rgba": np.repeat(image[..., None], 4, axis=2),
+            "empty": image[:0],
+        }
+        return Frame(images[step.image], stamp_ns, **self.telemetry(step))
 
     def telemetry(self, step: Step) -> dict[str, float | None]:
         """Of a step, by the names of :class:`engine.Frame`."""
@@ -139,9 +137,9 @@ class Ground:
 def stamp_after(kind: str, newest_ns: int, number: int) -> int | None:
     """The stamp of a step after the newest that came."""
     steps_s = {"next": 0.2, "gap": 60.0, "same": 0.0, "before": -0.3, "long before": -500.0, "far future": 1e8}
-    return (
-        None if kind == "none" else newest_ns + round(steps_s[kind] * SECOND) + (number if kind == "before" else 0)
-    )
+    if kind == "none":
+        return None
+    return newest_ns + round(steps_s[kind] * SECOND) + number * (kind == "before")
 
 
 def fly(ground: Ground, steps: Sequence[Step], method: str, *, start: bool) -> Counter[str]:
