@@ -286,7 +286,11 @@ class Looks:
         """Every level that is finer than the answer."""
         if answer is not None and not is_coarse(answer):
             return {}
-        return dict(list(self._works.items())[: None if answer is None else -1])
+        if answer is None:
+            return self._works
+        # Beside a coarse fix a finer level that does not fit is not missed, so its cost shall not fade.
+        *finer, _ = self._works.items()
+        return {step: work for step, work in finer if self.query.scheduler.can_afford({step: work})}
 
     def _look_coarsely(self, answer: Result | None, step: Hashable) -> Result | None:
         """The peak of the coarsest level, if it is accepted; a refusal says nothing, as finer levels show more."""
