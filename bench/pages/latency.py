@@ -61,8 +61,7 @@ TABLE_ONE = (
 )
 STARTUP = (
     "From the start of the process to the first fix, each start in a process of its own. *All kept* is every "
-    "start after the first on a machine: compiled code and the map's features lie in caches. An interpreter "
-    "that has torch loaded already spares the first two parts."
+    "start after the first on a machine: compiled code and the map's features lie in caches."
 )
 ENTRIES = (
     "Help, completion and `import engine` alone load neither torch nor any other large package; cameras, frames "
