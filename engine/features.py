@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.runtime.device import CPU, Device, Picture, as_float, as_tensor, element_type, like, on_host
+from engine.runtime.device import Device, Picture, as_float, as_tensor, device_of, element_type, like, on_host
 from engine.sift import BACKENDS
 from engine.sift.matching import match
 from engine.sift.scale_space import octaves_of
@@ -92,11 +92,6 @@ def sift(
         pictures = np.ascontiguousarray(pictures.clip(-_MAX_MAGNITUDE, _MAX_MAGNITUDE))
         found = loops.find_features(pictures, None if mask is None else on_host(mask), choice)
     return Features(*(like(images, values) for values in fields_of(found)))
-
-
-def device_of(picture: Picture) -> Device | torch.device:
-    """The device that an array or a tensor is on."""
-    return CPU if isinstance(picture, np.ndarray) else picture.device
 
 
 def chosen_backend(backend: str, device: Device | torch.device) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import ShapeError
-from engine.runtime.device import Picture, on_host
+from engine.runtime.device import Picture, device_of, on_host
 from engine.values import Peak
 
 # Of surfaces with more positions than this only the best of every tile is a candidate.
@@ -79,7 +79,7 @@ def find_peak(scores: Picture, *, exclusion_px: float) -> Peak:
     if scores.ndim != 2 or 0 in scores.shape:
         raise ShapeError(f"scores: expected (H, W) with no empty axis, got {tuple(scores.shape)}")
     height, width = scores.shape
-    if isinstance(scores, np.ndarray) or scores.device.type == "cpu":
+    if device_of(scores).type == "cpu":
         around = on_host(scores)
         y, x = row, column = divmod(int(around.argmax()), width)
         score, second = float(around[y, x]), _second_score(around, x, y, exclusion_px)

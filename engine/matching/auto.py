@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from engine.matching.acceptance import agree_in_height, agree_in_place, offset_between_m
 from engine.matching.explanation import Explanation
-from engine.matching.ladder import is_coarse
+from engine.matching.ladder import is_coarse, is_late
 from engine.matching.method import Method
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
@@ -75,10 +74,10 @@ class Auto(Method):
         first = self.ncc.locate(query, widely=False)  # SIFT finds the heading by itself
         # A coarse pose is not refined yet: SIFT's will be.
         agrees = partial(_agree, first) if isinstance(first, Fix) and not is_coarse(first) else None
-        with query.scheduler.with_fix() if isinstance(first, Fix) else nullcontext():
+        with query.scheduler.with_fix(isinstance(first, Fix)):
             second = self.sift.locate(query, agrees)
         if isinstance(first, NoFix):
-            return first if isinstance(second, NoFix) and second.reason is Reason.LATE else second
+            return first if is_late(second) else second
         if isinstance(second, NoFix):
             return first
         offset_m = offset_between_m(first, second)

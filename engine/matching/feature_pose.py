@@ -92,8 +92,10 @@ class FeatureMatcher:
         refusal = self.query.refuse_flat(self.method, self.options.min_deviation)
         return refusal or self._find_with(next(self._attempts())[1])
 
-    def judge(self, found: PoseCandidate) -> Fix | NoFix:
-        """The fix if its pose is accepted, else a refusal."""
+    def judge(self, found: PoseCandidate | NoFix) -> Fix | NoFix:
+        """The fix if there is a pose and it is accepted, else a refusal."""
+        if isinstance(found, NoFix):
+            return found
         fix, refusal = found.fix, judge_pose(found.evidence, self.query.risk)
         if refusal is None:
             return fix

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeGuard
 
 from engine.matching.query import Query
 from engine.runtime.scheduler import OutOfTime, Scheduler
-from engine.values import Fix, Result
+from engine.values import Fix, NoFix, Reason, Result
 
 Works = Mapping[Hashable, float]
 """Steps, as the scheduler knows them, by their work."""
@@ -44,11 +44,13 @@ def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Result:
         if not query.scheduler.deadline.met:
             break  # no step is refused for its cost
         works = rung.offers(answer)
-        with query.scheduler.with_fix() if isinstance(answer, Fix) else nullcontext(), suppress(OutOfTime):
+        with query.scheduler.with_fix(isinstance(answer, Fix)), suppress(OutOfTime):
             step = _affordable(query.scheduler, works)
             if step is not None:
                 with query.scheduler.costed(step, works[step]):
-                    answer = rung.look(answer, step) or answer
+                    looked = rung.look(answer, step)
+                if looked is not None and not (isinstance(answer, Fix) and is_late(looked)):
+                    answer = looked
     return answer or query.refuse_late(method)
 
 
@@ -64,6 +66,11 @@ def rehearse(query: Query, rung: Rung, answer: Result | None) -> list[Result | N
 def is_coarse(answer: Result | None) -> TypeGuard[Fix]:
     """Whether the answer is a fix at reduced resolution."""
     return isinstance(answer, Fix) and answer.stage == "coarse"
+
+
+def is_late(answer: Result | None) -> bool:
+    """Whether the answer is a refusal for lack of time."""
+    return isinstance(answer, NoFix) and answer.reason is Reason.LATE
 
 
 def _affordable(scheduler: Scheduler, works: Works) -> Hashable | None:

@@ -19,7 +19,7 @@ from engine.matching.views import map_px_per_pixel
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.values import Fix, NoFix, Result, Window
+from engine.values import Fix, Result, Window
 
 METHOD = "learned"
 _REDUCED = (1.0, 0.5)  # of the scale at which the frame is matched; the smaller if time is short
@@ -63,8 +63,7 @@ class Learned(Method):
     def _match(self, query: Query, answer: Result | None, step: Hashable) -> Result:
         assert isinstance(step, tuple)
         matcher = self._feature_matcher(query, step[1])
-        found = matcher.find()
-        result = found if isinstance(found, NoFix) else matcher.judge(found)
+        result = matcher.judge(matcher.find())
         return replace(result, stage="coarse") if step[1] < 1.0 and isinstance(result, Fix) else result
 
     def explain(self, query: Query, window: Window) -> Explanation:

@@ -14,7 +14,7 @@ from engine.matching.acceptance import agree_in_place, judge_peak, offset_betwee
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
 from engine.matching.evidence import is_beyond_doubt
 from engine.matching.explanation import Explanation, explain_correlation
-from engine.matching.ladder import Rung, Works, climb, is_coarse, rehearse
+from engine.matching.ladder import Rung, Works, climb, is_coarse, is_late, rehearse
 from engine.matching.method import Method
 from engine.matching.oblique import is_ground_below, is_oblique
 from engine.matching.peak_evidence import (
@@ -172,8 +172,10 @@ class Ncc(Method):
         second = correlator.search(again, window, quick_look(correlator, again, window))
         return (peak, aligned) if second is None else (second, again)
 
-    def judge(self, query: Query, found: PeakCandidate) -> Result:
-        """The fix if its peak is accepted, else a refusal."""
+    def judge(self, query: Query, found: PeakCandidate | NoFix) -> Result:
+        """The fix if there is a peak and it is accepted, else a refusal."""
+        if isinstance(found, NoFix):
+            return found
         refusal = judge_peak(found.peak, found.evidence, query.risk, is_tested=found.is_tested)
         if refusal is not None:
             return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
@@ -256,7 +258,7 @@ class Looks:
     def settled(self, answer: Result) -> Result:
         """The ladder's answer, or the refusal of the finer level if that contradicts a coarse fix."""
         refusal = self._refusal
-        if not is_coarse(answer) or refusal is None or refusal.reason is Reason.LATE:
+        if not is_coarse(answer) or refusal is None or is_late(refusal):
             return answer
         is_same = refusal.match is not None and self._is_same(answer, refusal.match)
         return answer if is_same else refusal
@@ -294,8 +296,7 @@ class Looks:
 
     def _look_coarsely(self, answer: Result | None, step: Hashable) -> Result | None:
         """The peak of the coarsest level, if it is accepted; a refusal says nothing, as finer levels show more."""
-        found = self._find(step)
-        result = found if isinstance(found, NoFix) else self._ncc.judge(self.query, found)
+        result = self._ncc.judge(self.query, self._find(step))
         return replace(result, stage="coarse") if isinstance(result, Fix) else None
 
     def _correlate(self, answer: Result | None, step: Hashable) -> Result | None:
@@ -328,7 +329,7 @@ class Looks:
     ) -> Result | None:
         """The fix of a peak, or its refusal, which names the first look's match and leaves a coarse fix alone."""
         query, height_m = self.query, self.query.telemetry.height_agl_m
-        result = found if isinstance(found, NoFix) else self._ncc.judge(query, found)
+        result = self._ncc.judge(query, found)
         if isinstance(result, NoFix):
             self._refusal = replace(result, match=None if isinstance(first, NoFix) else first.fix)
             return None if isinstance(answer, Fix) else self._refusal

@@ -22,7 +22,7 @@ from engine.matching.views import coarser_scale, drawn_px
 from engine.options import MatcherOptions, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.values import Fix, NoFix, Reason, Result, Window
+from engine.values import Fix, NoFix, Result, Window
 
 _REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched; the smaller if time is short
 _FEW_SHARE = 0.5  # of the keypoints, if a pose is refined from few
@@ -112,18 +112,17 @@ class Sift(Method):
         looks = Looks(self, query, agrees)
         return looks.settled(climb(query, METHOD, looks.rungs))
 
-    def few_scale(self, query: Query) -> float | None:
-        """The frame's scale for few features; None if they are not wanted or the map has no such level."""
+    def few_options(self, query: Query) -> SiftOptions | None:
+        """Of few features, at their scale; None if they are not wanted or the map has no such level."""
         height_m = query.telemetry.height_agl_m
         if query.prior is None or height_m is None or not self.options.upright or not self.can_refine(query):
             return None
-        return coarser_scale(query, height_m, self.options.scale)
+        scale = coarser_scale(query, height_m, self.options.scale)
+        return None if scale is None else replace(self._few, scale=scale)
 
-    def find_few(self, query: Query) -> PoseCandidate | NoFix:
+    def find_few(self, query: Query, options: SiftOptions) -> PoseCandidate | NoFix:
         """The pose by half as many keypoints, a level coarser and not upsampled."""
-        scale = self.few_scale(query)
-        assert scale is not None  # or few features are not wanted
-        return FeatureMatcher(query, self.landmarks, replace(self._few, scale=scale)).find_at_once()
+        return FeatureMatcher(query, self.landmarks, options).find_at_once()
 
     def can_refine(self, query: Query) -> bool:
         """Whether poses are refined: only with trusted telemetry over a surface model."""
@@ -154,8 +153,8 @@ class Sift(Method):
         """
         return FeatureMatcher(query, self.landmarks, options or self.options).find()
 
-    def judge(self, query: Query, found: PoseCandidate) -> Result:
-        """The fix if its pose is accepted, else a refusal."""
+    def judge(self, query: Query, found: PoseCandidate | NoFix) -> Result:
+        """The fix if there is a pose and it is accepted, else a refusal."""
         return FeatureMatcher(query, self.landmarks, self.options).judge(found)
 
     def works(self, query: Query) -> Works:
@@ -172,8 +171,7 @@ class Sift(Method):
     def at_scale(self, query: Query, share: float) -> Result:
         """The fix by all features at a share of the usual scale, not refined; or its refusal."""
         options = self.options if share == 1.0 else replace(self.options, scale=self.options.scale * share)
-        found = self.find(query, options)
-        result = found if isinstance(found, NoFix) else self.judge(query, found)
+        result = self.judge(query, self.find(query, options))
         return replace(result, stage="coarse") if share < 1.0 and isinstance(result, Fix) else result
 
 
@@ -189,6 +187,7 @@ class Looks:
     def __init__(self, sift: Sift, query: Query, agrees: Callable[[Fix], bool] | None = None) -> None:
         self._sift, self._query, self._agrees = sift, query, agrees
         self._few: Fix | None = None
+        self._few_options = sift.few_options(query)
         self._is_settled = self._is_unrefinable = False
         self._works, frame_px = sift.works(query), float(query.gray.size)
         self.few = Rung(self._if_few_suffice, self._by_few)
@@ -218,21 +217,20 @@ class Looks:
 
     def _if_few_suffice(self, answer: Result | None) -> Works:
         """Few features, if time allows all of them as well, or only few."""
-        query, scheduler = self._query, self._query.scheduler
-        if self._sift.few_scale(query) is None:
+        if self._few_options is None:
             return {}
-        few: Works = {_FEW: next(iter(self._works.values()))}
-        *_, least = self._works.items()
-        if scheduler.has_fix or not scheduler.can_afford(dict([least])):
-            return few
-        if scheduler.can_afford({**few, **dict([least])}):
-            return few
+        (_, work), *_, (least, least_work) = self._works.items()
+        scheduler = self._query.scheduler
+        is_only = scheduler.has_fix or not scheduler.can_afford({least: least_work})
+        if is_only or scheduler.can_afford({_FEW: work, least: least_work}):
+            return {_FEW: work}
         scheduler.note_refusal(_FEW)
         return {}
 
     def _by_few(self, answer: Result | None, step: Hashable) -> Fix | None:
         """The fix by few features, if it is beyond doubt and agrees."""
-        found = self._sift.find_few(self._query)
+        assert self._few_options is not None  # or it was not offered
+        found = self._sift.find_few(self._query, self._few_options)
         if isinstance(found, NoFix) or found.evidence.nats < self._query.needed_nats:
             return None
         self._few = found.fix
@@ -251,12 +249,10 @@ class Looks:
         self._is_settled = True
         return refined
 
-    def _by_all(self, answer: Result | None, step: Hashable) -> Result | None:
+    def _by_all(self, answer: Result | None, step: Hashable) -> Result:
         """The fix by all features, or their refusal."""
         assert isinstance(step, tuple)
-        result = self._sift.at_scale(self._query, step[1])
-        is_late = isinstance(result, NoFix) and result.reason is Reason.LATE
-        return None if is_late and isinstance(answer, Fix) else result
+        return self._sift.at_scale(self._query, step[1])
 
     def _is_refinable(self, answer: Result | None) -> bool:
         is_done = self._is_settled or self._is_unrefinable or self._agrees is not None

@@ -159,8 +159,8 @@ class TelemetryErrors:
         if late:
             return self.without_errors(frame)
         self._follow(frame, time_s)
-        rates_dps = None if self._turn is None else self._turn.angles_deg / self._turn.interval_s
-        shown = self.without_errors(frame, rates_dps)
+        turn = self._turn
+        shown = self.without_errors(frame, _NO_RATES_DPS if turn is None else turn.angles_deg / turn.interval_s)
         if frame.heading_deg is None or self._height_m is None:
             return shown
         self._searched = refusals >= self._next_search
@@ -179,17 +179,17 @@ class TelemetryErrors:
         heading_deg = max(frame.heading_sigma_deg or 0.0, _DOUBTED_HEADING_DEG)
         return replace(frame, heading_sigma_deg=heading_deg, height_sigma_m=height_m)
 
-    def without_errors(self, frame: Frame, rates_dps: Array | None = None) -> Frame:
+    def without_errors(self, frame: Frame, rates_dps: Array = _NO_RATES_DPS) -> Frame:
         """A frame without the errors known so far; what is not known of them widens its standard deviations.
 
         Args:
             frame: the newest or a late one.
-            rates_dps: (3,) of roll, pitch and heading; None if they are unknown.
+            rates_dps: (3,) of roll, pitch and heading; 0 if they are unknown.
 
         Returns:
             Frame: the same if nothing is known to be off.
         """
-        return self._at_its_height(self._in_its_attitude(frame, _NO_RATES_DPS if rates_dps is None else rates_dps))
+        return self._at_its_height(self._in_its_attitude(frame, rates_dps))
 
     def _in_its_attitude(self, frame: Frame, rates_dps: Array) -> Frame:
         """The frame with the attitude at its capture."""

@@ -78,6 +78,11 @@ def _may_have_cuda() -> bool:
     return True
 
 
+def device_of(picture: Picture) -> Device | torch.device:
+    """The device that an array or a tensor is on."""
+    return CPU if isinstance(picture, np.ndarray) else picture.device
+
+
 def synchronise(device: Device | torch.device) -> None:
     """Wait until all work queued on ``device`` is done, for instance before reading a clock."""
     if device.type == "cuda":

@@ -94,9 +94,9 @@ class Scheduler:
             self._refused.add(step)
 
     @contextmanager
-    def with_fix(self) -> Iterator[None]:
-        """Protect an existing fix: abandon work before the deadline that would make it late."""
-        outer, self.has_fix = self.has_fix, True
+    def with_fix(self, has_fix: bool = True) -> Iterator[None]:
+        """Protect a fix, if there is one: abandon work before the deadline that would make it late."""
+        outer, self.has_fix = self.has_fix, self.has_fix or has_fix
         try:
             yield
         finally:

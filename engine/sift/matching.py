@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.runtime.device import as_float, like, on_host
+from engine.runtime.device import as_float, device_of, like, on_host
 from engine.sift.values import FORBIDDEN, ROUNDING, TRAIN_CHUNK, Features, Limits, Matches, fields_of
 
 Floats = NDArray[np.float32]
@@ -48,7 +48,7 @@ def match(
     if not 0 < ratio <= 1:
         raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
     limits, given = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor), query.descriptors
-    if not isinstance(given, np.ndarray) and given.device.type != "cpu":
+    if device_of(given).type != "cpu":
         from engine.sift.matching_tensors import match_tensors  # torch takes a while to import
 
         return match_tensors(query, train, limits, ratio)

@@ -51,8 +51,8 @@ def test_few_features_that_disagree_are_not_the_second_opinion(ground, site, cam
 
     few = Sift.find_few
 
-    def off(self, query):
-        found = few(self, query)
+    def off(self, *args):
+        found = few(self, *args)
         north_m = found.fix.north_m + 4.0
         fix = replace(found.fix, north_m=north_m, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
         return replace(found, fix=fix)
