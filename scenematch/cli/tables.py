@@ -91,9 +91,9 @@ def print_paper_table(results: Mapping[str, Mapping[str, Any]], seed: int) -> No
 
 
 def _cells(summary: Mapping[str, Any]) -> list[str]:
-    """The figures of a run; a dash if unknown."""
-    found = {**summary, **summary["latency_ms"]}
-    return ["-" if found.get(key) is None else form.format(found[key]) for _, key, form in _RUN]
+    from scenematch.report.metrics import figures_in_words
+
+    return figures_in_words(summary, ((key, form.format) for _, key, form in _RUN))
 
 
 def print_audit(result: MapAudit, title: str) -> None:

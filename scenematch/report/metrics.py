@@ -8,7 +8,7 @@ Convention:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -177,6 +177,17 @@ def summarise(
         summary |= _accuracy(errors_en_m(rows, truth, frame))
         summary |= _height(height_pairs_m(rows, truth, ground or Ground()))
     return summary
+
+
+def figures_in_words(summary: Mapping[str, Any], forms: Iterable[tuple[str, Callable[[Any], str]]]) -> list[str]:
+    """Figures of a summary as text, a dash where one is unknown.
+
+    Args:
+        summary: by :func:`summarise`.
+        forms: the name of each figure, of the latency's too, and what writes it.
+    """
+    known = {**summary, **summary["latency_ms"]}
+    return ["-" if known.get(name) is None else form(known[name]) for name, form in forms]
 
 
 def _counts(values: Any) -> dict[str, int]:

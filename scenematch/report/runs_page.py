@@ -13,7 +13,7 @@ from engine.errors import OptionError
 from engine.geo import Array
 from scenematch.report.charts import ChartArea, Limits, dots, line
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.metrics import FALSE_SIGMAS
+from scenematch.report.metrics import FALSE_SIGMAS, figures_in_words
 from scenematch.report.page_charts import Chart, column
 from scenematch.report.page_map import connected, draw_map, map_of_tracks
 from scenematch.report.page_parts import charts_with_axis, fill_page, map_with_legend, section, table
@@ -75,9 +75,7 @@ def _figures(tracks: Mapping[str, FinishedTrack]) -> str:
     }  # fmt: skip
     rows = []
     for name, track in tracks.items():
-        found = {**track.summary, **track.summary["latency_ms"]}
-        shown = ("-" if found.get(key) is None else form(found[key]) for key, form in columns.values())
-        rows.append((name, track.method, *shown))
+        rows.append((name, track.method, *figures_in_words(track.summary, columns.values())))
     return table(("run", "method", *columns), rows)
 
 
