@@ -61,12 +61,10 @@ class AssumedErrors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseOptions:
-    """Inlier tolerance, search effort and acceptance thresholds.
+    """Inlier tolerance and acceptance thresholds of a pose from matched points.
 
     Attributes:
         reprojection_px: Largest reprojection distance of an inlier.
-        max_iterations: Upper bound on the samples that RANSAC draws.
-        confidence: Probability, in (0, 1), at which RANSAC stops early.
         min_inliers: Fewest distinct inliers of a pose.
         distinct_px: Matches nearer to each other than this count once: they see the same pixels. In pixels of the
             picture whose matches vote, and of the frame if nothing was voted for.
@@ -75,35 +73,23 @@ class PoseOptions:
         min_spread_px: Smallest standard deviation of the inliers in the image, in the direction of smallest
             spread; below it they are nearly collinear.
         min_cost_gap: Chi-square by which the pose must beat the second pose that a plane allows.
-        noise_floor_px: Lower bound on the standard deviation assumed for an image point's x and y.
-        seed: Seeds RANSAC's samples; equal inputs and seeds give equal poses.
     """
 
     reprojection_px: float = 3.0
-    max_iterations: int = 1000
-    confidence: float = 0.999
     min_inliers: int = 6
     distinct_px: float = 16.0
     max_log10_nfa: float = -6.0
     min_spread_px: float = 6.0
     min_cost_gap: float = 9.0
-    noise_floor_px: float = 0.05
-    seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("reprojection_px", "distinct_px", "min_spread_px", "min_cost_gap", "noise_floor_px"):
+        for name in ("reprojection_px", "distinct_px", "min_spread_px", "min_cost_gap"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        if not 0 < self.confidence < 1:
-            raise OptionError(f"confidence: expected a number in (0, 1), got {self.confidence}")
-        if self.max_iterations < 1:
-            raise OptionError(f"max_iterations: expected at least 1, got {self.max_iterations}")
         if self.min_inliers < 4:
             raise OptionError(f"min_inliers: expected at least 4, got {self.min_inliers}")
         if math.isnan(self.max_log10_nfa):
             raise OptionError("max_log10_nfa: expected a number, got nan")
-        if self.seed < 0:
-            raise OptionError(f"seed: expected at least 0, got {self.seed}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,38 +97,23 @@ class NccOptions:
     """Settings of the NCC method.
 
     Attributes:
-        margin: the 1.3 of equations 4 and 5.
-        fraction: size of the rectified patch relative to the frame.
         score: the correlated quantity: "grey", "local", "gradient" or "mixed", see ``docs/scores.md``.
         enhance_radius_px: neighbourhood of the local normalisation; 0 leaves it out. "grey" has none.
-        min_valid_share: a place counts only if this share of the patch lies on valid map.
         exhaustive: score every place of the window at full resolution.
         refine: refine the pose densely after the peak.
         exclusion_m: rivals nearer than this are the peak itself.
-        min_deviation: standard deviation in grey levels below which a frame has no texture.
         errors: assumed errors of the telemetry and the map.
     """
 
-    margin: float = 1.3
-    fraction: float = 0.7
     score: str = "local"
     enhance_radius_px: int = 8
-    min_valid_share: float = 0.9
     exhaustive: bool = False
     refine: bool = True
     exclusion_m: float = 6.0
-    min_deviation: float = 3.0
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
-        if math.isinf(self.margin):
-            raise OptionError(f"margin: expected a finite number, got {self.margin}")
-        if not self.margin >= 1.0:
-            raise OptionError(f"margin: expected 1 or more, got {self.margin}")
-        for name in ("fraction", "min_valid_share"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
-        check_positive(self, "exclusion_m", "min_deviation")
+        check_positive(self, "exclusion_m")
         check_score(self.score)
         if self.enhance_radius_px < 0:
             raise OptionError(f"enhance_radius_px: expected 0 or more, got {self.enhance_radius_px}")
@@ -153,7 +124,6 @@ class SiftOptions:
     """Settings of the SIFT method.
 
     Attributes:
-        margin: the 1.3 of equations 4 and 5.
         scale: the frame is reduced to this before detection; the paper's 0.5.
         max_keypoints: features taken from a frame of usual size; the map's are as dense.
         keypoints_per_px: features taken from a larger frame, per map pixel that it covers on its level.
@@ -161,25 +131,15 @@ class SiftOptions:
             takes "compiled" on the CPU, else "kornia".
         upsample: samples per pixel in the first octave of a frame that is drawn in the map's pixels. 2 locates
             small keypoints more exactly and takes three times as long. The map always has 2.
-        contrast_threshold: Lowe's, of frame and map; bare ground has little contrast.
         map_features: "prepared" once for the map, or found "per_frame" in the window, as the paper does.
         max_map_keypoints: upper limit for a window that is described per frame.
-        ratio: best over second-best descriptor distance (Lowe's test), if RANSAC must find the matches that agree.
-        vote_ratio: the same if matches vote for a translation; a vote tolerates many wrong matches.
-        vote_share: matches agree on a translation within this share of the distance to the ground.
         tolerance_px: distance, in pixels of the map's level, within which a match agrees with the voted pose.
-        upright: if the heading is known, turn descriptors by it instead of by each keypoint's gradients.
-        max_turn_deg: how far the angles of a match may contradict a known heading if descriptors are not upright;
-            None skips the test.
-        max_scale_factor: the factor by which the scales of a match may contradict a known height; None skips the
-            test.
         second_look: if nothing is found, search again without the heading and with heights off by up to
             ``height_factor``.
         height_factor: see above; 1 trusts the height even then.
         max_height_m: the largest height to search if the height is unknown.
         matcher: replaces the features: it gets the reduced frame and the map's crop; its matches are lifted and
             solved for the pose like those of features.
-        min_deviation: standard deviation in grey levels below which a frame has no texture.
         max_tilt_deg: a pose tilted further off the vertical is considered wrong.
         use_attitude: use the known heading, roll and pitch as a prior of the pose, weighted by their assumed
             errors; a few features alone hardly separate a tilt from a displacement.
@@ -188,27 +148,18 @@ class SiftOptions:
         errors: assumed errors of the telemetry and the map.
     """
 
-    margin: float = 1.3
     scale: float = 0.5
     max_keypoints: int = 300
     keypoints_per_px: float = 0.01
     backend: str = "auto"
     upsample: int = 2
-    contrast_threshold: float = 0.005
     map_features: str = "prepared"
     max_map_keypoints: int = 6000
-    ratio: float = 0.8
-    vote_ratio: float = 0.9
-    vote_share: float = 0.03
     tolerance_px: float = 1.0
-    upright: bool = True
-    max_turn_deg: float | None = 30.0
-    max_scale_factor: float | None = 1.5
     second_look: bool = True
     height_factor: float = 2.0
     max_height_m: float = 500.0
     matcher: PairMatcher | None = None
-    min_deviation: float = 3.0
     max_tilt_deg: float = 45.0
     use_attitude: bool = True
     refine: bool = True
@@ -216,23 +167,19 @@ class SiftOptions:
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
-        for name in ("margin", "height_factor", "max_height_m", "min_deviation", "tolerance_px"):
+        for name in ("height_factor", "max_height_m", "tolerance_px"):
             if math.isinf(getattr(self, name)):
                 raise OptionError(f"{name}: expected a finite number, got {getattr(self, name)}")
-        for name in ("margin", "height_factor"):
-            if not getattr(self, name) >= 1.0:
-                raise OptionError(f"{name}: expected 1 or more, got {getattr(self, name)}")
-        if not self.min_deviation >= 0.0:
-            raise OptionError(f"min_deviation: expected 0 or more, got {self.min_deviation}")
-        for name in ("scale", "ratio", "vote_ratio", "vote_share"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise OptionError(f"{name}: expected above 0 and at most 1, got {getattr(self, name)}")
+        if not self.height_factor >= 1.0:
+            raise OptionError(f"height_factor: expected 1 or more, got {self.height_factor}")
+        if not 0.0 < self.scale <= 1.0:
+            raise OptionError(f"scale: expected above 0 and at most 1, got {self.scale}")
         for name, minimum in (
-            ("max_turn_deg", 0.0), ("max_scale_factor", 1.0), ("max_height_m", MIN_HEIGHT_M),
-            ("max_tilt_deg", 0.0), ("keypoints_per_px", 0.0), ("contrast_threshold", 0.0), ("tolerance_px", 0.0),
+            ("max_height_m", MIN_HEIGHT_M), ("max_tilt_deg", 0.0),
+            ("keypoints_per_px", 0.0), ("tolerance_px", 0.0),
         ):  # fmt: skip
             value = getattr(self, name)
-            if value is not None and not value > minimum:
+            if not value > minimum:
                 raise OptionError(f"{name}: expected above {minimum:g}, got {value}")
         if self.upsample not in (1, 2):
             raise OptionError(f"upsample: expected 1 or 2, got {self.upsample}")

@@ -8,28 +8,25 @@ from engine.errors import OptionError
 from engine.orthomap import OrthoMap
 from engine.values import Window
 
+MARGIN = 1.3
+"""The margin of equations 4 and 5; the paper's."""
 SPREAD_SIGMAS = 3.0
 """How many standard deviations of the prior a window covers to each side."""
 
 
-def window_size_px(
-    footprint_px: tuple[float, float], moved_px: tuple[float, float], *, margin: float = 1.3
-) -> tuple[float, float]:
+def window_size_px(footprint_px: tuple[float, float], moved_px: tuple[float, float]) -> tuple[float, float]:
     """Width and height of the window in map pixels: W = 1.3 s T + v tau (eq. 4, 5).
 
     Args:
         footprint_px: s T, the frame's extent (width, height) on the map.
         moved_px: v tau, the movement (x, y) since the last frame; signs are ignored.
-        margin: the paper's 1.3.
 
     Raises:
-        OptionError: margin is below 1, or an extent is not positive and finite.
+        OptionError: an extent is not positive and finite.
     """
-    if not margin >= 1.0:
-        raise OptionError(f"margin: expected 1 or more, got {margin}")
     if not all(math.isfinite(v) and v > 0 for v in footprint_px):
         raise OptionError(f"footprint_px: expected positive finite extents, got {footprint_px}")
-    width, height = (margin * extent + abs(step) for extent, step in zip(footprint_px, moved_px, strict=True))
+    width, height = (MARGIN * extent + abs(step) for extent, step in zip(footprint_px, moved_px, strict=True))
     return width, height
 
 

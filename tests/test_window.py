@@ -10,7 +10,7 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from engine import Fix, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, SceneMatcher, Window
-from engine.window import place_window, window_size_px
+from engine.window import MARGIN, place_window, window_size_px
 from tests.support.matchers import ScriptedMatcher
 
 SIDE_PX = 300.0
@@ -31,18 +31,11 @@ def test_equations_4_and_5_in_the_papers_figures():
 @given(
     extent=st.tuples(st.floats(1.0, 5000.0), st.floats(1.0, 5000.0)),
     moved=st.tuples(st.floats(-500.0, 500.0), st.floats(-500.0, 500.0)),
-    margin=st.floats(1.0, 4.0),
 )
-def test_only_the_size_of_a_movement_counts(extent, moved, margin):
-    size = window_size_px(extent, moved, margin=margin)
-    assert size == (margin * extent[0] + abs(moved[0]), margin * extent[1] + abs(moved[1]))
-    assert size == window_size_px(extent, (-moved[0], -moved[1]), margin=margin)
-
-
-@pytest.mark.parametrize("margin", [0.99, 0.0, -1.0, float("nan")])
-def test_a_margin_below_one_is_refused(margin):
-    with pytest.raises(OptionError, match=r"^margin: expected 1 or more, got "):
-        window_size_px(FOOTPRINT, (0.0, 0.0), margin=margin)
+def test_only_the_size_of_a_movement_counts(extent, moved):
+    size = window_size_px(extent, moved)
+    assert size == (MARGIN * extent[0] + abs(moved[0]), MARGIN * extent[1] + abs(moved[1]))
+    assert size == window_size_px(extent, (-moved[0], -moved[1]))
 
 
 @pytest.mark.parametrize("extent", [(0.0, 5.0), (5.0, -1.0), (float("inf"), 5.0), (5.0, float("nan"))])

@@ -165,7 +165,7 @@ class OpenCvFeatures:
         footprint = view.footprint_px
         if pose.grid_heading_deg is None:
             footprint = (math.hypot(*footprint),) * 2
-        return query.window(query.prior_px + view.center_px, footprint, footprint, margin=self._options.margin)
+        return query.window(query.prior_px + view.center_px, footprint, footprint)
 
     def _map_features(self, query: Query, window: Window) -> tuple[Keypoints, int, Array]:
         site, options, height_m = self.site, self._options, query.frame.height_agl_m

@@ -30,7 +30,10 @@ _MIN_DOWN = math.cos(math.radians(MAX_RAY_DEG))
 # A frame finer than the map by more than this factor is averaged down first, to prevent aliasing.
 _MAX_SHRINK = 0.75
 _ASPECTS = np.array([1.0, 4 / 3, 3 / 4, 16 / 9, 9 / 16])
-# Least size of a patch as a share of the requested fraction.
+FRACTION = 0.7
+"""Side of the rectified part over the frame's: it fits into a square frame at any heading, so that the cost of
+matching does not depend on the heading."""
+# Least size of a patch as a share of that.
 MIN_SHRINK = 0.25
 _SHRINKS = np.linspace(1.0, MIN_SHRINK, 61)
 # Corners (S, A, 4, 2) about the middle of rectangles of area 1 and below, the largest first.
@@ -128,20 +131,18 @@ class Patch:
     offset_px: Array
 
 
-def rectify(gray: NDArray[np.uint8], camera: Camera, view: GroundView, *, fraction: float = 0.7) -> Patch | None:
-    """Warp the frame to the map's pixels, and crop to the largest upright rectangle inside it.
+def rectify(gray: NDArray[np.uint8], camera: Camera, view: GroundView) -> Patch | None:
+    """Warp the frame to the map's pixels, and crop to the largest upright rectangle inside a share of it.
 
     Args:
         gray: (H, W) undistorted.
         camera: its pinhole.
         view: from :func:`view_of`.
-        fraction: upper bound on the rectangle's side over the frame's; at 0.7 it fits into a square frame at any
-            heading, so that the cost of matching does not depend on the heading.
 
     Returns:
         Patch | None: None if it would be smaller than 8 x 8 map pixels.
     """
-    size = _inscribed_size(view, gray.shape, fraction)
+    size = _inscribed_size(view, gray.shape)
     if size is None:
         return None
     width, height = size
@@ -182,9 +183,9 @@ def shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], Ar
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8), homography
 
 
-def _inscribed_size(view: GroundView, shape: tuple[int, ...], fraction: float) -> tuple[int, int] | None:
+def _inscribed_size(view: GroundView, shape: tuple[int, ...]) -> tuple[int, int] | None:
     """Width and height of the largest upright rectangle about the view's centre inside the frame."""
-    side = fraction * math.sqrt(view.area_px)
+    side = FRACTION * math.sqrt(view.area_px)
     limit = np.array([shape[1] - 1, shape[0] - 1])
     for shapes in (_RECTANGLES[:1], _RECTANGLES):  # at most headings and tilts the largest fits
         corners = view.center_px + side * shapes  # (S, A, 4, 2)

@@ -13,7 +13,7 @@ from engine.kernels.coarse_to_fine import QuickLook
 from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance
 from engine.maps.prepared import PreparedMap, Region
-from engine.matching.align import MIN_SHRINK, GroundView, Patch, rectify, view_of
+from engine.matching.align import FRACTION, MIN_SHRINK, GroundView, Patch, rectify, view_of
 from engine.matching.oblique import is_oblique, oblique_patch
 from engine.matching.query import Query
 from engine.ncc_fft import match_template, ncc
@@ -21,11 +21,13 @@ from engine.options import NccOptions
 from engine.runtime.device import Picture, placed
 from engine.runtime.scheduler import OutOfTime
 from engine.values import GridPose, NoFix, Peak, Reason, Window
-from engine.window import SPREAD_SIGMAS, level_crop
+from engine.window import MARGIN, SPREAD_SIGMAS, level_crop
 
 Array = NDArray[np.float64]
 
 METHOD = "ncc"
+MIN_VALID_SHARE = 0.9
+"""A place counts only if this share of the patch lies on valid map."""
 _COARSER = (0, 1, 2)  # levels above the frame's own that may be matched if time is short
 _MIN_SIDE_PX = 24  # of the template there
 _EVERY_PLACE = "every place of a wide window"  # a step
@@ -95,9 +97,9 @@ class Correlator:
         if view is None:
             return query.refuse_tilted(attitude, METHOD)
         rows, columns = query.site.level_shape(level)
-        if (MIN_SHRINK * options.fraction) ** 2 * view.area_px > rows * columns:
+        if (MIN_SHRINK * FRACTION) ** 2 * view.area_px > rows * columns:
             return query.refuse(Reason.OUTSIDE_MAP, "the frame covers more ground than the map", METHOD)
-        patch = rectify(query.gray, query.camera, view, fraction=options.fraction)
+        patch = rectify(query.gray, query.camera, view)
         if patch is None:
             detail = "the frame covers fewer than 8 x 8 pixels of the map"
             return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
@@ -113,7 +115,7 @@ class Correlator:
         turned, patch = np.ascontiguousarray(own[::-1, ::-1]), None
         if attitude is not None and not is_oblique(query, attitude):
             mirrored = np.ascontiguousarray(query.gray[:, ::-1])
-            patch = rectify(mirrored, query.camera, aligned.view, fraction=self.options.fraction)
+            patch = rectify(mirrored, query.camera, aligned.view)
         return [turned, np.ascontiguousarray(own[:, ::-1]) if patch is None else patch.gray]
 
     def _align_oblique(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
@@ -153,7 +155,7 @@ class Correlator:
         footprint = (aligned.view.footprint_px[0] * scale, aligned.view.footprint_px[1] * scale)
         center = nadir + aligned.view.center_px * scale
         min_px = ((width + 4) * scale, (height + 4) * scale)
-        return query.window(center, footprint, min_px, margin=self.options.margin)
+        return query.window(center, footprint, min_px)
 
     def near(self, aligned: Aligned, nadir_px: Array, slack_px: int) -> Window:
         """The window that holds the template around a nadir, with a margin in full-resolution pixels."""
@@ -210,8 +212,7 @@ class Correlator:
     ) -> Peak | None:
         if not self._has_coarse_levels(region):
             return None
-        least = self.options.min_valid_share
-        return coarse_to_fine.peak(region.search, template, exclusion_px, min_overlap=least, quick=quick)
+        return coarse_to_fine.peak(region.search, template, exclusion_px, min_overlap=MIN_VALID_SHARE, quick=quick)
 
     def _has_coarse_levels(self, region: Region) -> bool:
         """Whether to score places at half resolution: on the CPU, if pixels are centred on 0 like nodata."""
@@ -258,7 +259,7 @@ class Correlator:
             region.search.image[None],
             placed(templates[None], self.query.device),
             search_valid=region.valid[None],
-            min_overlap=self.options.min_valid_share,
+            min_overlap=MIN_VALID_SHARE,
         )
         return scores[0]
 
@@ -291,10 +292,10 @@ def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:
     for coarser in _COARSER:
         gsd_m = site.gsd_m_per_px * 2.0 ** (own + coarser)
         per_px = height_m / (camera.focal_px * gsd_m)
-        side_px = options.fraction * min(camera.width_px, camera.height_px) * per_px
+        side_px = FRACTION * min(camera.width_px, camera.height_px) * per_px
         if coarser == 0 or (own + coarser < site.levels and side_px >= _MIN_SIDE_PX):
             slack_px = 2.0 * SPREAD_SIGMAS * query.prior.sigma_m / gsd_m
-            width, height = (options.margin * n * per_px + slack_px for n in (camera.width_px, camera.height_px))
+            width, height = (MARGIN * n * per_px + slack_px for n in (camera.width_px, camera.height_px))
             rows, columns = site.level_shape(own + coarser)  # no window is larger
             out[coarser] = min(width, columns) * min(height, rows)
     return out

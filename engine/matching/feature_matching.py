@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from engine.features import Features, Matches, match, sift
 from engine.geo import wrap_heading_deg
-from engine.maps.landmarks import LandmarkMap, Landmarks, as_picture
+from engine.maps.landmarks import MIN_CONTRAST, LandmarkMap, Landmarks, as_picture
 from engine.matching.align import Orthophoto, orthorectify
 from engine.matching.pose import PoseStart
 from engine.matching.query import Query
@@ -40,6 +40,9 @@ _BLUNT_PX = 1.6  # scale at which a keypoint's position variance is twice a smal
 MAX_KEYPOINTS = 1000
 """Of the largest orthophoto."""
 _MAP_DENSITY = 1.5  # landmarks per pixel over the frame's keypoints per pixel
+_VOTE_RATIO = 0.9  # of Lowe's test where matches vote: a vote tolerates many wrong ones
+_VOTE_SHARE = 0.03  # of the distance to the ground, within which matches agree on a translation
+_MAX_SCALE_FACTOR = 1.5  # by which the scales of a match may contradict a known height
 _UPSAMPLED_PX = 100_000  # an orthophoto with more has enough keypoints without the smallest
 
 
@@ -91,7 +94,7 @@ def match_views(
     source = finder or landmarks
     assert source is not None  # only a finder needs no landmarks
     height_m, attitude = hypothesis.height_m, query.telemetry.grid_attitude
-    if height_m is not None and hypothesis.x_axis_deg is not None and attitude is not None and options.upright:
+    if height_m is not None and hypothesis.x_axis_deg is not None and attitude is not None:
         found = [_by_orthophoto(query, source, options, view, attitude, height_m) for view in views]
         if None not in found:
             return [matched for matched in found if matched is not None]
@@ -146,15 +149,13 @@ def _feature_pairs(
             upright=True,
             mask=valid[None, None],
             upsample=options.upsample if shown_px <= _UPSAMPLED_PX else 1,
-            contrast_threshold=options.contrast_threshold,
+            contrast_threshold=MIN_CONTRAST,
         )
     with query.scheduler.stage("map features"):
         per_px = _MAP_DENSITY * keypoints / max(shown_px, 1)
         known = landmarks.find(view.crop, view.level, upright=True, per_px=per_px)
     with query.scheduler.stage("match"):
-        found = match(
-            features, known.features, ratio=options.vote_ratio, max_scale_factor=options.max_scale_factor
-        )
+        found = match(features, known.features, ratio=_VOTE_RATIO, max_scale_factor=_MAX_SCALE_FACTOR)
         photo_px, scale_px, index = _matched(features, found)
         return photo_px.astype(np.float64), known.xy_px[index].astype(np.float64), scale_px
 
@@ -178,7 +179,7 @@ def _voted(
 ) -> Matched:
     """The matches with the pose that most of them vote for."""
     site, level = query.site, matched.view.level
-    share_px = options.vote_share * slant_m(query, height_m) / (site.gsd_m_per_px * 2.0**level)
+    share_px = _VOTE_SHARE * slant_m(query, height_m) / (site.gsd_m_per_px * 2.0**level)
     radius_px = max(share_px, 2.0 * options.tolerance_px)
     middle = (np.array(photo.gray.shape[::-1]) - 1.0) / 2.0
     # A finer picture shows the same objects by more pixels: no more of its matches are independent.
@@ -222,7 +223,7 @@ def _by_frame(
 ) -> list[Matched]:
     """Match features of the reduced frame with those of the map, view by view."""
     turn = hypothesis.x_axis_deg
-    upright = options.upright and turn is not None
+    upright = turn is not None
     with query.scheduler.stage("frame features"):
         reduced = _reduce(query, options.scale)
         features = sift(
@@ -240,11 +241,8 @@ def _by_frame(
             found = match(
                 features,
                 known.features,
-                ratio=options.ratio,
-                rotation_deg=-(turn or 0.0),
-                max_angle_diff_deg=None if upright or turn is None else options.max_turn_deg,
                 scale=1.0 / view.pixel_ratio,
-                max_scale_factor=None if hypothesis.height_m is None else options.max_scale_factor,
+                max_scale_factor=None if hypothesis.height_m is None else _MAX_SCALE_FACTOR,
             )
             xy_px, scale_px, index = _matched(features, found)
             points_px, points_m = reduced.full(xy_px), known.points_m[index]

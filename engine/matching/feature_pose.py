@@ -69,8 +69,8 @@ class FeatureMatcher:
 
     def find(self) -> PoseCandidate | NoFix:
         """The pose of the frame, or a refusal if there is none."""
-        query, options = self.query, self.options
-        flat = query.refuse_flat(self.method, options.min_deviation)
+        query = self.query
+        flat = query.refuse_flat(self.method)
         if flat is not None:
             return flat
         first: PoseCandidate | NoFix | None = None
@@ -89,7 +89,7 @@ class FeatureMatcher:
 
     def find_at_once(self) -> PoseCandidate | NoFix:
         """The pose of a frame by its own telemetry, with no second attempt and no null hypothesis."""
-        refusal = self.query.refuse_flat(self.method, self.options.min_deviation)
+        refusal = self.query.refuse_flat(self.method)
         return refusal or self._find_with(next(self._attempts())[1])
 
     def judge(self, found: PoseCandidate | NoFix) -> Fix | NoFix:
@@ -119,7 +119,7 @@ class FeatureMatcher:
         unknown = (MIN_HEIGHT_M, options.max_height_m)
         known = TelemetryHypothesis(unknown if height_m is None else (height_m, height_m), x_axis_deg(query))
         yield self, known
-        drawn = height_m is not None and known.x_axis_deg is not None and options.upright and self.finder is None
+        drawn = height_m is not None and known.x_axis_deg is not None and self.finder is None
         if drawn and level_at(query, known.heights_m[0], options.scale) > level_at(query, known.heights_m[0], 1.0):
             yield replace(self, options=replace(options, scale=1.0)), known
         wide = TelemetryHypothesis(unknown if height_m is None else (height_m / factor, height_m * factor), None)
@@ -148,7 +148,7 @@ class FeatureMatcher:
         """Match, lift and solve, under one hypothesis about the telemetry."""
         query, options, scheduler = self.query, self.options, self.query.scheduler
         with scheduler.stage("window"):
-            views = views_of(query, hypothesis, self.method, margin=options.margin, scale=options.scale)
+            views = views_of(query, hypothesis, self.method, options.scale)
         if isinstance(views, NoFix):
             return views
         if self.finder is not None and any(map(self.finder.too_large, views)):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from engine.kernels.coarse_to_fine import surfaces_over_nodata
 from engine.kernels.peaks import best_positions
 from engine.maps.prepared import Region
-from engine.matching.correlation import Aligned, Correlator
+from engine.matching.correlation import MIN_VALID_SHARE, Aligned, Correlator
 from engine.matching.covariance import score_sigma
 from engine.matching.evidence import Evidence, is_hopeless, surprise_of
 from engine.matching.peak_evidence import places_in
@@ -214,8 +214,7 @@ def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.floa
         for several in surfaces(region.search, own, group=group):
             yield from several
     elif region.search.counts is not None and correlator.is_centred:
-        least = correlator.options.min_valid_share
-        yield from surfaces_over_nodata(region.search, templates, min_overlap=least, group=group)
+        yield from surfaces_over_nodata(region.search, templates, min_overlap=MIN_VALID_SHARE, group=group)
     else:
         for first in range(0, len(templates), group):
             yield from correlator.masked_scores(region, templates[first : first + group])

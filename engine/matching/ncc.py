@@ -216,7 +216,7 @@ class Ncc(Method):
         if pose.grid_heading_deg is None:
             detail = "NCC needs the heading; with a sigma of 180 degrees it tries all of them"
             return query.refuse(Reason.NO_HEADING, detail, METHOD)
-        return query.refuse_flat(METHOD, self.options.min_deviation)
+        return query.refuse_flat(METHOD)
 
     def _align(self, correlator: Correlator, coarser: int) -> Aligned | NoFix:
         """The frame with its own height and heading."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import attitude_from_rotation
+from engine.matching.align import FRACTION
 from engine.matching.explanation import (
     Explanation,
     PointMatches,
@@ -27,10 +28,8 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Scores = NDArray[np.float32]
 
-MARGIN = 1.3
 SCALE = 0.5
 RATIO = 0.8  # the paper gives none; Lowe's own
-FRACTION = 0.7  # of the rotated frame, to exclude empty corners
 REPROJECTION_PX = 4.0
 SIGMA_M = 2.4  # the paper states no covariance; this is the RMS error that it reports
 _MAX_DISTANCE_M = 1e6
@@ -120,7 +119,7 @@ def _window(query: Query) -> Window | None:
     scale = _scale(query)
     extent = (scale * query.camera.width_px, scale * query.camera.height_px)
     center = np.zeros(2) if query.prior_px is None else query.prior_px
-    return query.window(center, extent, (1.0, 1.0), margin=MARGIN)
+    return query.window(center, extent, (1.0, 1.0))
 
 
 def _scale(query: Query) -> float:

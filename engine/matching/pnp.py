@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
 
+_MAX_SAMPLES = 1000  # that RANSAC draws
+_CONFIDENCE = 0.999  # at which it stops early
+_NOISE_FLOOR_PX = 0.05  # least standard deviation assumed for an image point's x and y
 _STEPS = 12  # Gauss-Newton steps at most; four or five are usual
 _STEP_SIGMAS = 2e-2  # stop after a step this small, in standard deviations of the pose
 _PAIRS = 24  # pairs of matches that give candidate centres if the attitude is known
@@ -42,7 +45,6 @@ class Problem:
         attitude: (3, 3) rotation of the prior, or None.
         precision: (3, 3) inverse covariance of its angles about the camera's axes in 1/rad^2, 0 without one.
         tolerance_px: A match agrees if it reprojects at most this far off.
-        noise_floor_px: Lower bound on the standard deviation of a pixel.
         min_inliers: Fewest inliers of a pose.
     """
 
@@ -53,7 +55,6 @@ class Problem:
     attitude: Array | None
     precision: Array
     tolerance_px: float
-    noise_floor_px: float
     min_inliers: int
 
 
@@ -96,23 +97,20 @@ class Fit:
 # ------------------------------------------------------------------------------------------------- initial pose
 
 
-def ransac(problem: Problem, max_iterations: int, confidence: float, seed: int) -> Start | None:
+def ransac(problem: Problem) -> Start | None:
     """Return the best pose of minimal samples, by OpenCV's USAC with MSAC scores.
 
     Args:
-        problem: The matches.
-        max_iterations: Upper bound on the number of samples.
-        confidence: Probability, in (0, 1), at which the search stops early.
-        seed: Of the samples.
+        problem: The matches; equal ones give equal poses.
 
     Returns:
         Rotation (3, 3) and centre (3,), or None if no sample gives a pose.
     """
     params = cv2.UsacParams()
     params.threshold = problem.tolerance_px
-    params.confidence = confidence
-    params.maxIterations = max_iterations
-    params.randomGeneratorState = seed
+    params.confidence = _CONFIDENCE
+    params.maxIterations = _MAX_SAMPLES
+    params.randomGeneratorState = 0
     params.sampler = cv2.SAMPLING_UNIFORM
     params.score = cv2.SCORE_METHOD_MSAC
     params.loMethod = cv2.LOCAL_OPTIM_NULL  # Gauss-Newton below refines instead
@@ -127,7 +125,7 @@ def ransac(problem: Problem, max_iterations: int, confidence: float, seed: int) 
     return R, -R.T @ t[:, 0]
 
 
-def refine_from_attitude(problem: Problem, seed: int) -> Fit | None:
+def refine_from_attitude(problem: Problem) -> Fit | None:
     """Return the pose near the known attitude, or None unless more than half of the matches are its inliers.
 
     Two matches and the attitude determine the centre. A majority needs no further search: no other pose can have
@@ -136,7 +134,7 @@ def refine_from_attitude(problem: Problem, seed: int) -> Fit | None:
     if problem.attitude is None:
         return None
     R, count = problem.attitude, problem.pixels.shape[1]
-    pairs = np.random.default_rng(seed).integers(0, count, (2, _PAIRS))
+    pairs = np.random.default_rng(0).integers(0, count, (2, _PAIRS))
     x = R @ problem.points
     rays = np.linalg.inv(problem.K) @ np.concatenate([problem.pixels, np.ones((1, count))])
     # x = c + z ray with ray = (., ., 1): x gives the difference of the depths; x and y give the first depth.
@@ -197,7 +195,7 @@ def gauss_newton(
     attitude = rotation if problem.attitude is None else np.ascontiguousarray(problem.attitude)
     found, rotation, center, tangents, projected, squared, inliers, information, variance = fit_pose(
         problem.points, problem.pixels, problem.K, problem.weights, attitude, problem.precision,
-        problem.tolerance_px, problem.noise_floor_px, problem.min_inliers,
+        problem.tolerance_px, _NOISE_FLOOR_PX, problem.min_inliers,
         rotation, center, steps, slack, _REACH_SIGMAS, _STEP_SIGMAS,
     )  # fmt: skip
     if not found:

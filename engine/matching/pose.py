@@ -159,7 +159,7 @@ def solve_pose(
         return None
     origin = points_m[known].mean(0)
     problem = _problem((points_m[known] - origin).T, points_px[known].T, K, weights[known], options, prior)
-    fit = _fit(problem, options) if start is None else _fit_from(problem, start, origin)
+    fit = _fit(problem) if start is None else _fit_from(problem, start, origin)
     if fit is not None and prior is not None:
         problem, fit = _without_wrong_prior(problem, fit)
     if fit is None or not _supported(problem, fit, options):
@@ -188,7 +188,6 @@ def _problem(
         attitude=None if prior is None else prior.rotation,
         precision=np.zeros((3, 3)) if prior is None else prior.precision,
         tolerance_px=options.reprojection_px,
-        noise_floor_px=options.noise_floor_px,
         min_inliers=options.min_inliers,
     )
 
@@ -239,11 +238,11 @@ def _spread(points: Array) -> float:
     return math.sqrt(max(smaller, 0.0) / points.shape[1])
 
 
-def _fit(problem: Problem, options: PoseOptions) -> Fit | None:
-    fit = refine_from_attitude(problem, options.seed)
+def _fit(problem: Problem) -> Fit | None:
+    fit = refine_from_attitude(problem)
     if fit is not None:
         return fit
-    start = ransac(problem, options.max_iterations, options.confidence, options.seed)
+    start = ransac(problem)
     return None if start is None else gauss_newton(problem, *start)
 
 

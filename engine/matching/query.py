@@ -23,6 +23,8 @@ from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 
 Array = NDArray[np.float64]
 
+MIN_DEVIATION = 3.0
+"""Standard deviation in grey levels below which a frame has no texture."""
 _AGREE_SIGMAS = 2.0  # difference at which a measured height still agrees with the telemetry's
 _FOUND_HEADING_DEG, _FOUND_HEIGHT_SHARE = 2.0, 0.03  # standard deviations of what a search found
 
@@ -106,8 +108,6 @@ class Query:
         center_px: Array,
         footprint_px: tuple[float, float],
         min_px: tuple[float, float],
-        *,
-        margin: float,
     ) -> Window | None:
         """The adaptive window in map pixels (eq. 4, 5), or None if it lies outside the map.
 
@@ -116,14 +116,13 @@ class Query:
             footprint_px: extent of the whole frame on the map.
             min_px: extent of what will be matched. The window holds it at every position within
                 :data:`engine.window.SPREAD_SIGMAS` of the prior, even if equations 4 and 5 would give less.
-            margin: the paper's 1.3.
         """
         prior = self.prior
         if prior is None:
             return Window(0, 0, self.site.width_px, self.site.height_px)
         moved_m = np.array([prior.moved_east_m, prior.moved_north_m])
         moved_px = np.abs(inverse_2x2(self.jacobian) @ moved_m)
-        size = window_size_px(footprint_px, (float(moved_px[0]), float(moved_px[1])), margin=margin)
+        size = window_size_px(footprint_px, (float(moved_px[0]), float(moved_px[1])))
         slack = 2.0 * SPREAD_SIGMAS * prior.sigma_m / self.site.gsd_m_per_px
         width, height = (max(a, b + slack) for a, b in zip(size, min_px, strict=True))
         shape = (self.site.width_px, self.site.height_px)
@@ -272,13 +271,13 @@ class Query:
             timings=self.timings,
         )
 
-    def refuse_flat(self, method: str, min_deviation: float) -> NoFix | None:
+    def refuse_flat(self, method: str) -> NoFix | None:
         """A refusal if the picture has no texture to match, else None."""
         deviation = float(cv2.meanStdDev(self.gray)[1][0, 0])
-        if deviation >= min_deviation:
+        if deviation >= MIN_DEVIATION:
             return None
         figure = f"the frame's grey levels deviate by {deviation:.1f}"
-        return self.refuse(Reason.NO_TEXTURE, f"{figure}; {min_deviation:g} is required", method)
+        return self.refuse(Reason.NO_TEXTURE, f"{figure}; {MIN_DEVIATION:g} is required", method)
 
     def refuse_tilted(self, attitude: Attitude, method: str) -> NoFix:
         """The refusal of a frame that sees the horizon, or nearly so."""

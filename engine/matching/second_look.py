@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance, orientation
 from engine.kernels.sums import counts, counts_inside
-from engine.matching.correlation import Aligned, Correlator
+from engine.matching.correlation import MIN_VALID_SHARE, Aligned, Correlator
 from engine.matching.peak_evidence import PeakCandidate, candidate_of
 from engine.ncc_fft import ncc
 from engine.runtime.device import on_host, placed
@@ -88,7 +88,7 @@ def _scores(
     scores = on_host(ncc(placed(search, query.device), placed(templates, query.device)).mean(0))
     if valid is not None:
         # Nodata is 0 in all channels, near their mean, and so hardly lowers places that are mostly on the map.
-        scores[:, _share_on_map(valid, height, width) < options.min_valid_share] = -1.0
+        scores[:, _share_on_map(valid, height, width) < MIN_VALID_SHARE] = -1.0
     return scores, crop
 
 

@@ -115,7 +115,7 @@ class Sift(Method):
     def few_options(self, query: Query) -> SiftOptions | None:
         """Of few features, at their scale; None if they are not wanted or the map has no such level."""
         height_m = query.telemetry.height_agl_m
-        if query.prior is None or height_m is None or not self.options.upright or not self.can_refine(query):
+        if query.prior is None or height_m is None or not self.can_refine(query):
             return None
         scale = coarser_scale(query, height_m, self.options.scale)
         return None if scale is None else replace(self._few, scale=scale)
@@ -164,7 +164,7 @@ class Sift(Method):
             step = "sift search" if query.prior is None else "sift heights"
         else:
             step = METHOD
-        if not self.options.upright or known.height_agl_m is None or known.grid_heading_deg is None:
+        if known.height_agl_m is None or known.grid_heading_deg is None:
             return {(step, share): query.gray.size * (scale * share) ** 2 for share in _REDUCED}
         return {(step, share): drawn_px(query, known.height_agl_m, scale * share) for share in _REDUCED}
 

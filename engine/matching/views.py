@@ -69,16 +69,13 @@ def x_axis_deg(query: Query) -> float | None:
     return math.degrees(math.atan2(y, x))
 
 
-def views_of(
-    query: Query, hypothesis: TelemetryHypothesis, method: str, *, margin: float, scale: float
-) -> list[MapView] | NoFix:
+def views_of(query: Query, hypothesis: TelemetryHypothesis, method: str, scale: float) -> list[MapView] | NoFix:
     """The windows to search, one per level; a coarser level replaces one that is too large to search.
 
     Args:
         query: the frame and its prior; without a prior every window is the whole map.
         hypothesis: its heights determine the levels; the greatest height of a level determines its window.
         method: named in a refusal.
-        margin: the 1.3 of equations 4 and 5.
         scale: of the reduced frame.
     """
     site, heights_m = query.site, hypothesis.heights_m
@@ -90,7 +87,7 @@ def views_of(
     views: dict[int, MapView] = {}
     for level in range(first, last + 1):
         served_m = heights_m[1] if level == last else 2 ** (level + _LEVEL_ENDS) / per_height
-        window = _window(query, served_m, hypothesis.x_axis_deg is not None, method, margin)
+        window = _window(query, served_m, hypothesis.x_axis_deg is not None, method)
         if isinstance(window, NoFix):
             return window
         view = _view(query, window, level, heights_m[0] * per_height)
@@ -129,7 +126,7 @@ def _view(query: Query, window: Window, level: int, per_px: float) -> MapView:
     return MapView(window, level, level_crop(site, window, level, step_px=_CROP_STEP_PX), 2**level / per_px)
 
 
-def _window(query: Query, height_m: float, has_heading: bool, method: str, margin: float) -> Window | NoFix:
+def _window(query: Query, height_m: float, has_heading: bool, method: str) -> Window | NoFix:
     """The adaptive window (eq. 4, 5) at a height; the whole map if the position is unknown."""
     nadir = query.prior_px
     if nadir is None:
@@ -141,7 +138,7 @@ def _window(query: Query, height_m: float, has_heading: bool, method: str, margi
     width, height = (float(n) for n in bounds[1] - bounds[0])
     if not has_heading:  # at any heading the footprint fits the square of its diagonal
         width = height = math.hypot(width, height)
-    window = query.window(nadir + bounds.mean(axis=0), (width, height), (width, height), margin=margin)
+    window = query.window(nadir + bounds.mean(axis=0), (width, height), (width, height))
     return window or query.refuse_outside(method)
 
 

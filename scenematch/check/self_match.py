@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from engine.geo import Array
 from engine.kernels.scores import enhance
 from engine.maps.prepared import PreparedMap
+from engine.matching.correlation import MIN_VALID_SHARE
 from engine.matching.covariance import score_sigma
 from engine.ncc_fft import surface
 from engine.options import NccOptions
@@ -102,7 +103,7 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px:
     if not plan.contains(center_px):
         return nothing
     extent = Window(x0, y0, width, height)
-    if not site.fully_valid and site.valid(extent, level).mean() < plan.options.ncc.min_valid_share:
+    if not site.fully_valid and site.valid(extent, level).mean() < MIN_VALID_SHARE:
         return nothing
     gray = site.gray(extent, level)
     other = None if plan.other is None else _seen_on(plan.other, plan, extent)
@@ -130,7 +131,7 @@ def _window(plan: AuditPlan, middle_px: Array) -> Window:
     site, level, (height, width) = plan.site, plan.level, plan.shape
     rows, columns = site.level_shape(level)
     slack = 2.0 * SPREAD_SIGMAS * plan.options.prior_sigma_m / (site.gsd_m_per_px * 2.0**level)
-    size = window_size_px(plan.view.footprint_px, (0.0, 0.0), margin=plan.options.ncc.margin)
+    size = window_size_px(plan.view.footprint_px, (0.0, 0.0))
     size = (max(size[0], width + 4 + slack), max(size[1], height + 4 + slack))
     window = place_window((float(middle_px[0]), float(middle_px[1])), size, (columns, rows))
     assert window is not None  # the cell is on the map
@@ -190,7 +191,7 @@ def _seen_on(other: OrthoMap, plan: AuditPlan, extent: Window) -> Gray | None:
     if low.min() < 0 or high[0] > columns or high[1] > rows:
         return None
     window = Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
-    if not other.fully_valid and other.valid(window, level).mean() < plan.options.ncc.min_valid_share:
+    if not other.fully_valid and other.valid(window, level).mean() < MIN_VALID_SHARE:
         return None
     matrix = cv2.getPerspectiveTransform(corners.astype(np.float32), (there - low).astype(np.float32))
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

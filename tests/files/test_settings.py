@@ -43,17 +43,17 @@ def test_every_field_that_a_file_can_hold_is_explained():
 def test_values_arrive(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(
-        'method = "sift"\n[ncc]\nmargin = 2\n[ncc.errors]\nmap_m = 6.5\n[sift]\nmax_turn_deg = "none"\n',
+        'method = "sift"\n[ncc]\nexclusion_m = 2\n[ncc.errors]\nmap_m = 6.5\n[navigator]\nodometry = true\n',
         encoding="utf-8",
     )
     found = load_settings(path)
-    assert (found.method, found.ncc.margin, found.ncc.errors.map_m) == ("sift", 2.0, 6.5)
-    assert found.sift.max_turn_deg is None
+    assert (found.method, found.ncc.exclusion_m, found.ncc.errors.map_m) == ("sift", 2.0, 6.5)
+    assert found.navigator.odometry is True
     assert changed(found) == {
         "method": "sift",
-        "ncc.margin": 2.0,
+        "ncc.exclusion_m": 2.0,
         "ncc.errors.map_m": 6.5,
-        "sift.max_turn_deg": None,
+        "navigator.odometry": True,
     }
     assert changed(TrackSettings()) == {}
 
@@ -83,16 +83,16 @@ def test_the_command_line_counts_more_than_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("marign = 1", "marign: not a setting; did you mean margin?"),
+        ("exclusoin_m = 1", "exclusoin_m: not a setting; did you mean exclusion_m?"),
         ("[errors]\nmpa_m = 4", "errors.mpa_m: not a setting; did you mean map_m?"),
-        ("zebra = 1", "zebra: not a setting; expected one of margin, "),
-        ('margin = "wide"', "margin: expected a number, got 'wide'"),
-        ("margin = 0.5", "margin: expected 1 or more, got 0.5"),
+        ("zebra = 1", "zebra: not a setting; expected one of score, "),
+        ('exclusion_m = "wide"', "exclusion_m: expected a number, got 'wide'"),
+        ("exclusion_m = 0.0", "exclusion_m: expected a number above 0, got 0.0"),
         ("enhance_radius_px = 2.5", "enhance_radius_px: expected a whole number, got 2.5"),
         ("refine = 1", "refine: expected true or false, got 1"),
         ("errors = 3", "errors: expected a table, got 3"),
         ("[errors]\nmap_m = -1", "errors.map_m: expected a number above 0, got -1.0"),
-        ("margin = ", "expected TOML, got something else: "),
+        ("exclusion_m = ", "expected TOML, got something else: "),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path, text, message):

@@ -1,7 +1,7 @@
 """Truths about the pose: recovered where it is there, within its covariance, and refused where it is not."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -61,6 +61,10 @@ def solved(s: Scene, options: PoseOptions | None = None, **other: object) -> Pos
     result = solve_pose(s.points_m, s.points_px, K, options, **other)
     assert result is not None
     return result
+
+
+def reordered(s: Scene, order: np.ndarray) -> Scene:
+    return replace(s, points_m=s.points_m[order], points_px=s.points_px[order], wrong=s.wrong[order])
 
 
 NARROW = np.array([[9000.0, 0, 149.5], [0, 9000.0, 149.5], [0, 0, 1]])
@@ -219,7 +223,8 @@ def test_where_the_search_began_does_not_show():
     for _ in range(20):
         s = scene(rng, 120, noise_px=0.8, wrong=0.3, relief_m=10)
         prior = AttitudePrior(s.rotation, sigma_deg=1.0)
-        poses = [solved(s, PoseOptions(seed=seed), prior=prior) for seed in range(3)]
+        orders = [rng.permutation(len(s.points_m)) for _ in range(3)]
+        poses = [solved(reordered(s, order), prior=prior) for order in orders]
         free = solved(s, prior=AttitudePrior(scene(rng).rotation, sigma_deg=1e4))  # says nothing: RANSAC decides
         weak = solved(s)
         for pose in poses[1:]:
@@ -406,13 +411,10 @@ def test_a_little_relief_does_not_hide_the_ambiguity():
     ("options", "text"),
     [
         ({"reprojection_px": 0}, "reprojection_px: expected a positive number, got 0"),
-        ({"confidence": 1.0}, "confidence: expected a number in (0, 1), got 1.0"),
-        ({"max_iterations": 0}, "max_iterations: expected at least 1, got 0"),
         ({"distinct_px": -1}, "distinct_px: expected a positive number, got -1"),
         ({"min_inliers": 3}, "min_inliers: expected at least 4, got 3"),
         ({"max_log10_nfa": math.nan}, "max_log10_nfa: expected a number, got nan"),
-        ({"seed": -1}, "seed: expected at least 0, got -1"),
-        ({"noise_floor_px": math.inf}, "noise_floor_px: expected a positive number, got inf"),
+        ({"min_cost_gap": math.inf}, "min_cost_gap: expected a positive number, got inf"),
     ],
 )
 def test_wrong_options_are_named(options, text):

@@ -172,8 +172,8 @@ def test_settings_are_read_back_from_the_record():
         method="sift",
         budget_ms=40.0,
         risk=1e-3,
-        ncc=NccOptions(fraction=0.6),
-        sift=SiftOptions(max_turn_deg=None),
+        ncc=NccOptions(refine=False),
+        sift=SiftOptions(max_height_m=90.0),
     )
     record = json.loads(json.dumps(changed(settings)))
     assert options_from_mapping(TrackSettings, nested(record)) == settings
