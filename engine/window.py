@@ -10,6 +10,8 @@ from engine.values import Window
 
 MARGIN = 1.3
 """The margin of equations 4 and 5; the paper's."""
+LEVEL_OCTAVES = 0.25
+"""How much coarser than requested a level's pixels may be, in octaves."""
 SPREAD_SIGMAS = 3.0
 """How many standard deviations of the prior a window covers to each side."""
 
@@ -72,6 +74,6 @@ def level_crop(site: OrthoMap, window: Window, level: int, *, step_px: int = 1) 
     return Window(spans[0][0], spans[1][0], spans[0][1], spans[1][1])
 
 
-def level_for(gsd_m_per_px: float, wanted_m_per_px: float, levels: int) -> int:
-    """The pyramid level whose pixels are nearest to the requested size without being much coarser."""
-    return min(max(math.floor(math.log2(wanted_m_per_px / gsd_m_per_px) + 0.25), 0), levels - 1)
+def level_for(gsd_m_per_px: float, wanted_m_per_px: float, levels: int, coarser: float = LEVEL_OCTAVES) -> int:
+    """The coarsest pyramid level whose pixels are coarser than requested by at most this many octaves."""
+    return min(max(math.floor(math.log2(wanted_m_per_px / gsd_m_per_px) + coarser), 0), levels - 1)

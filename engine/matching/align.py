@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 # Beyond this angle off the vertical a footprint is stretched more than 4 times and relief occludes the ground.
 MAX_RAY_DEG = 75.0
-_MIN_DOWN = math.cos(math.radians(MAX_RAY_DEG))
+MIN_DOWN = math.cos(math.radians(MAX_RAY_DEG))
 # A frame finer than the map by more than this factor is averaged down first, to prevent aliasing.
 _MAX_SHRINK = 0.75
 _ASPECTS = np.array([1.0, 4 / 3, 3 / 4, 16 / 9, 9 / 16])
@@ -98,7 +98,7 @@ def view_of(
     enu_from_camera = camera.enu_from_camera(attitude)
     rays = camera.frame_rays @ enu_from_camera.T
     down = -rays[:, 2] / np.sqrt((rays * rays).sum(axis=1))
-    if down.min() < _MIN_DOWN:
+    if down.min() < MIN_DOWN:
         return None
     slope = np.zeros(2) if slope_m_per_px is None else slope_m_per_px
     px_from_enu = inverse_2x2(enu_jacobian)

@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.maps.landmarks import PREPARED_PX
-from engine.matching.align import ground_bounds_px
+from engine.matching.align import MIN_DOWN, ground_bounds_px
 from engine.matching.query import Query
 from engine.values import Attitude, NoFix, Window
-from engine.window import level_crop, level_for
+from engine.window import LEVEL_OCTAVES, level_crop, level_for
 
 _CROP_STEP_PX = 32
-_NO_LARGER = 2.0**-0.25  # level_for allows pixels larger by this factor
-_MIN_DOWN = 0.2  # cosine of the optical axis off the vertical
-_LEVEL_ENDS = 0.75  # a level serves pictures up to this many octaves coarser than it, see level_for
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +83,7 @@ def views_of(query: Query, hypothesis: TelemetryHypothesis, method: str, scale: 
         first, last = (level_for(1.0, height * per_height, site.levels) for height in heights_m)
     views: dict[int, MapView] = {}
     for level in range(first, last + 1):
-        served_m = heights_m[1] if level == last else 2 ** (level + _LEVEL_ENDS) / per_height
+        served_m = heights_m[1] if level == last else 2 ** (level + 1.0 - LEVEL_OCTAVES) / per_height
         window = _window(query, served_m, hypothesis.x_axis_deg is not None, method)
         if isinstance(window, NoFix):
             return window
@@ -102,7 +99,7 @@ def view_in(query: Query, window: Window, height_m: float, scale: float) -> MapV
 
 def level_at(query: Query, height_m: float, scale: float) -> int:
     """The level whose pixels are like those of a frame reduced to a scale, and no larger."""
-    return level_for(1.0, map_px_per_pixel(query, height_m, scale) * _NO_LARGER, query.site.levels)
+    return level_for(1.0, map_px_per_pixel(query, height_m, scale), query.site.levels, coarser=0.0)
 
 
 def drawn_px(query: Query, height_m: float, scale: float) -> float:
@@ -145,7 +142,7 @@ def _window(query: Query, height_m: float, has_heading: bool, method: str) -> Wi
 def slant_m(query: Query, height_m: float) -> float:
     """Distance to the ground along the optical axis at a height; bounded near the horizon."""
     attitude = query.telemetry.grid_attitude or Attitude(0.0, 0.0, 0.0)
-    return height_m / max(-float(query.camera.enu_from_camera(attitude)[2, 2]), _MIN_DOWN)
+    return height_m / max(-float(query.camera.enu_from_camera(attitude)[2, 2]), MIN_DOWN)
 
 
 def map_px_per_pixel(query: Query, height_m: float, scale: float = 1.0) -> float:
