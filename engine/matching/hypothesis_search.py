@@ -41,16 +41,12 @@ _MAX_COARSE_PX = 4_000_000  # of the map, likewise
 _MIN_TEMPLATE_PX = 20
 _MIN_QUICK_TEMPLATE_PX = 12  # of a quick look, whose result is kept only if beyond doubt
 _MIN_QUICK_SCORE, _MAX_QUICK_RIVAL = 0.5, 0.7  # at full resolution; the rival as a share of the score
-_CANDIDATES = 8
-_SEMIFINALISTS = 4
-_FINALISTS = 2
+_CANDIDATES = 8  # on the coarsest level; half of them are refined, and half of those at full resolution
 _HOPEFUL = 0.5  # of the best score: a lower place does not win by a better heading and height
 _MIN_GROUP, _MAX_GROUP_PX = 2, 4_000_000  # templates in one batch, or pixels of their surfaces, to bound memory
 _MAX_SHARE = 0.2  # of the height, by which it may be off
-_SLACK_PX = 3  # error of a place found on a level, in pixels of that level
-_EDGE_PX = 1.5  # error of the nearest hypothesis at the patch's corner
-_MIDDLE_ROUNDS = 2
-_FINE_ROUNDS = 2
+_EDGE_PX = 1.5  # error at the patch's corner by the nearest heading, and by the nearest height
+_ROUNDS = 2  # of fitting heading and height, on the middle level and at full resolution
 
 
 def reach_of(correlator: Correlator) -> Reach:
@@ -117,8 +113,8 @@ def _from_level(
         surprise = surprise_of(peak.score, score_sigma(aligned.template.size))
         if is_hopeless(Evidence(surprise, 0.0, tried, tried, None).nats, correlator.query.risk):
             return None
-        hopeful = [pair for pair in found[:_SEMIFINALISTS] if pair[0].score >= _HOPEFUL * found[0][0].score]
-        found = [_refined(correlator, *pair, _MIDDLE_ROUNDS) for pair in hopeful]
+        hopeful = [pair for pair in found[: _CANDIDATES // 2] if pair[0].score >= _HOPEFUL * found[0][0].score]
+        found = [_refined(correlator, *pair) for pair in hopeful]
         found.sort(key=lambda pair: -pair[0].score)
     return _best_at_full_resolution(correlator, found, first.level, refine=several)
 
@@ -241,15 +237,15 @@ def _separated(found: list[tuple[float, GridPose, Array]], distance_px: float) -
 
 
 def _near(correlator: Correlator, aligned: Aligned, nadir_px: Array, level: int) -> Peak | None:
-    """The peak within a few pixels of a nadir that was found on some level."""
-    return correlator.search(aligned, correlator.near(aligned, nadir_px, _SLACK_PX * 2**level))
+    """The peak near a nadir that was found on some level, as far as heading and height move a place there."""
+    return correlator.search(aligned, correlator.near(aligned, nadir_px, round(2.0 * _EDGE_PX * 2**level)))
 
 
-def _refined(correlator: Correlator, peak: Peak, aligned: Aligned, rounds: int) -> tuple[Peak, Aligned]:
+def _refined(correlator: Correlator, peak: Peak, aligned: Aligned) -> tuple[Peak, Aligned]:
     """Heading and height between the hypotheses: parabolas through three scores, over ever smaller steps."""
     step = 2.0 * _EDGE_PX / math.hypot(*aligned.template.shape)
     best = (peak, aligned)
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         for turn, share in ((step, 0.0), (0.0, step)):
             sides = [_moved(correlator, best, sign * turn, sign * share) for sign in (-1.0, 1.0)]
             if sides[0] is None or sides[1] is None:
@@ -289,7 +285,7 @@ def _best_at_full_resolution(
 ) -> tuple[Peak, Aligned] | None:
     """The best of a few places at full resolution; its rival is the best of the others."""
     final: list[tuple[Peak, Aligned]] = []
-    for peak, aligned in found[:_FINALISTS]:
+    for peak, aligned in found[: _CANDIDATES // 4]:
         nadir = correlator.nadir_px(peak, aligned)
         fine = correlator.align(aligned.pose, level, nadir)
         if isinstance(fine, NoFix):
@@ -298,7 +294,7 @@ def _best_at_full_resolution(
         if better is None:
             continue
         # Rivals are refined in heading and height like the winner, or refinement alone would create the lead.
-        final.append(_refined(correlator, better, fine, _FINE_ROUNDS) if refine else (better, fine))
+        final.append(_refined(correlator, better, fine) if refine else (better, fine))
     if not final:
         return None
     final.sort(key=lambda pair: -pair[0].score)
