@@ -32,20 +32,17 @@ from engine.matching.pnp import (
     reproject,
     turn_from_attitude,
 )
+from engine.matching.votes import chance_of_agreeing
 from engine.options import PoseOptions
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_SAMPLE = 3  # matches that determine a pose, up to ...
-_POSES_PER_SAMPLE = 4
 _MIRRORED_STEPS = 4  # for the other pose of a plane: enough to estimate its cost
-_PAIRED = 300  # projections compared with all image points for the probability of a chance inlier
 _SAME_POSE_DEG = 1.5
-_CLOSER = (1.0, 2.0, 4.0)  # factors on the tolerance, tried in turn
+_CLOSER = (1.0, 2.0, 4.0)  # factors on the tolerance, tried in turn; without the prior a pose starts from the last
 _CLOSE_SHARE, _CLOSE_INLIERS = 0.15, 12  # fewest inliers, as a share of those within the widest tolerance
 _START_SLACK = 2.0  # factor on the first step's tolerance from a pose that fits within a wider one
-_FREE_REACH = 4.0  # factor on the tolerance from which a pose without the prior starts
 # By how many times the inliers it must have more. Under right attitudes 134 frames of four flights had up to 1.07
 # times as many and one 1.16, under angles in radians, swapped or of the wrong sign each wrong pose but one 1.09.
 _CONTESTED = 1.1
@@ -270,7 +267,7 @@ def _without_wrong_prior(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     With an attitude ten degrees off, part of the frame still agrees, at a correspondingly wrong place.
     """
     free = replace(problem, attitude=None, precision=np.zeros((3, 3)))
-    wide = replace(free, tolerance_px=_FREE_REACH * problem.tolerance_px)
+    wide = replace(free, tolerance_px=_CLOSER[-1] * problem.tolerance_px)
     near = gauss_newton(wide, fit.rotation, fit.center)
     close = None if near is None else gauss_newton(free, near.rotation, near.center, slack=_START_SLACK)
     if close is None or np.count_nonzero(close.inliers) < _CONTESTED * np.count_nonzero(fit.inliers):
@@ -299,25 +296,16 @@ def _false_alarms(problem: Problem, fit: Fit, options: PoseOptions) -> tuple[flo
     """Return log10 of the expected number of poses with as many inliers of N matches by chance, and of all poses.
 
     NFA = (N - 3) C(N, k) C(k, 3) 4 p^(k - 3), k the distinct inliers (Moisan and Stival). p is the probability
-    that a wrong match is an inlier: the share of all pairs of a map point with an image point, of other matches
-    too, that agree with the pose. This accounts for clustered points, which a uniform density would not.
+    that a wrong match is an inlier. Three matches determine up to four poses.
     """
     total, k = problem.pixels.shape[1], _distinct(problem.pixels[:, fit.inliers], options)
     if k < options.min_inliers:
         return math.inf, 0.0
-    from engine.kernels import clusters  # numba takes a while to import
-
-    square = options.reprojection_px**2
-    own = slice(None, None, -(-total // _PAIRED))
-    some = fit.view.projected[:, own]
-    near = clusters.count_near_pairs(*map(np.ascontiguousarray, (*some, *problem.pixels)), options.reprojection_px)
-    agree = near - int(np.count_nonzero(fit.inliers[own]))
-    extent = np.ptp(problem.pixels, axis=1) + 1
-    uniform = math.pi * square / float(extent[0] * extent[1])
-    p = min(max(agree / (some.shape[1] * (total - 1)), uniform), 1.0)
+    area_px2 = float((np.ptp(problem.pixels, axis=1) + 1).prod())
+    p = chance_of_agreeing(fit.view.projected, problem.pixels, fit.inliers, options.reprojection_px, area_px2)
     distinct = total * k / np.count_nonzero(fit.inliers)  # among as many fewer in all
-    tried = _log10_choose(k, _SAMPLE) + math.log10((total - _SAMPLE) * _POSES_PER_SAMPLE)
-    return tried + _log10_choose(distinct, k) + (k - _SAMPLE) * math.log10(p), tried
+    tried = _log10_choose(k, 3) + math.log10(4 * (total - 3))
+    return tried + _log10_choose(distinct, k) + (k - 3) * math.log10(p), tried
 
 
 def _log10_choose(n: float, k: int) -> float:

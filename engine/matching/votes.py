@@ -20,7 +20,7 @@ TURNS_DEG = (0.0, -6.0, 6.0)
 SCALES = (1.0, 0.93, 1.075)
 """Scales to try, since a height may be wrong."""
 _RIVAL_RADII = 3.0  # from the best translation; closer votes may be its own, scattered by an unknown tilt
-_PAIRED = 300  # points compared with all others for the probability of a chance vote
+_PAIRED = 300  # points compared with all others for the probability that one agrees by chance
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,9 @@ def vote(photo_px: Array, map_px: Array, radius_px: float, distinct_px: float) -
     apart = shifts - shift_px
     elsewhere = np.einsum("ij,ij->i", apart, apart) > (_RIVAL_RADII * radius_px) ** 2
     rivals = np.flatnonzero(elsewhere)[clusters.densest(shifts[elsewhere], radius_px)]
-    by_chance = _chance(photo_px @ similarity(turn_deg, scale).T, map_px, shift_px, voters, radius_px)
+    placed_px = photo_px @ similarity(turn_deg, scale).T + shift_px
+    extent = np.ptp(map_px - placed_px, axis=0) + 2.0 * radius_px
+    by_chance = chance_of_agreeing(placed_px.T, map_px.T, voters, radius_px, float(extent.prod()))
     surprise, rival_surprise = (
         _surprise(photo_px[agreeing], len(map_px), by_chance, distinct_px) for agreeing in (voters, rivals)
     )
@@ -84,22 +86,31 @@ def vote(photo_px: Array, map_px: Array, radius_px: float, distinct_px: float) -
     return Vote(turn_deg, scale, voters, shift_px, surprise, rival_surprise, tried)
 
 
-def _chance(photo_px: Array, map_px: Array, shift_px: Array, voters: NDArray[np.bool_], radius_px: float) -> float:
-    """The probability that a wrong match agrees on a translation.
+def chance_of_agreeing(
+    predicted_px: Array, seen_px: Array, agree: NDArray[np.bool_], radius_px: float, area_px2: float
+) -> float:
+    """The probability that a wrong match agrees with a pose.
 
-    A match of each orthophoto point with the map point of another match is wrong, but as crowded as right ones:
-    it is the share of these that agree.
+    Where the pose predicts one match and where another is seen make a wrong match, but as crowded as right ones:
+    it is the share of these that agree. A uniform density would not see crowds.
+
+    Args:
+        predicted_px: (2, N) pixels at which the pose predicts the matches.
+        seen_px: (2, N) pixels at which they are.
+        agree: (N,) which matches agree.
+        radius_px: a match that is seen this close to its prediction agrees.
+        area_px2: that wrong matches scatter over; no less chance is assumed than if they did so evenly.
     """
     from engine.kernels import clusters  # numba takes a while to import
 
-    total = len(map_px)
+    total = seen_px.shape[1]
     some = slice(None, None, -(-total // _PAIRED))
-    columns = (*(photo_px[some] + shift_px).T, *map_px.T)
-    near = int(clusters.count_near_pairs(*map(np.ascontiguousarray, columns), radius_px))
-    agree = near - int(np.count_nonzero(voters[some]))
-    extent = np.ptp(map_px - photo_px, axis=0) + 2.0 * radius_px
-    uniform = math.pi * radius_px * radius_px / float(extent[0] * extent[1])
-    return min(max(agree / (len(photo_px[some]) * max(total - 1, 1)), uniform), 1.0)
+    own = predicted_px[:, some]
+    near = int(clusters.count_near_pairs(*map(np.ascontiguousarray, (*own, *seen_px)), radius_px))
+    wrong = near - int(np.count_nonzero(agree[some]))
+    uniform = math.pi * radius_px * radius_px / area_px2
+    share: float = wrong / (own.shape[1] * max(total - 1, 1))
+    return min(max(share, uniform), 1.0)
 
 
 def _surprise(agreeing_px: Array, total: int, chance: float, distinct_px: float) -> float:
