@@ -37,13 +37,12 @@ Array = NDArray[np.float64]
 # it is not, or if one failed as well.
 _COARSER, _MUCH_COARSER = 1, 2
 _TILTS_DEG = (-6.0, -3.0, 0.0, 3.0, 6.0)  # tried first about both axes if the tilt is unknown
-# Least correlation of an accepted pose. Without a known tilt true poses over simulated towns reached 0.53 and
-# wrong ones 0.32; with it true poses over a town in snow reached 0.29.
-_MIN_CORRELATION_WITHOUT_TILT = 0.45
-_MIN_CORRELATION = 0.2
-MIN_CORRELATION_AT_ONCE = 0.45
-"""Least correlation to accept the first attempt; below it coarser levels are tried and a known tilt is doubted.
+_MIN_CORRELATION = 0.2  # of an accepted pose with a known tilt: true poses over a town in snow reached 0.29
+CONFIRMING_CORRELATION = 0.45
+"""Least correlation of a pose that the picture itself confirms, without a known tilt or at the first attempt.
 
+Below it coarser levels are tried and a known tilt is doubted. Without a known tilt true poses over simulated towns
+reached 0.53 and wrong ones 0.32.
 By day the frames of three simulated flights reached 0.8 and more; in the evening, on a map from noon, half of them
 reached 0.6. Poses with a wrong tilt reached 0.30 to 0.35, and 0.87 as soon as the tilt was doubted.
 """
@@ -51,8 +50,8 @@ reached 0.6. Poses with a wrong tilt reached 0.30 to 0.35, and 0.87 as soon as t
 # of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; with correct angles all
 # were confirmed.
 _UNCONFIRMED_TILT_DEG = 1.5
-# Standard deviations of an attitude that the image does not confirm.
-_DOUBTED_TILT_DEG, _DOUBTED_HEADING_DEG = 6.0, 6.0
+# Standard deviation of each angle of an attitude that the image does not confirm.
+_DOUBTED_DEG = 6.0
 _HEIGHT_SHARE = 2e-4  # bias of the height from walls and the ground hidden behind them: 3 cm at 150 m
 _COARSE_SAMPLES = 800  # on a coarser level
 
@@ -83,7 +82,7 @@ class Refinement:
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
         refined = self._through_all(fix)
-        is_doubtful = refined is None or refined.score < MIN_CORRELATION_AT_ONCE
+        is_doubtful = refined is None or refined.score < CONFIRMING_CORRELATION
         if is_doubtful and has_tilt and query.site.has_surface:
             try:
                 refined = self._doubting()._through_all(fix) or refined
@@ -113,8 +112,8 @@ class Refinement:
         """The same for a frame whose attitude is hardly known."""
         frame = replace(
             self.query.frame,
-            tilt_sigma_deg=_DOUBTED_TILT_DEG,
-            heading_sigma_deg=max(self.query.frame.heading_sigma_deg or 0.0, _DOUBTED_HEADING_DEG),
+            tilt_sigma_deg=_DOUBTED_DEG,
+            heading_sigma_deg=max(self.query.frame.heading_sigma_deg or 0.0, _DOUBTED_DEG),
         )
         return replace(self, query=replace(self.query, frame=frame), knows_tilt=False)
 
@@ -167,7 +166,7 @@ class Refinement:
         return self._knows_tilt and not self.query.site.has_surface
 
     def _at_once(self, prior: GaussianPrior) -> DenseFit | None:
-        return self._through_levels(prior, 0, MIN_CORRELATION_AT_ONCE)
+        return self._through_levels(prior, 0, CONFIRMING_CORRELATION)
 
     def _through_levels(
         self, prior: GaussianPrior, coarser: int, min_correlation: float | None = None
@@ -179,7 +178,7 @@ class Refinement:
         query, site, height_m = self.query, self.query.site, self.query.telemetry.height_agl_m
         assert height_m is not None  # a fix by correlation had one
         own, has_tilt = query.level_of(height_m), self._knows_tilt
-        least = _MIN_CORRELATION if has_tilt else _MIN_CORRELATION_WITHOUT_TILT
+        least = _MIN_CORRELATION if has_tilt else CONFIRMING_CORRELATION
         pose, fit = prior.pose, None
         with query.scheduler.stage("dense"):  # one stage per pass; each may be skipped
             for level in range(min(own + coarser, site.levels - 1), own - 1, -1):

@@ -17,7 +17,7 @@ from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, Pose
 from engine.matching.ladder import Rung, Works, climb, rehearse
 from engine.matching.method import Method
 from engine.matching.query import Query
-from engine.matching.refinement import MIN_CORRELATION_AT_ONCE, Refinement, with_unconfirmed_tilt
+from engine.matching.refinement import CONFIRMING_CORRELATION, Refinement, with_unconfirmed_tilt
 from engine.matching.views import coarser_scale, drawn_px
 from engine.options import MatcherOptions, SiftOptions
 from engine.orthomap import OrthoMap
@@ -244,7 +244,7 @@ class Looks:
         assert self._few is not None  # or it was not offered
         refined = self._sift.refined(self._query, self._few)
         self._is_unrefinable = refined is None
-        if refined is None or not (self._is_certain or refined.score >= MIN_CORRELATION_AT_ONCE):
+        if refined is None or not (self._is_certain or refined.score >= CONFIRMING_CORRELATION):
             return None
         self._is_settled = True
         return refined
