@@ -13,6 +13,8 @@ from engine.values import MAX_SIGMA_M, GridPose, check_positive
 
 PROFILES = ("engine", "paper")
 MAP_FEATURES = ("prepared", "per_frame")
+PAPER_SCALE = 0.5
+"""To which the paper reduces frame and map before detection."""
 MIN_HEIGHT_M = 1.0
 """The lowest height to search if the height is unknown."""
 
@@ -44,7 +46,9 @@ class AssumedErrors:
     unknown_slope_deg: float = 2.0
 
     def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
+        check_positive(self, *(name for name in self.__dataclass_fields__ if name != "height_share"))
+        if not 0.0 <= self.height_share < math.inf:
+            raise OptionError(f"height_share: expected a number from 0 up, got {self.height_share}")
         for name in self.__dataclass_fields__:
             if getattr(self, name) > MAX_SIGMA_M:
                 raise OptionError(f"{name}: expected at most {MAX_SIGMA_M:g}, got {getattr(self, name):g}")
@@ -124,7 +128,7 @@ class SiftOptions:
     """Settings of the SIFT method.
 
     Attributes:
-        scale: the frame is reduced to this before detection; the paper's 0.5.
+        scale: the frame is reduced to this before detection.
         max_keypoints: features taken from a frame of usual size; the map's are as dense.
         keypoints_per_px: features taken from a larger frame, per map pixel that it covers on its level.
         backend: computes the features of frame and map: "compiled" loops (CPU) or "kornia" (any device); "auto"
@@ -148,7 +152,7 @@ class SiftOptions:
         errors: assumed errors of the telemetry and the map.
     """
 
-    scale: float = 0.5
+    scale: float = PAPER_SCALE
     max_keypoints: int = 300
     keypoints_per_px: float = 0.01
     backend: str = "auto"
@@ -202,7 +206,6 @@ class LearnedOptions:
         max_map_keypoints: most keypoints of a window.
         max_window_px: a window with more pixels on its level is not searched.
         tolerance_px: replaces SIFT's; networks locate points less exactly.
-        min_match_confidence: lowest confidence of a LoFTR match.
     """
 
     weights: tuple[str, ...] = ()
@@ -211,7 +214,6 @@ class LearnedOptions:
     max_map_keypoints: int = 2048
     max_window_px: int = 1 << 22
     tolerance_px: float = 2.0
-    min_match_confidence: float = 0.5
 
     def __post_init__(self) -> None:
         limits = {"max_picture_px": 4096, "max_window_px": 4096, "max_keypoints": 4, "max_map_keypoints": 4}
@@ -220,8 +222,6 @@ class LearnedOptions:
                 raise OptionError(f"{name}: expected {minimum} or more, got {getattr(self, name)}")
         if not 0.0 < self.tolerance_px < math.inf:
             raise OptionError(f"tolerance_px: expected a positive number, got {self.tolerance_px}")
-        if not 0.0 <= self.min_match_confidence <= 1.0:
-            raise OptionError(f"min_match_confidence: expected 0 to 1, got {self.min_match_confidence}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -33,7 +33,8 @@ Array = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
 MIN_SAMPLES = 60
-_STEPS = 12  # Gauss-Newton steps at most; four are usual
+MAX_STEPS = 12
+"""Gauss-Newton steps at most; four or five are usual."""
 _LAST_STEP = 0.5  # in standard deviations of the pose; the next one would be a tenth of it
 _EDGE_PX = 2.0  # border of the picture that is not sampled
 # The score vector is summed over 8 x 8 cells of the picture: the scatter of the sums accounts for errors that
@@ -195,7 +196,7 @@ def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: Gaussia
         picture.levels, picture.matrix, rotation, start.center_m, start.slope,
         prior_rotation, prior.pose.center_m, prior.pose.slope, prior.precision,
         offset_m, samples.values, samples.gradients, samples.weights,
-        _EDGE_PX, _CELLS, MIN_SAMPLES, _STEPS, _EXCESS, _LAST_STEP**2,
+        _EDGE_PX, _CELLS, MIN_SAMPLES, MAX_STEPS, _EXCESS, _LAST_STEP**2,
     )  # fmt: skip
     if not found:
         return None

@@ -26,7 +26,8 @@ BLOCK_PX = 4
 """Every block with this side gives one sample: the pixel with the steepest gradient."""
 MAX_CELLS = 256
 MAX_SAMPLES = 2000
-_ROUGH_REACH_PX = 1.5  # pixels of the level from a sample at which roughness is measured
+ROUGH_REACH_PX = 1.5
+"""Distance from a point of the map, in pixels, at which the roughness of its surface is measured."""
 
 
 class SampleMap:
@@ -99,7 +100,7 @@ class SampleMap:
         if mask is not None:
             weights = mask[rows, columns].astype(np.float64)
         height_m = self._site.surface_at(xy_px)
-        weights *= self._site.roughness_weight_at(xy_px, _ROUGH_REACH_PX * 2.0**level)
+        weights *= self._site.roughness_weight_at(xy_px, ROUGH_REACH_PX * 2.0**level)
         points = np.column_stack([self._site.enu_from_pixel(xy_px), height_m])
         per_px = np.stack([across[rows, columns], down[rows, columns]], axis=-1).astype(np.float64)
         metres_per_px = self._site.enu_jacobian(xy_px[len(xy_px) // 2]) * 2.0**level  # nearly constant over a cell

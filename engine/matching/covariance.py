@@ -92,14 +92,13 @@ def _with_accuracy(
 ) -> AssumedErrors:
     stated = {"heading_deg": heading_sigma_deg, "tilt_deg": tilt_sigma_deg}
     if height_sigma_m is not None:
-        stated |= {"height_m": height_sigma_m, "height_share": _NO_SHARE}
+        stated |= {"height_m": height_sigma_m, "height_share": 0.0}
     known = {name: value for name, value in stated.items() if value is not None}
     return replace(errors, **known) if known else errors
 
 
 _MAX_TURNED = math.radians(60.0)
 _ASIDE = math.tan(math.radians(2.0))  # of an axis that counts as vertical
-_NO_SHARE = 1e-6  # for a height whose standard deviation is stated as a whole
 # Neighbouring pixels share their noise: a square with this side counts as one.
 _CORRELATION_PX = 5.0
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.kernels.coarse_to_fine import WIDE_PX
 from engine.matching.align import Patch, rectify, view_of
 from engine.matching.correlation import Aligned, Correlator
 from engine.matching.pose import PoseStats
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
-
-_MAX_WINDOW_PX = 1 << 21  # of a window correlated as a whole; a larger one uses a coarser level
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +86,7 @@ def explain_correlation(correlator: Correlator, window: Window) -> Explanation:
     if pose.height_agl_m is None or pose.grid_heading_deg is None:
         return Explanation(query.gray)
     level = query.level_of(pose.height_agl_m)
-    while window.area_px >> 2 * level > _MAX_WINDOW_PX and level < site.levels - 1:
+    while window.area_px >> 2 * level > WIDE_PX and level < site.levels - 1:
         level += 1
     aligned = correlator.align(pose, level)
     if not isinstance(aligned, Aligned):

@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from engine.features import Features, Matches, match, sift
 from engine.geo import wrap_heading_deg
 from engine.maps.landmarks import MIN_CONTRAST, LandmarkMap, Landmarks, as_picture
+from engine.maps.samples import ROUGH_REACH_PX
 from engine.matching.align import Orthophoto, orthorectify
 from engine.matching.pose import PoseStart
 from engine.matching.query import Query
 from engine.matching.relief import ground_relief
 from engine.matching.views import MapView, TelemetryHypothesis, map_px_per_pixel, slant_m
 from engine.matching.votes import Vote, similarity, vote
-from engine.options import SiftOptions
+from engine.options import PAPER_SCALE, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Picture, all_on_host, all_placed, as_float, on_host, placed
 from engine.values import Attitude
@@ -33,9 +34,6 @@ if TYPE_CHECKING:  # it loads torch
 
 Array = NDArray[np.float64]
 
-NOMINAL_SCALE = 0.5
-"""The pose's tolerance refers to this; features of a coarser picture are less accurate."""
-_ROUGHNESS_REACH_PX = 1.5  # map pixels around a landmark over which the surface's roughness counts
 _BLUNT_PX = 1.6  # scale at which a keypoint's position variance is twice a small one's
 MAX_KEYPOINTS = 1000
 """Of the largest orthophoto."""
@@ -183,7 +181,7 @@ def _voted(
     radius_px = max(share_px, 2.0 * options.tolerance_px)
     middle = (np.array(photo.gray.shape[::-1]) - 1.0) / 2.0
     # A finer picture shows the same objects by more pixels: no more of its matches are independent.
-    distinct_px = options.pose.distinct_px * max(1.0, options.scale / NOMINAL_SCALE)
+    distinct_px = options.pose.distinct_px * max(1.0, options.scale / PAPER_SCALE)
     found = vote(photo_px - middle, map_px, radius_px, distinct_px)
     if found is None:
         return matched
@@ -264,7 +262,8 @@ def _by_reduced(query: Query, finder: PointFinder, options: SiftOptions, views: 
 
 
 def _frame_tolerance_px(options: SiftOptions) -> float:
-    return options.pose.reprojection_px * max(1.0, NOMINAL_SCALE / options.scale)
+    """The pose's tolerance; features of a coarser picture than the paper's are less accurate."""
+    return options.pose.reprojection_px * max(1.0, PAPER_SCALE / options.scale)
 
 
 def _reduce(query: Query, scale: float) -> _Reduced:
@@ -303,5 +302,5 @@ def lifted(site: OrthoMap, map_px: Array) -> Array:
 
 def _weights(site: OrthoMap, points_m: Array, scale_px: Array) -> Array:
     """Weights (N,) of matches: large keypoints are less accurate, and on a rough surface heights vary."""
-    roughness = site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), _ROUGHNESS_REACH_PX)
+    roughness = site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), ROUGH_REACH_PX)
     return roughness / (1.0 + (scale_px / _BLUNT_PX) ** 2)

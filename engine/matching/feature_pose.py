@@ -16,12 +16,12 @@ from engine.maps.landmarks import LandmarkMap
 from engine.matching.acceptance import judge_pose
 from engine.matching.covariance import tilt_covariance
 from engine.matching.evidence import Evidence, is_beyond_doubt, probability
-from engine.matching.feature_matching import NOMINAL_SCALE, Matched, match_views
+from engine.matching.feature_matching import Matched, match_views
 from engine.matching.pose import PoseStats, solve_pose
 from engine.matching.query import Query
 from engine.matching.views import TelemetryHypothesis, level_at, view_in, views_of, x_axis_deg
 from engine.matching.votes import Vote
-from engine.options import MIN_HEIGHT_M, AssumedErrors, SiftOptions
+from engine.options import MIN_HEIGHT_M, PAPER_SCALE, AssumedErrors, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, NoFix, Reason, Window
 
@@ -214,7 +214,7 @@ class FeatureMatcher:
         covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
         turns_rad2 = stats.covariance[3:, 3:] + tilt_covariance(stats.rotation, _slope_rad(site, options.errors))
         if not query.telemetry.has_tilt:  # features of a coarse picture share errors that look like a tilt
-            wider = max(1.0, NOMINAL_SCALE / options.scale) ** 2
+            wider = max(1.0, PAPER_SCALE / options.scale) ** 2
             covariance, turns_rad2 = covariance * wider, turns_rad2 * wider
         doubt_m = query.scale_doubt_m(nadir, up, stats.rotation[2], query.errors(options.errors))
         above_m = up - float(site.surface_at(nadir))

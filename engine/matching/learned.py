@@ -39,11 +39,9 @@ class Learned(Method):
 
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         own = options.learned
-        matcher = load_matcher(own.weights, device=device, min_confidence=own.min_match_confidence)
+        matcher = load_matcher(own.weights, device=device)
         self.keypoints = KeypointMap(site, matcher) if isinstance(matcher, KeypointMatcher) else None
-        self.finder = PointFinder(
-            matcher, self.keypoints, own.max_keypoints, own.max_map_keypoints, own.max_window_px
-        )
+        self.finder = PointFinder(matcher, self.keypoints, own)
         # The frame is turned upright for the network; without the heading a second look would see less.
         self.options = replace(options.sift, second_look=False, tolerance_px=own.tolerance_px)
         self.max_picture_px = own.max_picture_px

@@ -22,17 +22,16 @@ from engine.matching.explanation import (
 )
 from engine.matching.method import Method
 from engine.matching.query import Query
-from engine.values import Attitude, Reason, Result, Window
+from engine.options import PAPER_SCALE
+from engine.values import MAX_SIGMA_M, Attitude, Reason, Result, Window
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Scores = NDArray[np.float32]
 
-SCALE = 0.5
 RATIO = 0.8  # the paper gives none; Lowe's own
 REPROJECTION_PX = 4.0
 SIGMA_M = 2.4  # the paper states no covariance; this is the RMS error that it reports
-_MAX_DISTANCE_M = 1e6
 _COVARIANCE_M2 = SIGMA_M**2 / 2.0 * np.eye(3)
 
 
@@ -151,7 +150,9 @@ def surface(template: Gray, search: Gray) -> Scores:
 def matches(gray: Gray, search: Gray) -> tuple[Array, Array] | None:
     """Points (M, 2) of the frame and of the window that SIFT matches at half scale; None without features."""
     detector = cv2.SIFT_create()
-    halves = [cv2.resize(p, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA) for p in (gray, search)]
+    halves = [
+        cv2.resize(p, None, fx=PAPER_SCALE, fy=PAPER_SCALE, interpolation=cv2.INTER_AREA) for p in (gray, search)
+    ]
     (frame_points, frame_words), (map_points, map_words) = (
         detector.detectAndCompute(half, None) for half in halves
     )
@@ -160,7 +161,7 @@ def matches(gray: Gray, search: Gray) -> tuple[Array, Array] | None:
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(frame_words, map_words, k=2)
     good = [best for best, second in pairs if best.distance < RATIO * second.distance]
     found = ([frame_points[m.queryIdx].pt for m in good], [map_points[m.trainIdx].pt for m in good])
-    frame_px, map_px = ((np.array(points).reshape(-1, 2) + 0.5) / SCALE - 0.5 for points in found)
+    frame_px, map_px = ((np.array(points).reshape(-1, 2) + 0.5) / PAPER_SCALE - 0.5 for points in found)
     return frame_px, map_px
 
 
@@ -174,6 +175,6 @@ def _pose(query: Query, points_px: Array, map_px: Array) -> tuple[Array, Array, 
         return "PnP found no pose"
     rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
     center = np.asarray(-rotation.T @ np.asarray(shift, dtype=np.float64).ravel())
-    if not (np.abs(center) < _MAX_DISTANCE_M).all():  # PnP reports success on NaN and at any distance
+    if not (np.abs(center) < MAX_SIGMA_M).all():  # PnP reports success on NaN and at any distance
         return "PnP found no finite pose"
     return rotation, center, len(inliers) / len(points_px)

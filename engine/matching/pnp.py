@@ -18,6 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.kernels.dense import MAX_STEPS
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
@@ -25,7 +27,6 @@ Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
 _MAX_SAMPLES = 1000  # that RANSAC draws
 _CONFIDENCE = 0.999  # at which it stops early
 _NOISE_FLOOR_PX = 0.05  # least standard deviation assumed for an image point's x and y
-_STEPS = 12  # Gauss-Newton steps at most; four or five are usual
 _STEP_SIGMAS = 2e-2  # stop after a step this small, in standard deviations of the pose
 _PAIRS = 24  # pairs of matches that give candidate centres if the attitude is known
 _SLACK = 3.0  # factor on the tolerance at the start, for the error of a known attitude
@@ -175,7 +176,7 @@ def reproject(problem: Problem, R: Array, center: Array) -> Reprojection:
 
 
 def gauss_newton(
-    problem: Problem, R: Array, center: Array, *, steps: int = _STEPS, slack: float = 1.0
+    problem: Problem, R: Array, center: Array, *, steps: int = MAX_STEPS, slack: float = 1.0
 ) -> Fit | None:
     """Iterate Gauss-Newton with Tukey's biweight; each step updates the inliers and their variance.
 

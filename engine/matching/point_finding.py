@@ -14,6 +14,7 @@ from engine.maps.landmarks import as_picture
 from engine.matching.align import RIM_PX
 from engine.matching.query import Query
 from engine.matching.views import MapView
+from engine.options import LearnedOptions
 from engine.runtime.device import Picture, as_tensor
 from engine.runtime.tensors import torch
 
@@ -27,20 +28,16 @@ class PointFinder:
     Attributes:
         matcher: matches two pictures.
         keypoints: of the map, if the matcher uses any.
-        max_keypoints: of a frame.
-        max_map_keypoints: of a window.
-        max_window_px: upper bound on the pixels of a view.
+        options: limits of keypoints and windows; None, without keypoints, has none.
     """
 
     matcher: PairMatcher
     keypoints: KeypointMap | None = None
-    max_keypoints: int = 512
-    max_map_keypoints: int = 2048
-    max_window_px: int | None = None
+    options: LearnedOptions | None = None
 
     def too_large(self, view: MapView) -> bool:
         """Whether a view is too large to search."""
-        return self.max_window_px is not None and view.crop.area_px > self.max_window_px
+        return self.options is not None and view.crop.area_px > self.options.max_window_px
 
     def find(self, query: Query, picture: Picture, valid: NDArray[np.bool_], view: MapView) -> tuple[Array, Array]:
         """The points that a picture and a view share.
@@ -56,7 +53,10 @@ class PointFinder:
         """
         picture = _plain_outside(as_tensor(picture), valid)
         if self.keypoints is not None and isinstance(self.matcher, KeypointMatcher):
-            points, places = self._by_keypoints(query, view, picture, self.matcher, self.keypoints, valid)
+            assert self.options is not None  # whoever has keypoints has limits
+            points, places = self._by_keypoints(
+                query, view, picture, self.matcher, self.keypoints, valid, self.options
+            )
         else:
             with query.scheduler.stage("match"), torch.inference_mode():
                 crop = as_tensor(as_picture(query.site.gray(view.crop, view.level), query.device))
@@ -74,14 +74,15 @@ class PointFinder:
         matcher: KeypointMatcher,
         known: KeypointMap,
         valid: NDArray[np.bool_],
+        options: LearnedOptions,
     ) -> tuple[Array, Array]:
         """Matched pixels of picture and crop; the crop's keypoints are looked up."""
         with query.scheduler.stage("frame features"):
-            mine = matcher.extract(picture, 4 * self.max_keypoints)
-            shown = np.flatnonzero(_is_valid(_points(mine.xy_px), valid))[: self.max_keypoints]
+            mine = matcher.extract(picture, 4 * options.max_keypoints)
+            shown = np.flatnonzero(_is_valid(_points(mine.xy_px), valid))[: options.max_keypoints]
             mine = mine.only(torch.from_numpy(shown).to(mine.xy_px.device))
         with query.scheduler.stage("map features"):
-            theirs = known.find(view.crop, view.level, self.max_map_keypoints)
+            theirs = known.find(view.crop, view.level, options.max_map_keypoints)
         with query.scheduler.stage("match"):
             size, crop_size = (valid.shape[1], valid.shape[0]), (view.crop.width_px, view.crop.height_px)
             pairs = matcher.match(mine, size, theirs, crop_size)

@@ -29,7 +29,6 @@ _WIDTHS = (0.175, 0.35, 0.7, 1.4)
 # 98 % of poses agreed to this share of the height (the peak is as inexact), over hills of 8 to 30 m 19 to 33 %.
 _MAX_APART_SHARE = 0.0067
 _MAX_DEG = 20.0  # of the assumed slope: twice as steep is a wall
-_REACH_SHARE = 1.0  # of the height: sloping ground nearby rises or falls by this distance times its slope
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +94,8 @@ def _mixed(pose: Pose, steps: Array, covariances: Array, weights: Array, height_
     between = steps - step
     covariance = np.einsum("k,kij->ij", weights, covariances) + (weights[:, None] * between).T @ between
     slope = pose.slope + step[6:]
-    # Sloping ground is seldom a plane: nearby it rises or falls by about as much.
-    relief_m2 = (_REACH_SHARE * height_m) ** 2 * 0.5 * float(slope @ slope + np.trace(covariance[6:, 6:]))
+    # Sloping ground is seldom a plane: as far away as the camera is high it rises or falls by about as much.
+    relief_m2 = height_m**2 * 0.5 * float(slope @ slope + np.trace(covariance[6:, 6:]))
     covariance[2, 2] += relief_m2
     rotation = cv2.Rodrigues(step[3:6])[0] @ pose.rotation
     return SlopeFit(Pose(rotation, pose.center_m + step[:3], slope), covariance)

@@ -167,7 +167,7 @@ def test_weights_are_a_setting(tmp_path):
 
 
 def test_settings_of_the_learned_method_are_checked():
-    for name, value in (("max_keypoints", 1), ("max_picture_px", 10), ("min_match_confidence", 2.0)):
+    for name, value in (("max_keypoints", 1), ("max_picture_px", 10), ("max_window_px", 10)):
         with pytest.raises(OptionError, match=f"{name}: expected"):
             LearnedOptions(**{name: value})
     assert SiftOptions().second_look  # the learned method turns it off for itself alone
