@@ -29,10 +29,10 @@ METHOD = "ncc"
 MIN_VALID_SHARE = 0.9
 """A place counts only if this share of the patch lies on valid map."""
 _COARSER = (0, 1, 2)  # levels above the frame's own that may be matched if time is short
-_MIN_SIDE_PX = 24  # of the template there
+MIN_SIDE_PX = 24
+"""Least side of a template on a coarser level."""
 _EVERY_PLACE = "every place of a wide window"  # a step
-_GROUND_SHARE = 0.3  # of the height: the ground this close to a frame's middle is fitted by a plane
-_SPREAD_SIGMAS = 2.0  # or within so many sigmas of the prior, if that is farther
+_GROUND_SHARE = 0.3  # of the height: the ground fitted by a plane, or the spread of the prior if that is wider
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ class Correlator:
         query = self.query
         reach_m, place = _GROUND_SHARE * height_m, nadir_px
         if place is None and query.prior is not None:
-            reach_m, place = max(reach_m, _SPREAD_SIGMAS * query.prior.sigma_m), query.prior_px
+            reach_m, place = max(reach_m, SPREAD_SIGMAS * query.prior.sigma_m), query.prior_px
         if place is None:
             return np.zeros(2)
         return query.site.ground_plane(place + view.center_px * 2.0**level, reach_m)[1] * 2.0**level
@@ -293,7 +293,7 @@ def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:
         gsd_m = site.gsd_m_per_px * 2.0 ** (own + coarser)
         per_px = height_m / (camera.focal_px * gsd_m)
         side_px = FRACTION * min(camera.width_px, camera.height_px) * per_px
-        if coarser == 0 or (own + coarser < site.levels and side_px >= _MIN_SIDE_PX):
+        if coarser == 0 or (own + coarser < site.levels and side_px >= MIN_SIDE_PX):
             slack_px = 2.0 * SPREAD_SIGMAS * query.prior.sigma_m / gsd_m
             width, height = (MARGIN * n * per_px + slack_px for n in (camera.width_px, camera.height_px))
             rows, columns = site.level_shape(own + coarser)  # no window is larger

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from engine.kernels.coarse_to_fine import surfaces_over_nodata
 from engine.kernels.peaks import best_positions
 from engine.maps.prepared import Region
-from engine.matching.correlation import MIN_VALID_SHARE, Aligned, Correlator
+from engine.matching.correlation import MIN_SIDE_PX, MIN_VALID_SHARE, Aligned, Correlator
 from engine.matching.covariance import score_sigma
-from engine.matching.evidence import Evidence, is_hopeless, surprise_of
+from engine.matching.evidence import Evidence, is_beyond_doubt, is_hopeless, surprise_of
 from engine.matching.peak_evidence import places_in
 from engine.ncc_fft import surfaces
 from engine.runtime.device import Picture, placed
@@ -37,13 +37,8 @@ OWN = (0.0, 0.0)
 # Most hypotheses times places on the coarse level, unless the template gets too small: in all, and in multiples of
 # the places of one look at the frame's own level.
 _MAX_COARSE_PLACES, _MAX_LOOKS = 32_000_000, 16
-_MAX_COARSE_PX = 4_000_000  # of the map, likewise
-_MIN_TEMPLATE_PX = 20
-_MIN_QUICK_TEMPLATE_PX = 12  # of a quick look, whose result is kept only if beyond doubt
-_MIN_QUICK_SCORE, _MAX_QUICK_RIVAL = 0.5, 0.7  # at full resolution; the rival as a share of the score
+_MAX_COARSE_PX = 4_000_000  # of the map, likewise; and of the surfaces in memory at once
 _CANDIDATES = 8  # on the coarsest level; half of them are refined, and half of those at full resolution
-_HOPEFUL = 0.5  # of the best score: a lower place does not win by a better heading and height
-_MIN_GROUP, _MAX_GROUP_PX = 2, 4_000_000  # templates in one batch, or pixels of their surfaces, to bound memory
 _MAX_SHARE = 0.2  # of the height, by which it may be off
 _EDGE_PX = 1.5  # error at the patch's corner by the nearest heading, and by the nearest height
 _ROUNDS = 2  # of fitting heading and height, on the middle level and at full resolution
@@ -72,10 +67,10 @@ def search(
     level, poses = _coarse_level(correlator, first, window, reach)
     if level == first.level and len(poses) == 1:
         return correlator.search(first, window), first, 1
-    quick = _quick_level(correlator, first, level, reach)
+    quick, tried = _quick_level(correlator, first, level, reach), len(poses) * places_in(first, window)
     if quick is not None:
         best = _from_level(correlator, first, window, *quick)
-        if best is not None and _is_clear(best[0]):
+        if best is not None and is_beyond_doubt(_nats(*best, tried), correlator.query.risk):
             return *best, len(poses)
     return *(_from_level(correlator, first, window, level, poses) or (None, first)), len(poses)
 
@@ -83,16 +78,18 @@ def search(
 def _quick_level(
     correlator: Correlator, first: Aligned, level: int, reach: Reach
 ) -> tuple[int, list[GridPose]] | None:
-    """Search one level above, with fewer hypotheses, at a sixteenth of the cost; None if too little is left."""
+    """Search one level above, with fewer hypotheses, at a sixteenth of the cost; None above the coarsest."""
     above = level + 1
-    side_px, turns, shares = _grid_on(first, above, reach)
-    if above == correlator.query.site.levels or side_px < _MIN_QUICK_TEMPLATE_PX:
+    if above == correlator.query.site.levels:
         return None
+    _, turns, shares = _grid_on(first, above, reach)
     return above, _hypotheses(correlator.query.telemetry, turns, shares)
 
 
-def _is_clear(peak: Peak) -> bool:
-    return peak.score >= _MIN_QUICK_SCORE and peak.second_score <= _MAX_QUICK_RIVAL * peak.score
+def _nats(peak: Peak, aligned: Aligned, tried: float) -> float:
+    """The evidence for the best of so many places under all hypotheses."""
+    sigma = score_sigma(aligned.template.size)
+    return Evidence(surprise_of(peak.score, sigma), surprise_of(peak.second_score, sigma), tried, tried, None).nats
 
 
 def _from_level(
@@ -110,11 +107,9 @@ def _from_level(
     several = len(poses) > 1
     if several and found:
         (peak, aligned), tried = found[0], len(poses) * places_in(first, window)
-        surprise = surprise_of(peak.score, score_sigma(aligned.template.size))
-        if is_hopeless(Evidence(surprise, 0.0, tried, tried, None).nats, correlator.query.risk):
+        if is_hopeless(_nats(replace(peak, second_score=0.0), aligned, tried), correlator.query.risk):
             return None
-        hopeful = [pair for pair in found[: _CANDIDATES // 2] if pair[0].score >= _HOPEFUL * found[0][0].score]
-        found = [_refined(correlator, *pair) for pair in hopeful]
+        found = [_refined(correlator, *pair) for pair in found[: _CANDIDATES // 2]]
         found.sort(key=lambda pair: -pair[0].score)
     return _best_at_full_resolution(correlator, found, first.level, refine=several)
 
@@ -139,7 +134,7 @@ def _coarse_level(
         side_px, turns, shares = _grid_on(first, level, reach)
         area_px = window.area_px / 4**level
         few = area_px <= _MAX_COARSE_PX and len(turns) * len(shares) * area_px <= most
-        if few or level + 1 == levels or side_px >> 1 < _MIN_TEMPLATE_PX:
+        if few or level + 1 == levels or side_px >> 1 < MIN_SIDE_PX:
             return level, _hypotheses(correlator.query.telemetry, turns, shares)
         level += 1
 
@@ -204,7 +199,7 @@ def _coarse(
 def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.float32]) -> Iterator[Picture]:
     """Yield one surface (H', W') at a time; only a few are in memory."""
     area_px = region.window.width_px * region.window.height_px
-    group = max(_MIN_GROUP, _MAX_GROUP_PX // area_px)
+    group = max(1, _MAX_COARSE_PX // area_px)
     if region.valid is None:
         own = placed(templates, correlator.query.device)
         for several in surfaces(region.search, own, group=group):

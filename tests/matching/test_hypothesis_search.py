@@ -135,7 +135,7 @@ def test_a_place_beyond_doubt_at_a_quick_look_is_that_of_the_thorough_one(
     unknown = replace(flight.frames[5], **ANY_HEADING)
     quick = matcher().locate(unknown)
     levels = list(looked_on)
-    monkeypatch.setattr(hypothesis_search, "_MIN_QUICK_SCORE", 2.0)  # nothing is beyond doubt
+    monkeypatch.setattr(hypothesis_search, "is_beyond_doubt", lambda nats, risk: False)
     thorough = matcher().locate(unknown)
     assert len(levels) == 1
     assert looked_on == [*levels, *levels, levels[0] - 1]
