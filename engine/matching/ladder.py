@@ -11,6 +11,8 @@ from engine.matching.query import Query
 from engine.runtime.scheduler import OutOfTime, Scheduler
 from engine.values import Fix, NoFix, Reason, Result
 
+SHARES = (1.0, 0.5)
+"""Of the scale at which features are matched, a level of the map apart; the smaller if time is short."""
 Works = Mapping[Hashable, float]
 """Steps, as the scheduler knows them, by their work."""
 

@@ -11,7 +11,7 @@ from engine.learned import KeypointMatcher, load_matcher
 from engine.maps.keypoints import KeypointMap
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import FeatureMatcher
-from engine.matching.ladder import Rung, Works, climb
+from engine.matching.ladder import SHARES, Rung, Works, climb
 from engine.matching.method import Method
 from engine.matching.point_finding import PointFinder
 from engine.matching.query import Query
@@ -22,7 +22,6 @@ from engine.runtime.device import Device
 from engine.values import Fix, Result, Window
 
 METHOD = "learned"
-_REDUCED = (1.0, 0.5)  # of the scale at which the frame is matched; the smaller if time is short
 
 
 class Learned(Method):
@@ -55,7 +54,7 @@ class Learned(Method):
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that time allows."""
-        works: Works = {(METHOD, share): query.gray.size * self._scale(query, share) ** 2 for share in _REDUCED}
+        works: Works = {(METHOD, share): query.gray.size * self._scale(query, share) ** 2 for share in SHARES}
         return climb(query, METHOD, [Rung(lambda _: works, partial(self._match, query))])
 
     def _match(self, query: Query, answer: Result | None, step: Hashable) -> Result:

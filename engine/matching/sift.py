@@ -14,7 +14,7 @@ from engine.matching.align import SIDE_STEP_PX
 from engine.matching.evidence import is_beyond_doubt, nats_of
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate
-from engine.matching.ladder import Rung, Works, climb, rehearse
+from engine.matching.ladder import SHARES, Rung, Works, climb, rehearse
 from engine.matching.method import Method
 from engine.matching.query import Query
 from engine.matching.refinement import CONFIRMING_CORRELATION, Refinement, with_unconfirmed_tilt
@@ -24,7 +24,6 @@ from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
 from engine.values import Fix, NoFix, Result, Window
 
-_REDUCED = (1.0, 0.7, 0.5)  # of the scale at which the frame is matched; the smaller if time is short
 _FEW_SHARE = 0.5  # of the keypoints, if a pose is refined from few
 _FEW, _REFINEMENT = "sift by few features", "refinement of sift"  # steps
 
@@ -165,8 +164,8 @@ class Sift(Method):
         else:
             step = METHOD
         if known.height_agl_m is None or known.grid_heading_deg is None:
-            return {(step, share): query.gray.size * (scale * share) ** 2 for share in _REDUCED}
-        return {(step, share): drawn_px(query, known.height_agl_m, scale * share) for share in _REDUCED}
+            return {(step, share): query.gray.size * (scale * share) ** 2 for share in SHARES}
+        return {(step, share): drawn_px(query, known.height_agl_m, scale * share) for share in SHARES}
 
     def at_scale(self, query: Query, share: float) -> Result:
         """The fix by all features at a share of the usual scale, not refined; or its refusal."""
