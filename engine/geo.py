@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from statistics import NormalDist
 from typing import TypeVar
 
 import numpy as np
@@ -261,6 +262,13 @@ def chi_square(difference: Array, covariance: Array) -> float:
             return math.inf
         return float(squared / allowed) if allowed > 0.0 else 0.0
     return float(across / determinant)
+
+
+def chi_square_of(probability: float, degrees: int) -> float:
+    """The chi-square that chance exceeds with a probability, for one or two degrees of freedom."""
+    if degrees == 1:
+        return NormalDist().inv_cdf(1.0 - probability / 2.0) ** 2
+    return -2.0 * math.log(probability)
 
 
 def inverse_2x2(matrix: Array) -> Array:

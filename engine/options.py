@@ -76,7 +76,6 @@ class PoseOptions:
             many inliers by chance.
         min_spread_px: Smallest standard deviation of the inliers in the image, in the direction of smallest
             spread; below it they are nearly collinear.
-        min_cost_gap: Chi-square by which the pose must beat the second pose that a plane allows.
     """
 
     reprojection_px: float = 3.0
@@ -84,10 +83,9 @@ class PoseOptions:
     distinct_px: float = 16.0
     max_log10_nfa: float = -6.0
     min_spread_px: float = 6.0
-    min_cost_gap: float = 9.0
 
     def __post_init__(self) -> None:
-        for name in ("reprojection_px", "distinct_px", "min_spread_px", "min_cost_gap"):
+        for name in ("reprojection_px", "distinct_px", "min_spread_px"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name}: expected a positive number, got {getattr(self, name)}")
         if self.min_inliers < 4:

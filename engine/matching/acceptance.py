@@ -11,17 +11,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.geo import chi_square
+from engine.geo import chi_square, chi_square_of
 from engine.matching.evidence import Evidence, needed_nats, probability
 from engine.values import Fix, Peak, Reason
 
 Array = NDArray[np.float64]
 
-CONSISTENT_CHI_SQUARE = 13.8
-"""Chi-square of the difference of two positions that chance exceeds once in a thousand, two degrees of freedom."""
-_HEIGHT_CHI_SQUARE = 16.0  # of the difference of two heights, one degree of freedom
-
-
+CHANCE = 1e-3
+"""Two estimates contradict each other if chance sets them so far apart less often than this."""
 Refusal = tuple[Reason, str]
 """Why a match is not accepted, and the figures behind it."""
 
@@ -83,9 +80,9 @@ def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:
         covariance_m2: (2, 2) sum of their covariances.
 
     Returns:
-        bool: False if chance alone would set them this far apart less than once in a thousand.
+        bool: False if they contradict each other, see :data:`CHANCE`.
     """
-    return chi_square(apart_m, covariance_m2) <= CONSISTENT_CHI_SQUARE
+    return chi_square(apart_m, covariance_m2) <= chi_square_of(CHANCE, 2)
 
 
 def offset_between_m(first: Fix, second: Fix) -> Array:
@@ -118,4 +115,4 @@ def agree_in_height(first: Fix, second: Fix) -> bool:
         return True
     variance_m2 = float(first.covariance_m2[2, 2] + second.covariance_m2[2, 2])
     variance_m2 -= first.map_sigma_m**2 + second.map_sigma_m**2  # they share this error
-    return (first.up_m - second.up_m) ** 2 <= _HEIGHT_CHI_SQUARE * variance_m2
+    return (first.up_m - second.up_m) ** 2 <= chi_square_of(CHANCE, 1) * variance_m2

@@ -19,17 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.dense import MAX_STEPS
+from engine.matching.acceptance import CHANCE
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
 
 _MAX_SAMPLES = 1000  # that RANSAC draws
-_CONFIDENCE = 0.999  # at which it stops early
 _NOISE_FLOOR_PX = 0.05  # least standard deviation assumed for an image point's x and y
 _STEP_SIGMAS = 2e-2  # stop after a step this small, in standard deviations of the pose
 _PAIRS = 24  # pairs of matches that give candidate centres if the attitude is known
-_SLACK = 3.0  # factor on the tolerance at the start, for the error of a known attitude
+SLACK = 2.0
+"""Factor on the tolerance at the start, for the error of a known attitude or of a pose that fits roughly."""
 _REACH_SIGMAS = 4.0
 _MIN_EIGENVALUE = 1e-7  # of the correlation matrix; below it some direction is not determined
 
@@ -109,7 +110,7 @@ def ransac(problem: Problem) -> Start | None:
     """
     params = cv2.UsacParams()
     params.threshold = problem.tolerance_px
-    params.confidence = _CONFIDENCE
+    params.confidence = 1.0 - CHANCE
     params.maxIterations = _MAX_SAMPLES
     params.randomGeneratorState = 0
     params.sampler = cv2.SAMPLING_UNIFORM
@@ -147,11 +148,11 @@ def refine_from_attitude(problem: Problem) -> Fit | None:
     seen = x[:, None, :] - centers[:, :, None]
     residual = problem.K[:2, :2] @ (seen[:2] / np.maximum(seen[2], 1e-9)).reshape(2, -1)
     residual = residual.reshape(2, _PAIRS, count) + (problem.K[:2, 2:] - problem.pixels)[:, None, :]
-    near = np.sum(residual * residual, axis=0) <= (_SLACK * problem.tolerance_px) ** 2
+    near = np.sum(residual * residual, axis=0) <= (SLACK * problem.tolerance_px) ** 2
     best = int(np.argmax(np.count_nonzero(near, axis=1)))
     if 2 * np.count_nonzero(near[best]) <= count:
         return None
-    fit = gauss_newton(problem, R, R.T @ centers[:, best], slack=_SLACK)
+    fit = gauss_newton(problem, R, R.T @ centers[:, best], slack=SLACK)
     return fit if fit is not None and 2 * np.count_nonzero(fit.inliers) > count else None
 
 
@@ -175,16 +176,13 @@ def reproject(problem: Problem, R: Array, center: Array) -> Reprojection:
     return Reprojection(*pose_fit.reproject(problem.points, problem.pixels, problem.K, rotation, center))
 
 
-def gauss_newton(
-    problem: Problem, R: Array, center: Array, *, steps: int = MAX_STEPS, slack: float = 1.0
-) -> Fit | None:
+def gauss_newton(problem: Problem, R: Array, center: Array, *, slack: float = 1.0) -> Fit | None:
     """Iterate Gauss-Newton with Tukey's biweight; each step updates the inliers and their variance.
 
     Args:
         problem: The matches.
         R: (3, 3) initial rotation.
         center: (3,) initial centre.
-        steps: Upper bound on the number of steps.
         slack: Factor on the tolerance in the first step.
 
     Returns:
@@ -197,7 +195,7 @@ def gauss_newton(
     found, rotation, center, tangents, projected, squared, inliers, information, variance = fit_pose(
         problem.points, problem.pixels, problem.K, problem.weights, attitude, problem.precision,
         problem.tolerance_px, _NOISE_FLOOR_PX, problem.min_inliers,
-        rotation, center, steps, slack, _REACH_SIGMAS, _STEP_SIGMAS,
+        rotation, center, MAX_STEPS, slack, _REACH_SIGMAS, _STEP_SIGMAS,
     )  # fmt: skip
     if not found:
         return None

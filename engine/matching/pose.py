@@ -21,7 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
+from engine.geo import chi_square_of
+from engine.matching.acceptance import CHANCE
 from engine.matching.pnp import (
+    SLACK,
     Fit,
     Problem,
     Reprojection,
@@ -38,11 +41,9 @@ from engine.options import PoseOptions
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_MIRRORED_STEPS = 4  # for the other pose of a plane: enough to estimate its cost
 _SAME_POSE_DEG = 1.5
 _CLOSER = (1.0, 2.0, 4.0)  # factors on the tolerance, tried in turn; without the prior a pose starts from the last
 _CLOSE_SHARE, _CLOSE_INLIERS = 0.15, 12  # fewest inliers, as a share of those within the widest tolerance
-_START_SLACK = 2.0  # factor on the first step's tolerance from a pose that fits within a wider one
 # By how many times the inliers it must have more. Under right attitudes 134 frames of four flights had up to 1.07
 # times as many and one 1.16, under angles in radians, swapped or of the wrong sign each wrong pose but one 1.09.
 _CONTESTED = 1.1
@@ -255,7 +256,7 @@ def _fit_from(problem: Problem, start: PoseStart, origin: Array) -> Fit | None:
     enough = max(_CLOSE_SHARE * np.count_nonzero(near.inliers), _CLOSE_INLIERS)
     for factor in _CLOSER:
         closer = replace(problem, tolerance_px=min(factor * problem.tolerance_px, wide.tolerance_px))
-        close = gauss_newton(closer, near.rotation, near.center, slack=_START_SLACK)
+        close = gauss_newton(closer, near.rotation, near.center, slack=SLACK)
         if close is not None and np.count_nonzero(close.inliers) >= enough:
             return close
     return near
@@ -269,7 +270,7 @@ def _without_wrong_prior(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     free = replace(problem, attitude=None, precision=np.zeros((3, 3)))
     wide = replace(free, tolerance_px=_CLOSER[-1] * problem.tolerance_px)
     near = gauss_newton(wide, fit.rotation, fit.center)
-    close = None if near is None else gauss_newton(free, near.rotation, near.center, slack=_START_SLACK)
+    close = None if near is None else gauss_newton(free, near.rotation, near.center, slack=SLACK)
     if close is None or np.count_nonzero(close.inliers) < _CONTESTED * np.count_nonzero(fit.inliers):
         return problem, fit
     x, y, z = np.degrees(turn_from_attitude(problem, close.rotation)).tolist()
@@ -320,10 +321,10 @@ def _other_pose(problem: Problem, fit: Fit, options: PoseOptions) -> Fit | None:
     cost = _cost(problem, fit.rotation, fit.view, fit.variance_px2, options)
     if _cost(problem, R, reproject(problem, R, center), fit.variance_px2, options) > 2 * cost + 50:
         return None  # too far off for a refinement to compensate
-    other = gauss_newton(problem, R, center, steps=_MIRRORED_STEPS)
+    other = gauss_newton(problem, R, center)
     if other is None or _same(other.rotation, fit.rotation):
         return None
-    close = _cost(problem, other.rotation, other.view, fit.variance_px2, options) < cost + options.min_cost_gap
+    close = _cost(problem, other.rotation, other.view, fit.variance_px2, options) < cost + chi_square_of(CHANCE, 1)
     return other if close else None
 
 
