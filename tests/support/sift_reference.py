@@ -40,8 +40,9 @@ def keypoints_of(levels: list[Array], contrast_threshold: float) -> Array:
     rows = [
         row
         for octave, gaussians in enumerate(levels)
-        for place in _extrema(np.diff(gaussians, axis=0), EARLY * contrast_threshold / SCALES)
-        if (row := _refined(np.diff(gaussians, axis=0), place, contrast_threshold / SCALES, octave)) is not None
+        for dog in [np.diff(gaussians, axis=0)]
+        for place in _extrema(dog, EARLY * contrast_threshold / SCALES)
+        if (row := _refined(dog, place, contrast_threshold / SCALES, octave)) is not None
     ]
     return np.array(rows).reshape(-1, 6)
 
@@ -74,18 +75,16 @@ def _refined(dog: Array, place: Array, threshold: float, octave: int) -> tuple[f
 def _derivatives(cube: Array) -> tuple[Array, Array]:
     """Gradient and Hessian over (level, y, x) by central differences."""
 
-    def at(*offset: int) -> float:
-        return float(cube[tuple(1 + np.array(offset))])
+    def at(level: int, y: int, x: int) -> float:
+        return float(cube[1 + level, 1 + y, 1 + x])
 
     axes = np.eye(3, dtype=int)
     gradient = np.array([(at(*a) - at(*-a)) / 2.0 for a in axes])
     hessian = np.empty((3, 3))
     for i, a in enumerate(axes):
-        for j, b in enumerate(axes):
-            if i == j:
-                hessian[i, j] = at(*a) + at(*-a) - 2.0 * at(0, 0, 0)
-            else:
-                hessian[i, j] = (at(*a + b) + at(*-a - b) - at(*a - b) - at(*b - a)) / 4.0
+        hessian[i, i] = at(*a) + at(*-a) - 2.0 * at(0, 0, 0)
+        for j, b in enumerate(axes[:i]):
+            hessian[i, j] = hessian[j, i] = (at(*a + b) + at(*-a - b) - at(*a - b) - at(*b - a)) / 4.0
     return gradient, hessian
 
 
@@ -133,22 +132,16 @@ def angle_of(level: Array, keypoint: Array, first_sigma: float) -> float:
 def descriptor_of(level: Array, keypoint: Array, first_sigma: float, turn: float) -> Array:
     """(128,): each gradient is shared by its two directions and by its four cells, bilinearly in the cells."""
     gx, gy = gradients(level, keypoint, first_sigma, turn, 12, 1.0)
-    described = np.zeros((4, 4, 8))
     ramp = (np.arange(12) - 5.5) / 3.0
-    for row, v in enumerate(ramp):
-        for column, u in enumerate(ramp):
-            weight = math.exp(-0.5 * (u * u + v * v) / 4.0)
-            shares = np.zeros(8)
-            sector = math.atan2(gy[row, column], gx[row, column]) % math.tau / (math.pi / 4.0)
-            k, part = int(sector) % 8, (sector % 1.0) * math.pi / 4.0
-            size = math.hypot(gx[row, column], gy[row, column])
-            # The vector is the sum of its shares along both directions, 45 degrees apart.
-            shares[k], shares[(k + 1) % 8] = size * math.sin(math.pi / 4.0 - part), size * math.sin(part)
-            for j in range(4):
-                for i in range(4):
-                    tent = max(0.0, 1.0 - abs(v - (j - 1.5))) * max(0.0, 1.0 - abs(u - (i - 1.5)))
-                    described[j, i] += weight * tent * shares
-    return normalised(described.ravel())
+    size = np.hypot(gx, gy) * np.exp(-0.5 * (ramp[:, None] ** 2 + ramp**2) / 4.0)
+    sector = np.arctan2(gy, gx) % math.tau / (math.pi / 4.0)
+    first, part = sector.astype(int) % 8, (sector % 1.0) * math.pi / 4.0
+    # The vector is the sum of its shares along both directions, 45 degrees apart.
+    along, across = size * np.sin(math.pi / 4.0 - part), size * np.sin(part)
+    both = (first[..., None] == np.arange(8), (first[..., None] + 1) % 8 == np.arange(8))
+    shares = along[..., None] * both[0] + across[..., None] * both[1]
+    tents = np.maximum(0.0, 1.0 - np.abs(ramp[:, None] - (np.arange(4) - 1.5)))
+    return normalised(np.einsum("vj,ui,vud->jid", tents, tents, shares).ravel())
 
 
 def normalised(descriptor: Array) -> Array:
