@@ -73,6 +73,11 @@ class Crossings(TorchDispatchMode):
         self.waits: list[str] = []
         self.trace: list[tuple[str, tuple[tuple[int, ...], ...]]] = []
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Nothing is compiled here: torch loads no compiler (two seconds) and steps around it at no operation."""
+        return False
+
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         given = _tensors((args, kwargs))
