@@ -13,7 +13,7 @@ import hypothesis
 import numpy as np
 import pytest
 
-from engine import Fix
+from engine import Fix, OrthoMap
 from scenematch.simulator import plan_flight
 from tests.support import towns
 from tests.support.paths import NO_SHARED, SHARED
@@ -114,6 +114,16 @@ def flight(tmp_path_factory):
 def sim_site(sim_town):
     """The town's map with its surface model."""
     return site_of(sim_town)
+
+
+@pytest.fixture(scope="session")
+def mirrored_site(sim_town):
+    """The town as a mirror shows it: the same kind of streets, and none of its places."""
+    gray, surface = (
+        np.ascontiguousarray(raster[:, ::-1])
+        for raster in (cv2.cvtColor(sim_town.ortho, cv2.COLOR_RGB2GRAY), sim_town.surface_m)
+    )
+    return OrthoMap.from_arrays(gray, sim_town.pixel_to_crs, f"EPSG:{sim_town.crs_epsg}", surface_m=surface)
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -28,8 +29,14 @@ METHODS = ("ncc", "sift")
 PIXELS = 0.3  # the most that a fix may be off, in map pixels
 
 
+@lru_cache(maxsize=4)
+def matcher_of(site, camera, method):
+    """The one that the tests before have used: what it has prepared of the map is as it was."""
+    return SceneMatcher(site, camera, method, "cpu")
+
+
 def locate(ground, camera, frame, method="ncc", nadir=NADIR):
-    return SceneMatcher(ground.site, camera, method, "cpu").locate(frame, ground.prior(nadir))
+    return matcher_of(ground.site, camera, method).locate(frame, ground.prior(nadir))
 
 
 def assert_found(result, nadir=NADIR, within=PIXELS):

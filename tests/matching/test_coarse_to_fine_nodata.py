@@ -179,7 +179,7 @@ def test_what_a_wide_window_over_nodata_answers_is_what_every_place_of_it_does(s
     rng = np.random.default_rng(7)
     quick = SceneMatcher(site, CAMERA, "ncc", "cpu")
     full = SceneMatcher(site, CAMERA, "ncc", "cpu", MatcherOptions(ncc=NccOptions(exhaustive=True)))
-    foreign = Ground(size=GROUND.size, seed=99)
+    foreign = Ground(seed=99)
     for number in numbers:
         y, x = rng.choice(np.argwhere(inner > 0.7 * inner.max()))
         nadir = np.array([x, y], float)
@@ -218,7 +218,7 @@ def test_every_place_is_scored_only_where_there_is_time_for_it():
     site, _ = site_with(0.3, 6)
     nadir = np.array([480.0, 450.0])
     matcher = SceneMatcher(site, CAMERA, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=False)))
-    frame = Ground(size=GROUND.size, seed=99).frame(CAMERA, nadir)  # shows no place of this map
+    frame = Ground(seed=99).frame(CAMERA, nadir)  # shows no place of this map
     prior = GROUND.prior(nadir, sigma_m=80.0)
     asked: list[str] = []
 

@@ -174,7 +174,7 @@ def test_weights_follow_the_better_points():
 def test_errors_lie_within_the_covariance(case):
     rng = np.random.default_rng(9)
     within, nees, turn = [], [], []
-    for _ in range(150):
+    for _ in range(100):
         s = scene(rng, **{"count": 100, **case})
         pose = solve_pose(s.points_m, s.points_px, K)
         if pose is None:
@@ -186,7 +186,7 @@ def test_errors_lie_within_the_covariance(case):
         turn.append(rotation @ np.linalg.solve(pose.covariance[3:, 3:], rotation))
         np.testing.assert_allclose(pose.covariance, pose.covariance.T, rtol=1e-6, atol=1e-15)
         assert np.linalg.eigvalsh(pose.covariance).min() > 0
-    assert len(nees) > 145
+    assert len(nees) >= 97
     assert np.mean(within) >= 0.98
     assert 2.3 < np.mean(nees) < 4.0  # three degrees of freedom
     assert 2.3 < np.mean(turn) < 4.0

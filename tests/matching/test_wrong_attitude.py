@@ -22,6 +22,11 @@ def site(ground):
     )
 
 
+@pytest.fixture(scope="module")
+def matchers(site, camera):
+    return {method: SceneMatcher(site, camera, method, "cpu") for method in ("ncc", "sift", "auto")}
+
+
 MOUNT_OFF = {"roll_deg": 6.0, "pitch_deg": -1.0}
 WRONG = [
     MOUNT_OFF,
@@ -36,9 +41,9 @@ WRONG = [
 @pytest.mark.parametrize(
     ("method", "stated"), [*itertools.product(("ncc", "sift"), WRONG), ("auto", MOUNT_OFF), ("auto", WRONG[-1])]
 )
-def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, site, camera, method, stated):
+def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, matchers, camera, method, stated):
     frame = replace(ground.frame(camera, NADIR, 150.0, **TRUE), **stated)
-    fix = SceneMatcher(site, camera, method, "cpu").locate(frame, ground.prior(NADIR))
+    fix = matchers[method].locate(frame, ground.prior(NADIR))
     assert isinstance(fix, Fix)
     off_m = np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR)
     assert np.hypot(*off_m) < 1.0
