@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import os
+from functools import lru_cache
 
 import cv2
 import hypothesis
@@ -41,6 +42,16 @@ def _one_thread():
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _transformers_made_once():
+    """PROJ looks for the way between two systems for tens of milliseconds, and the tests ask for the same few."""
+    from pyproj import Transformer
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Transformer, "from_crs", staticmethod(lru_cache(maxsize=64)(Transformer.from_crs)))
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
