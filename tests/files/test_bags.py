@@ -6,7 +6,7 @@ import io
 import random
 import sys
 import warnings
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.rosbag2 import Writer as Writer2
+from rosbags.serde import utils as serde_utils
 from rosbags.typesys import Stores, get_typestore
 
 from bench.inputs.bags import BAG_KINDS, BagMessages, flight_bag, write_bag
@@ -30,10 +31,19 @@ from tests.support.odometries import odometry_message, twist_message
 from tests.support.towns import drawn_town
 
 STEP_NS = 100_000_000
+compiled = cache(partial(compile, filename="<message>", mode="exec"))
 CAMERA = Camera(
     31, 23, np.array([[40.5, 0, 15.25], [0, 41.0, 10.75], [0, 0, 1]]), "plumb_bob",
     np.array([0.1, -0.02, 1e-3, 2e-3, 0.0]),
 )  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _code_of_messages_compiled_once():
+    """Every reader and writer generates the same code of a message's type: to compile it anew takes half the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(serde_utils, "exec", lambda code, names: exec(compiled(code), names), raising=False)
+        yield
 
 
 def a_flight(count=5, grey=False):
