@@ -46,7 +46,7 @@ def test_surfaces_are_the_references(seed, model, more, batch, zero_mean, offset
 
 
 @pytest.mark.parametrize("side", [63, 64, 65, 96, 97, 127])
-@pytest.mark.parametrize(("more", "count"), [(0, 1), (1, 2), (2, 1), (33, 2)])
+@pytest.mark.parametrize(("more", "count"), [(0, 1), (1, 2), (2, 1), (33, 1)])
 def test_templates_from_64_px_up(side, more, count):
     rng = np.random.default_rng(side)
     search = rng.normal(50.0, 20.0, (1, side + more, side + more + 1)).astype(np.float32)
@@ -58,7 +58,7 @@ def test_templates_from_64_px_up(side, more, count):
 @settings(max_examples=12)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    size=st.tuples(st.integers(30, 90), st.integers(30, 90)),
+    size=st.tuples(st.integers(30, 70), st.integers(30, 70)),
     model=st.tuples(st.integers(2, 20), st.integers(2, 20)),
     count=st.integers(1, 3),
     threads=st.integers(1, 2),
@@ -80,21 +80,21 @@ def test_blocks_are_the_window(seed, size, model, count, threads):
     np.testing.assert_allclose(got, expected_of(search, templates), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("divided", [False, True])
-@pytest.mark.parametrize("count", [1, 2])
-def test_weak_patches_beside_strong_ones(divided, count, monkeypatch):
+def test_weak_patches_beside_strong_ones(monkeypatch):
     """A thousand times the contrast in one corner: float32 transforms would lose the rest."""
-    if divided:
-        monkeypatch.setattr(blocks, "_CACHED_SIDE", 32)
-        monkeypatch.setattr(blocks, "_division", blocks._division.__wrapped__)
     rng = np.random.default_rng(7)
     search = rng.normal(0.0, 1.0, (1, 80, 90)).astype(np.float32)
     search[0, :20, :20] *= 1000.0
-    templates = np.stack([search[0, 50:62, 60:75], rng.normal(0.0, 1.0, (12, 15))])[None, :count]
-    templates = np.ascontiguousarray(templates, np.float32)
-    got = scores_of(search, templates)
-    np.testing.assert_allclose(got, expected_of(search, templates), rtol=0, atol=1e-5)
-    assert got[0, 0, 50, 60] == pytest.approx(1.0, abs=1e-6)
+    templates = np.stack([search[0, 50:62, 60:75], rng.normal(0.0, 1.0, (12, 15))])[None].astype(np.float32)
+    expected = expected_of(search, templates)
+    for divided in (False, True):
+        if divided:
+            monkeypatch.setattr(blocks, "_CACHED_SIDE", 32)
+            monkeypatch.setattr(blocks, "_division", blocks._division.__wrapped__)
+        for count in (1, 2):
+            got = scores_of(search, np.ascontiguousarray(templates[:, :count]))
+            np.testing.assert_allclose(got, expected[:, :count], rtol=0, atol=1e-5)
+            assert got[0, 0, 50, 60] == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1e-15, 1e15])

@@ -57,7 +57,6 @@ def test_reference_scores_flat_patches_and_templates_zero():
     assert not reference.ncc_surface(np.zeros((5, 5)), np.eye(3), zero_mean=False).any()
 
 
-@pytest.mark.parametrize("name", KERNELS)
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
 @pytest.mark.parametrize("zero_mean", [True, False])
 @pytest.mark.parametrize(
@@ -72,18 +71,19 @@ def test_reference_scores_flat_patches_and_templates_zero():
         (1, 1, (40, 3), (2, 3)),
     ],
 )
-def test_kernels_agree_with_the_reference(name, dtype, zero_mean, batch, hypotheses, size, model):
+def test_kernels_agree_with_the_reference(dtype, zero_mean, batch, hypotheses, size, model):
     rng = torch.Generator().manual_seed(3)
     search = torch.randn(batch, *size, generator=rng, dtype=torch.float64).to(dtype)
     templates = torch.randn(batch, hypotheses, *model, generator=rng, dtype=torch.float64).to(dtype)
     before = search.clone(), templates.clone()
-    scores = KERNELS[name](search, templates, zero_mean=zero_mean)
-    assert scores.dtype == dtype
-    assert scores.shape == (batch, hypotheses, size[0] - model[0] + 1, size[1] - model[1] + 1)
     expected = reference_batch(search, templates, zero_mean)
-    np.testing.assert_allclose(scores.numpy(), expected, rtol=0, atol=TOLERANCE[dtype])
-    assert torch.equal(search, before[0])  # input is left as it came
-    assert torch.equal(templates, before[1])
+    for name, kernel in KERNELS.items():
+        scores = kernel(search, templates, zero_mean=zero_mean)
+        assert scores.dtype == dtype
+        assert scores.shape == (batch, hypotheses, size[0] - model[0] + 1, size[1] - model[1] + 1)
+        np.testing.assert_allclose(scores.numpy(), expected, rtol=0, atol=TOLERANCE[dtype], err_msg=name)
+        assert torch.equal(search, before[0])  # input is left as it came
+        assert torch.equal(templates, before[1])
 
 
 @pytest.mark.slow

@@ -55,9 +55,10 @@ def reference(window, valid, templates, min_overlap):
 def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, model, small_px, monkeypatch):
     monkeypatch.setattr(masked_blocks, "_SMALL_PX", small_px)
     window, valid, templates = drawn(kind, size, model)
+    window, templates = (values.astype(np.float32).astype(np.float64) for values in (window, templates))
+    expected = reference(window, valid, templates, min_overlap)
     for dtype, tolerance in ((np.float64, 1e-9), (np.float32, 1e-6)):
         picture, patches = window.astype(dtype), templates.astype(dtype)
-        expected = reference(picture.astype(np.float64), valid, patches.astype(np.float64), min_overlap)
         scores = ncc(picture[None], patches[None], search_valid=valid[None], min_overlap=min_overlap)[0]
         assert scores.dtype == dtype
         np.testing.assert_array_equal(scores == -1.0, expected == -1.0)
