@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import gc
 import os
-from functools import lru_cache
+import shutil
+from functools import cache, lru_cache
 
 import cv2
 import hypothesis
@@ -112,12 +113,34 @@ def sim_flight(sim_town):
 
 
 @pytest.fixture(scope="session")
-def flight(tmp_path_factory):
-    """The folder of a flight of six frames, to be read and not written."""
+def flight_in(tmp_path_factory):
+    """Write up to eight frames of the usual flight to a folder, as `write_flight` does: they are drawn once."""
+    from scenematch.runs.inputs import FlightFiles
     from scenematch.runs.simulation import write_flight
 
+    @cache
+    def drawn():
+        folder = tmp_path_factory.mktemp("drawn")
+        write_flight(folder, plan_flight(town=drawn_town(), frames=8))
+        return folder
+
+    def write(folder, frames):
+        shutil.copytree(drawn(), folder, dirs_exist_ok=True)
+        for table in (folder / "telemetry.csv", folder / "truth.csv"):
+            lines = table.read_text(encoding="utf-8").splitlines(keepends=True)
+            table.write_text("".join(lines[: 1 + frames]), encoding="utf-8")
+        for picture in sorted((folder / "frames").iterdir())[frames:]:
+            picture.unlink()
+        return FlightFiles.in_folder(folder)
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def flight(flight_in, tmp_path_factory):
+    """The folder of a flight of six frames, to be read and not written."""
     folder = tmp_path_factory.mktemp("flight")
-    write_flight(folder, plan_flight(town=drawn_town(), frames=6))
+    flight_in(folder, frames=6)
     return folder
 
 

@@ -12,11 +12,8 @@ from docs.site_roles import on_page_content
 from engine.options import AssumedErrors, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, SiftOptions
 from engine.values import Reason
 from scenematch.files.track import COLUMNS
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
 from tests.cli.test_json import LEAVES
 from tests.support.paths import ROOT
-from tests.support.towns import drawn_town
 
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 FENCE = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -34,10 +31,10 @@ def read(name):
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory):
+def flight(flight_in, tmp_path_factory):
     """The folder in which a reader would try the snippets."""
     folder = tmp_path_factory.mktemp("docs")
-    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
+    flight_in(folder, frames=3)
     return folder
 
 

@@ -28,7 +28,6 @@ from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import open_truth
 from scenematch.files.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
 from tests.support.odometries import odometry_message, twist_message
-from tests.support.towns import drawn_town
 
 STEP_NS = 100_000_000
 compiled = cache(partial(compile, filename="<message>", mode="exec"))
@@ -40,7 +39,7 @@ CAMERA = Camera(
 
 @pytest.fixture(scope="module", autouse=True)
 def _code_of_messages_compiled_once():
-    """Every reader and writer generates the same code of a message's type: to compile it anew takes half the time."""
+    """Every reader and writer generates the same code of a message's type; compiling takes half their time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(serde_utils, "exec", lambda code, names: exec(compiled(code), names), raising=False)
         yield
@@ -383,13 +382,9 @@ def check_readable_or_one_line(path, frames):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("bare_runs")
-def test_a_folder_becomes_a_bag_and_is_tracked_alike(tmp_path, capsys):
-    from scenematch.runs.simulation import write_flight
-    from scenematch.simulator import plan_flight
-
+def test_a_folder_becomes_a_bag_and_is_tracked_alike(flight_in, tmp_path, capsys):
     folder, bag = tmp_path / "flight", tmp_path / "flight.bag"
-    folder.mkdir()
-    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
+    flight_in(folder, frames=3)
     flight_bag(folder, bag)
     world = ["--map", str(folder / "map.tif"), "--surface", str(folder / "dsm.tif")]
     inputs = {

@@ -30,9 +30,6 @@ from scenematch.files.resampling import MAX_SAMPLE_GAP_NS, FlightLog, interpolat
 from scenematch.files.telemetry import read_telemetry, take_off_sigma_m
 from scenematch.files.track import read_track
 from scenematch.files.truth import interpolate_truth, read_truth
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
-from tests.support.towns import drawn_town
 from tests.support.videos import write_video
 
 
@@ -509,10 +506,10 @@ def test_dataflash_is_read_as_pymavlink_reads_it(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory):
+def flown(flight_in, tmp_path_factory):
     """A flight folder of three frames, and the same telemetry as a DataFlash log with camera messages."""
     folder = tmp_path_factory.mktemp("flown")
-    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
+    flight_in(folder, frames=3)
     rows = read_telemetry(folder / "telemetry.csv")
     truth = read_truth(folder / "truth.csv")
     messages = []

@@ -12,16 +12,13 @@ from scenematch.files.track import read_track
 from scenematch.runs.comparison import DEFAULT_RUNS, parse_runs
 from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.settings import TrackSettings
-from scenematch.runs.simulation import write_flight
 from scenematch.runs.tracking import track
-from scenematch.simulator import plan_flight
-from tests.support.towns import drawn_town
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory):
+def flight(flight_in, tmp_path_factory):
     folder = tmp_path_factory.mktemp("compare") / "flight"
-    write_flight(folder, plan_flight(town=drawn_town(), frames=4))
+    flight_in(folder, frames=4)
     return folder
 
 

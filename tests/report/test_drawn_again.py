@@ -9,21 +9,18 @@ import pytest
 from scenematch.cli.app import run
 from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.settings import TrackSettings
-from scenematch.runs.simulation import write_flight
 from scenematch.runs.tracking import track
-from scenematch.simulator import plan_flight
 from tests.support.runs import bare_runs
-from tests.support.towns import drawn_town
 
 pytestmark = pytest.mark.usefixtures("bare_runs")
 PAGE = "report.html"
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(flight_in, tmp_path_factory):
     """A flight of three frames, and a finished track of it."""
     folder = tmp_path_factory.mktemp("again")
-    write_flight(folder / "flight", plan_flight(town=drawn_town(), frames=3))
+    flight_in(folder / "flight", frames=3)
     with bare_runs():
         track(FlightFiles.in_folder(folder / "flight"), folder / "out", TrackSettings(method="ncc"))
     return folder

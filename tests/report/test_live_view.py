@@ -21,11 +21,8 @@ from scenematch.files.ros.messages import MessageFactory
 from scenematch.files.track import read_track
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget
 from scenematch.runs.settings import TrackSettings
-from scenematch.runs.simulation import write_flight
 from scenematch.runs.tracking import track
-from scenematch.simulator import plan_flight
 from tests.support.runs import bare_runs
-from tests.support.towns import drawn_town
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 from pyarrow import duration, timestamp
@@ -62,10 +59,10 @@ def has_content(row):
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory):
+def flown(flight_in, tmp_path_factory):
     """A flight with a black frame, and what tracks it by a method and says where the results are."""
     folder = tmp_path_factory.mktemp("live")
-    files = write_flight(folder / "flight", plan_flight(town=drawn_town(), frames=FRAMES))
+    files = flight_in(folder / "flight", frames=FRAMES)
     cv2.imwrite(str(folder / "flight" / "frames" / f"{DARK:06d}.jpg"), np.zeros((300, 300, 3), np.uint8))
 
     @cache

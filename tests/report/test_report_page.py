@@ -22,12 +22,9 @@ from scenematch.report.page import write_page
 from scenematch.report.verdict import MEANINGS, verdict_of
 from scenematch.runs.evaluation import evaluate
 from scenematch.runs.settings import TrackSettings
-from scenematch.runs.simulation import write_flight
 from scenematch.runs.tracking import track
-from scenematch.simulator import plan_flight
 from tests.support.browser import missing, open_browser
 from tests.support.runs import bare_runs
-from tests.support.towns import drawn_town
 
 FRAMES = 6
 DARK = 4  # a frame that shows nothing
@@ -237,10 +234,10 @@ def test_nothing_is_made_up_where_the_telemetry_is_silent(sim_flight, sim_site):
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory):
+def flown(flight_in, tmp_path_factory):
     """A finished run over a flight with a black frame."""
     folder = tmp_path_factory.mktemp(HOSTILE.replace("/", "")) / "flight"
-    files = write_flight(folder, plan_flight(town=drawn_town(), frames=FRAMES))
+    files = flight_in(folder, frames=FRAMES)
     black = folder / "frames" / f"{DARK:06d}.jpg"
     Image.fromarray(np.zeros((300, 300, 3), np.uint8)).save(black)
     with bare_runs():

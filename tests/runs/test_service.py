@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from engine import SceneMatcher
 from engine.errors import OptionError
 from engine.navigation.live import Counts
 from engine.runtime.realtime import _FIFO_CURE, _MEMORY_CURE
@@ -26,15 +27,13 @@ from scenematch.bridges.ros import RosStatus, RosTopics
 from scenematch.files.ros.messages import MessageFactory
 from scenematch.runs import mavlink_bridge, service
 from scenematch.runs.bridge_files import BridgeFiles
+from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
 from scenematch.runs.progress import Progress
 from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
 from scenematch.runs.service import _BEATS, running_service, status_reporter
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
 from tests.support.paths import ROOT
-from tests.support.towns import drawn_town
 
 UNIT = ROOT / "deploy" / "scenematch-bridge.service"
 HANGING = """
@@ -146,13 +145,16 @@ def test_a_manager_that_does_not_read_stops_nobody(manager):
     assert time.monotonic() - begin_s < 60.0
 
 
-def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog(manager, tmp_path, monkeypatch):
+def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog(
+    manager, flight_in, tmp_path, monkeypatch
+):
     monkeypatch.setenv("WATCHDOG_USEC", "800000")  # no more beats than the socket's queue holds
     monkeypatch.setattr(mavlink_bridge, "end_on_sigterm", lambda: None)
     monkeypatch.setattr(mavlink_bridge, "_AUTOPILOT_TIMEOUT_S", 0.5)
     monkeypatch.setattr(service, "_STATUS_PERIOD_S", 0.0)
-    flight = write_flight(tmp_path / "flight", plan_flight(town=drawn_town(), frames=2))
-    files = BridgeFiles(map=flight.map, camera=flight.camera, frames=flight.frames, rate_hz=10.0)
+    monkeypatch.setattr(SceneMatcher, "warmup", lambda *_, **__: None)
+    flown = flight_in(tmp_path / "flight", frames=2)
+    files = BridgeFiles(map=flown.map, camera=flown.camera, frames=flown.frames, rate_hz=10.0)
     link, settings = MavlinkSettings(connect="udpout:127.0.0.1:9"), BridgeSettings(method="ncc")
     with pytest.raises(OptionError, match="start"):
         run_mavlink_bridge(files, link, replace(settings, start="0,0"))
@@ -166,7 +168,7 @@ def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog
     assert "STATUS=no autopilot; sent 0" in "".join(stated)
 
 
-def test_a_bridge_that_starts_again_in_the_air_warms_up_briefly(tmp_path, monkeypatch):
+def test_a_bridge_that_starts_again_in_the_air_warms_up_briefly(flight, tmp_path, monkeypatch):
     class WarmError(Exception):
         pass
 
@@ -177,15 +179,15 @@ def test_a_bridge_that_starts_again_in_the_air_warms_up_briefly(tmp_path, monkey
     briefly = []
     monkeypatch.setattr(mavlink_bridge.SceneMatcher, "warmup", warmup)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    flight = write_flight(tmp_path / "flight", plan_flight(town=drawn_town(), frames=1))
+    flown = FlightFiles.in_folder(flight)
     link = MavlinkSettings(connect="udpout:127.0.0.1:9")
     last = SimpleNamespace(lat_deg=48.0, lon_deg=16.0, sigma_m=1.0)
-    for frames, source in ((None, "0"), (None, "0"), (flight.frames, None)):
-        files = BridgeFiles(map=flight.map, camera=flight.camera, frames=frames, camera_source=source)
+    for frames, source in ((None, "0"), (None, "0"), (flown.frames, None)):
+        files = BridgeFiles(map=flown.map, camera=flown.camera, frames=frames, camera_source=source)
         with pytest.raises(WarmError):
             run_mavlink_bridge(files, link, BridgeSettings(method="ncc"))
         assert gc.isenabled()
-        LastFix(last_fix_file(link.connect, link.system_id, flight.map.map.absolute())).keep(last)
+        LastFix(last_fix_file(link.connect, link.system_id, flown.map.map.absolute())).keep(last)
     assert briefly == [(False, False), (True, False), (False, False)]  # a recorded flight starts on the ground
 
 
@@ -199,13 +201,14 @@ class Shown(Progress):
         self.lines.append(text)
 
 
-def test_a_ros_bridge_reports_as_the_other_does(manager, tmp_path, monkeypatch):
+def test_a_ros_bridge_reports_as_the_other_does(manager, flight, monkeypatch):
     monkeypatch.setenv("WATCHDOG_USEC", "1000")
+    monkeypatch.setattr(SceneMatcher, "warmup", lambda *_, **__: None)
     monkeypatch.setattr(service, "_STATUS_PERIOD_S", 0.0)
     types = get_typestore(Stores.ROS1_NOETIC).types
     maker, shown, published = MessageFactory(types.__getitem__, True), Shown(), []
-    flight = write_flight(tmp_path / "flight", plan_flight(town=drawn_town(), frames=1))
-    black = np.zeros((flight.camera.load(None).height_px, flight.camera.load(None).width_px), np.uint8)
+    flown = FlightFiles.in_folder(flight)
+    black = np.zeros((flown.camera.load(None).height_px, flown.camera.load(None).width_px), np.uint8)
 
     def spin(handlers, every_second, seconds):
         handlers["/down"][1](maker.image(10**9, "", black))
@@ -219,7 +222,7 @@ def test_a_ros_bridge_reports_as_the_other_does(manager, tmp_path, monkeypatch):
         messages=maker, now_ns=lambda: 10**9, spin=spin, has_subscribers=lambda output: False,
         publish=lambda output, message: published.append(output),
     )  # fmt: skip
-    ros = RosSettings(map=flight.map, camera=flight.camera, topics=RosTopics(image="/down"))
+    ros = RosSettings(map=flown.map, camera=flown.camera, topics=RosTopics(image="/down"))
     run_ros_bridge(ros, BridgeSettings(method="ncc"), node=node, progress=shown)
     line = "1 pictures; published 0; not published: no_height 1, unusable 1"
     assert shown.lines[-1] == line

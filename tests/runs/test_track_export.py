@@ -15,20 +15,17 @@ from scipy.spatial.transform import Rotation
 from scenematch import TrackSettings, export_track, track
 from scenematch.files.notes import read_notes
 from scenematch.files.track import read_track
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
 from tests.support.runs import bare_runs
-from tests.support.towns import drawn_town
 
 FRAMES = 5
 ROUNDED_M = 0.5e-3 * 2**0.5  # each axis of track.csv is rounded to a millimetre
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(flight_in, tmp_path_factory):
     """Flight folder and output folder of a flight, tracked by NCC, with both TUM files."""
     folder = tmp_path_factory.mktemp("export")
-    files = write_flight(folder / "flight", plan_flight(town=drawn_town(), frames=FRAMES))
+    files = flight_in(folder / "flight", frames=FRAMES)
     out = folder / "out"
     with bare_runs():
         track(files, out, TrackSettings(device="cpu"))

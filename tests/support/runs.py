@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,14 @@ import pytest
 from matplotlib.figure import Figure
 
 from engine import OrthoMap, SceneMatcher
+from engine.maps.landmarks import LandmarkMap
 
 BLANK = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
 
 
 _open = OrthoMap.open
 _opened: dict[Any, OrthoMap] = {}
+_landmarks_of = lru_cache(maxsize=6)(LandmarkMap)
 
 
 def opened_once(path: Any, surface: Any = None, *, on_copy: Any = None, **options: Any) -> OrthoMap:
@@ -38,8 +41,9 @@ def opened_once(path: Any, surface: Any = None, *, on_copy: Any = None, **option
 
 @contextmanager
 def bare_runs() -> Iterator[None]:
-    """Plots are one pixel, nothing is warmed up, and a map is opened once: seconds less, and the same track."""
+    """Plots are one pixel, nothing is warmed up, a map and its features are had once: seconds less, one track."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("engine.matching.sift.LandmarkMap", _landmarks_of)
         patch.setattr(OrthoMap, "open", opened_once)
         patch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(BLANK))
         patch.setattr(SceneMatcher, "warmup", lambda *_: None)
