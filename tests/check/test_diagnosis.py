@@ -219,9 +219,9 @@ def test_a_yaw_in_radians_that_was_wrapped_as_degrees_is_recognised():
 
 @pytest.fixture(scope="module")
 def over_a_town():
-    """Eight frames of a flight over a drawn town, and what finds the causes in such frames."""
+    """Six frames of a flight over a drawn town, and what finds the causes in such frames."""
     town = drawn_town()
-    plan = plan_flight(town=town, frames=8)
+    plan = plan_flight(town=town, frames=6)
     site, camera, first = site_of(town), plan.camera, plan.truth_rows()[0]
     start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=15.0)
     return list(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,13 @@ import pytest
 from matplotlib.figure import Figure
 
 from engine import OrthoMap, SceneMatcher
-from engine.maps.landmarks import LandmarkMap
+from tests.support.landmarks import landmarks_of
 
 BLANK = cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes()
 
 
 _open = OrthoMap.open
 _opened: dict[Any, OrthoMap] = {}
-_landmarks_of = lru_cache(maxsize=6)(LandmarkMap)
 
 
 def opened_once(path: Any, surface: Any = None, *, on_copy: Any = None, **options: Any) -> OrthoMap:
@@ -43,7 +41,7 @@ def opened_once(path: Any, surface: Any = None, *, on_copy: Any = None, **option
 def bare_runs() -> Iterator[None]:
     """Plots are one pixel, nothing is warmed up, a map and its features are had once: seconds less, one track."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("engine.matching.sift.LandmarkMap", _landmarks_of)
+        patch.setattr("engine.matching.sift.LandmarkMap", landmarks_of)
         patch.setattr(OrthoMap, "open", opened_once)
         patch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(BLANK))
         patch.setattr(SceneMatcher, "warmup", lambda *_: None)
