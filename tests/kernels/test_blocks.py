@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from engine.kernels import blocks, reference, tensors
 from engine.ncc_fft import Search, ncc, prepare, surface
 from engine.runtime import threads as chosen
+from tests.support.tensors import assert_close
 
 
 def scores_of(search, templates, zero_mean=True):
@@ -120,14 +121,14 @@ def test_a_prepared_crop_scores_as_the_tensor_ops(seed, model):
     norms = tensors.inverse_norm(on_device.sums, *model)
     for count in (1, 2):
         expected = tensors.prepared_surface(on_device.image, norms, centred[:count])
-        torch.testing.assert_close(surface(part, templates[:count]), expected, rtol=0, atol=1e-5)
+        assert_close(surface(part, templates[:count]), expected, rtol=0, atol=1e-5)
 
 
 def test_views_are_taken_and_left_as_they_are():
     search = torch.randn(2, 50, 60, generator=torch.Generator().manual_seed(0)).transpose(1, 2)
     templates = torch.randn(1, 1, 9, 11, generator=torch.Generator().manual_seed(1)).expand(2, 3, -1, -1)
     before = search.clone(), templates.clone()
-    torch.testing.assert_close(ncc(search, templates), ncc(search.contiguous(), templates.contiguous()))
+    assert_close(ncc(search, templates), ncc(search.contiguous(), templates.contiguous()))
     assert torch.equal(search, before[0])
     assert torch.equal(templates, before[1])
 

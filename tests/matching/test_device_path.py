@@ -17,6 +17,7 @@ from engine.kernels.peaks import find_peak
 from engine.ncc_fft import match_template, ncc, prepare
 from engine.runtime.tensors import download, upload
 from tests.support.pretended import DEVICE, Pretended, pretended_device
+from tests.support.tensors import assert_close
 
 CPU = torch.device("cpu")
 SUMMIT = 28  # numbers that a peak is made of
@@ -121,7 +122,7 @@ def test_the_surface_waits_for_the_check_of_its_arguments_alone(zero_mean):
         found = ncc(windows.to(DEVICE), templates.to(DEVICE), zero_mean=zero_mean)
         assert (len(crossings.uploads), crossings.downloads, crossings.waits) == (2, [2], [])
         back = found.cpu()
-    torch.testing.assert_close(back, ncc(windows, templates, zero_mean=zero_mean), atol=2e-6, rtol=0)
+    assert_close(back, ncc(windows, templates, zero_mean=zero_mean), atol=2e-6, rtol=0)
 
 
 def test_masks_do_not_make_the_host_wait():

@@ -13,6 +13,7 @@ from engine.errors import DtypeError, OptionError, ShapeError
 from engine.features import Features, chosen_backend, match, plans_created, prepare_plans, sift
 from engine.sift import loops
 from tests.support.matches import pairs_of
+from tests.support.tensors import assert_close
 
 LEVEL_RATIO = 2 ** (1 / 3)
 
@@ -169,7 +170,7 @@ def test_invalid_slots_are_zero_and_valid_ones_of_unit_norm(backend):
     assert 0 < found.valid.sum() < 500
     empty = ~found.valid
     assert found.xy_px[empty].abs().max() == found.descriptors[empty].abs().max() == 0
-    torch.testing.assert_close(found.descriptors[found.valid].norm(dim=1), torch.ones(int(found.valid.sum())))
+    assert_close(found.descriptors[found.valid].norm(dim=1), torch.ones(int(found.valid.sum())))
     assert (found.angle_deg >= 0).all()
     assert (found.angle_deg < 360).all()
 
@@ -180,8 +181,8 @@ def test_a_batch_is_its_images(backend):
     for i in range(3):
         alone = sift(images[i : i + 1], max_keypoints=50, backend=backend)
         assert torch.equal(alone.valid[0], together.valid[i])
-        torch.testing.assert_close(alone.xy_px[0], together.xy_px[i], atol=1e-3, rtol=0)
-        torch.testing.assert_close(alone.descriptors[0], together.descriptors[i], atol=1e-3, rtol=0)
+        assert_close(alone.xy_px[0], together.xy_px[i], atol=1e-3, rtol=0)
+        assert_close(alone.descriptors[0], together.descriptors[i], atol=1e-3, rtol=0)
 
 
 def test_repeats_are_equal(backend):
@@ -339,9 +340,9 @@ def test_distances_are_those_of_the_pairs(pair):
     query, train = pair
     found = match(query, train)
     full = torch.cdist(query.descriptors, train.descriptors)
-    torch.testing.assert_close(found.distance, full.amin(2), atol=1e-4, rtol=1e-4)
+    assert_close(found.distance, full.amin(2), atol=1e-4, rtol=1e-4)
     two = full.topk(2, largest=False).values
-    torch.testing.assert_close(found.ratio, two[..., 0] / two[..., 1], atol=1e-4, rtol=1e-4)
+    assert_close(found.ratio, two[..., 0] / two[..., 1], atol=1e-4, rtol=1e-4)
 
 
 def test_invalid_slots_never_match(pair):
@@ -368,7 +369,7 @@ def test_of_two_alike_neither_is_matched(stored):
     found = match(query, twins)
     assert found.distance.max() < 0.02
     assert not found.valid.any()
-    torch.testing.assert_close(found.ratio, torch.ones(1, 300), atol=0.1, rtol=0)
+    assert_close(found.ratio, torch.ones(1, 300), atol=0.1, rtol=0)
     lone = match(query, replace(twins, valid=torch.arange(600)[None] < 300))
     assert lone.valid.all()
     assert lone.ratio.max() < 0.05

@@ -15,6 +15,7 @@ from engine.runtime import jit
 from engine.runtime.threads import count, set_threads
 from engine.sift import loops
 from tests.support import sift_reference as reference
+from tests.support.tensors import assert_close
 
 
 def picture(height: int, width: int, seed: int = 0) -> torch.Tensor:
@@ -128,8 +129,8 @@ def test_more_threads_give_the_same():
     finally:
         set_threads(before)
     for name in ("xy_px", "scale_px", "angle_deg", "descriptors", "valid"):
-        torch.testing.assert_close(getattr(many, name), getattr(one, name), atol=1e-6, rtol=0)
-        torch.testing.assert_close(getattr(batch_by_many, name), getattr(batch, name), atol=1e-6, rtol=0)
+        assert_close(getattr(many, name), getattr(one, name), atol=1e-6, rtol=0)
+        assert_close(getattr(batch_by_many, name), getattr(batch, name), atol=1e-6, rtol=0)
 
 
 def test_without_a_folder_to_keep_it_the_code_is_compiled_anyway(monkeypatch):

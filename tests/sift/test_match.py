@@ -10,6 +10,7 @@ from engine.features import Features, match
 from engine.sift import matching, matching_tensors
 from engine.sift.values import fields_of
 from tests.support.matches import pairs_of
+from tests.support.tensors import assert_close
 
 
 def described(count, seed, *, like=None):
@@ -72,12 +73,12 @@ def test_the_loops_find_what_the_tensor_ops_find(batch, most_deg, factor):
     got, expected = tuple(map(torch.from_numpy, found)), matching_tensors._nearest(query, train, limits)
     allowed = expected[0] > -2.0
     assert allowed.sum() > 20 * batch
-    torch.testing.assert_close(got[0][allowed], expected[0][allowed])
+    assert_close(got[0][allowed], expected[0][allowed])
     assert torch.equal(got[1][allowed], expected[1][allowed])
     assert torch.equal(got[3][allowed], expected[3][allowed])
     assert (got[0][~allowed] < -2.0).all()
     two = expected[2] > -2.0
-    torch.testing.assert_close(got[2][two], expected[2][two])
+    assert_close(got[2][two], expected[2][two])
     assert (got[2][~two] < -2.0).all()
 
 
