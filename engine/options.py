@@ -253,19 +253,16 @@ class NavigatorOptions:
 
     Attributes:
         measured_velocity_sigma_mps: standard deviation of a velocity that came with the frame.
-        acceleration_mps2: acceleration of the vehicle, for a second at a time, while its velocity comes from its
-            last fixes.
-        max_speed_mps: speed assumed while the velocity is unknown.
-        growth: factor by which the window's uncertainty grows with every refusal in a row.
+        acceleration_mps2: acceleration of the vehicle, for a second at a time, where its velocity is not measured.
+        max_speed_mps: two standard deviations of an unknown velocity, per axis.
         default_interval_s: time between frames without a timestamp.
         gate: chi-square of two degrees of freedom, beyond which a fix contradicts a prediction.
-        trusted_sigma_m: only a prediction more certain than this may contradict a fix.
         min_confidence: lowest probability, by all evidence, that a fix is right.
-        lost_after: refusals in a row after which the whole map is searched again.
         lost_sigma_m: uncertainty of the prediction above which the whole map is searched as well.
         search_every: while lost, one frame in so many searches the whole map; the others search where dead
             reckoning leads.
-        hold_s: how long dead reckoning by measured velocities overrules fixes that agree with each other.
+        memory_s: time in which the evidence of past fixes fades: however long a flight, matches that agree with
+            each other outweigh it.
         late_s: how much older than the newest frame a frame may be.
         attitude_lag_s: standard deviation of the attitude telemetry's delay before images have measured it.
         attitude_jitter_s: standard deviation of one frame's delay about the mean delay.
@@ -279,15 +276,12 @@ class NavigatorOptions:
     measured_velocity_sigma_mps: float = 0.5
     acceleration_mps2: float = 3.0
     max_speed_mps: float = 15.0
-    growth: float = 1.4
     default_interval_s: float = 0.2
     gate: float = 18.4
-    trusted_sigma_m: float = 50.0
     min_confidence: float = 0.999
-    lost_after: int = 12
     lost_sigma_m: float = 100.0
     search_every: int = 3
-    hold_s: float = 15.0
+    memory_s: float = 60.0
     late_s: float = 2.0
     attitude_lag_s: float = 0.1
     attitude_jitter_s: float = 0.03
@@ -298,8 +292,6 @@ class NavigatorOptions:
 
     def __post_init__(self) -> None:
         check_positive(self, *(name for name in self.__dataclass_fields__ if name != "odometry"))
-        if self.growth < 1.0:
-            raise OptionError(f"growth: expected 1 or more, got {self.growth}")
         if self.min_confidence >= 1.0:
             raise OptionError(f"min_confidence: expected a probability below 1, got {self.min_confidence}")
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from engine import Fix, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, SceneMatcher, Window
+from engine import Fix, Frame, Navigator, NoFix, OptionError, Prior, SceneMatcher, Window
 from engine.window import MARGIN, place_window, window_size_px
 from tests.support.matchers import ScriptedMatcher
 
@@ -85,14 +86,14 @@ def first_fix(matcher, ground, camera):
 
 
 def test_the_window_grows_with_every_refusal(matcher, first_fix, ground, camera):
-    refuser = ScriptedMatcher(first_fix, *[None] * 8, site=ground.site)
-    navigator = Navigator(refuser, start=ground.prior((330.0, 290.0)), options=NavigatorOptions(growth=1.5))
+    refuser = ScriptedMatcher(first_fix, *[None] * 13, site=ground.site)
+    navigator = Navigator(refuser, start=ground.prior((330.0, 290.0)))
     still = {"east_velocity_mps": 0.0, "north_velocity_mps": 0.0}
     noise = np.random.default_rng(0).integers(0, 256, (300, 300), dtype=np.uint8)
-    for k in range(9):
+    for k in range(14):
         navigator.update(Frame(noise, 1 + k * 200_000_000, 150.0, 0.0, 0.0, 0.0, **still))
     sigmas = [prior.sigma_m for prior in refuser.priors[1:]]
-    assert all(b > 1.5 * a for a, b in itertools.pairwise(sigmas))
+    assert all(b > math.sqrt(2.0) * a for a, b in itertools.pairwise(sigmas))
     frame = ground.frame(camera, np.array([330.0, 290.0]))
     widths = [matcher.locate(frame, prior).window.width_px for prior in refuser.priors[1:]]
     assert widths == sorted(widths)

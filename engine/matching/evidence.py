@@ -20,7 +20,7 @@ from engine.window import SPREAD_SIGMAS
 
 RELIABILITY = 0.99
 """Probability that a position or a height is right to within its standard deviation; else it may be anything."""
-_SEARCHED = (2.0 * SPREAD_SIGMAS) ** 2 / (2.0 * math.pi)
+SEARCHED = (2.0 * SPREAD_SIGMAS) ** 2 / (2.0 * math.pi)
 """Area of a window over that of the prior's Gaussian: how much more probable its middle is than other places."""
 _MAX_NATS = 30.0  # above it a probability is 1 to the last digit
 _PLACE_PX = 4.0  # side of the area that counts as one place: enhanced pictures vary on this scale
@@ -89,7 +89,7 @@ def prior_chi_square(fix: Fix, prior_m: NDArray[np.float64], sigma_m: float) -> 
 
 def _of_position(chi_square: float | None) -> float:
     """Evidence for a place at this distance from the prior's, against one anywhere in the window."""
-    return 0.0 if chi_square is None else math.log(_gaussian(chi_square) * _SEARCHED + 1.0 - RELIABILITY)
+    return 0.0 if chi_square is None else math.log(_gaussian(chi_square) * SEARCHED + 1.0 - RELIABILITY)
 
 
 def _of_height(chi_square: float | None) -> float:

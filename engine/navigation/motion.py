@@ -1,40 +1,68 @@
-"""Dead reckoning: the displacement between fixes by odometry, and its uncertainty."""
+"""Motion between frames: what telemetry and pictures say of it, and positions of other sources."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
 from engine.geo import chi_square
+from engine.options import NavigatorOptions
+from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class OdometrySample:
-    """Time and displacement at one frame.
+class Step:
+    """The way between two frames as one source measured it.
 
     Attributes:
-        time_s: since the first frame.
-        moved_m: (2,) displacement east and north since then.
-        blind_s: the part of that time without a measured velocity.
-        stated_s: the part of that time whose velocity came with its accuracy; the next two accumulate it.
-        lasting_m: accumulated errors that last, both axes.
+        moved_m: (2,) east and north.
+        begin_mps: (2,) velocity at the earlier frame; None if the source did not know it.
+        end_mps: (2,) at the later one.
+        sigma_mps: standard deviation per axis of the source's lasting error.
         noise_m2: variance per axis of errors that do not last.
     """
 
-    time_s: float
     moved_m: Array
-    blind_s: float
-    stated_s: float = 0.0
-    lasting_m: float = 0.0
+    begin_mps: Array | None
+    end_mps: Array
+    sigma_mps: float
     noise_m2: float = 0.0
+
+    def part(self, begin: float, end: float) -> Step:
+        """The part between two shares, in [0, 1], of the way."""
+        known, share = self.begin_mps, end - begin
+        turn_mps = np.zeros(2) if known is None else self.end_mps - known
+        first_mps = None if known is None else known + begin * turn_mps
+        last_mps = self.end_mps - (1.0 - end) * turn_mps
+        return Step(share * self.moved_m, first_mps, last_mps, self.sigma_mps, share * self.noise_m2)
+
+
+@dataclass(frozen=True, slots=True)
+class Ways:
+    """All that is known of the way from one frame to the next.
+
+    Attributes:
+        interval_s: between them.
+        told: by the telemetry's velocity, if both came with one or the later did.
+        seen: by pictures, if they were followed.
+    """
+
+    interval_s: float
+    told: Step | None = None
+    seen: Step | None = None
+
+    def part(self, begin: float, end: float) -> Ways:
+        """The part between two shares, in [0, 1], of the way."""
+        told, seen = (step and step.part(begin, end) for step in (self.told, self.seen))
+        return Ways((end - begin) * self.interval_s, told, seen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,45 +97,32 @@ class GroundMotion:
         lasting_m2 = self.lasting_share**2 * float(self.moved_m @ self.moved_m)
         return np.asarray((self.noise_m2 + lasting_m2 * np.eye(2)) / self.interval_s**2)
 
-    def added_to(self, last: OdometrySample) -> OdometrySample:
-        """The sample at the later picture, given that of the earlier."""
-        return OdometrySample(
-            last.time_s + self.interval_s,
-            last.moved_m + self.moved_m,
-            last.blind_s,
-            last.stated_s + self.interval_s,
-            last.lasting_m + self.lasting_share * float(np.hypot(*self.moved_m)),
-            last.noise_m2 + self.drift * float(np.linalg.eigvalsh(self.noise_m2)[-1]),
-        )
+    def step(self, begin_mps: Array | None) -> Step:
+        """The way of this motion.
+
+        Args:
+            begin_mps: (2,) velocity up to the earlier picture, if it was measured.
+
+        Returns:
+            Step: its lasting error is a share of the velocity.
+        """
+        sigma_mps = self.lasting_share * float(np.hypot(*self.velocity_mps))
+        noise_m2 = self.drift * float(np.linalg.eigvalsh(self.noise_m2)[-1])
+        return Step(self.moved_m, begin_mps, self.velocity_mps, sigma_mps, noise_m2)
 
 
-@dataclass(frozen=True, slots=True)
-class VelocityEstimate:
-    """A velocity (2,) east and north, and its standard deviation per axis."""
-
-    mps: Array
-    sigma_mps: float
-
-
-class DeadReckoning:
-    """Integrates the frames' velocities over time.
+class FrameClock:
+    """Orders the frames in time and integrates the telemetry's velocity between them.
 
     Args:
-        late_s: how much older than the newest frame a frame may be.
-        default_interval_s: time between frames without a timestamp.
+        options: of the navigator.
     """
 
-    def __init__(self, late_s: float, default_interval_s: float) -> None:
-        self._late_s, self._default_interval_s = late_s, default_interval_s
-        self._samples: deque[OdometrySample] = deque()  # of the last late_s
-        self._stamps: deque[int] = deque()  # of the same
+    def __init__(self, options: NavigatorOptions) -> None:
+        self._options = options
+        self._stamps: deque[int] = deque()  # of the last late_s
         self._newest_ns: int | None = None
-        self._measured: Array | None = None  # velocity of the newest frame, if it had one
-
-    @property
-    def last(self) -> OdometrySample | None:
-        """The sample of the newest frame, or None before the first."""
-        return self._samples[-1] if self._samples else None
+        self._told_mps: Array | None = None  # with the newest frame
 
     def is_late(self, frame: Frame) -> bool:
         """Whether a frame is older than the newest one.
@@ -120,54 +135,39 @@ class DeadReckoning:
             return False
         if stamp in self._stamps:
             raise TelemetryError(f"timestamp_ns: expected a frame that did not come before, got {stamp} again")
-        min_stamp_ns = newest - round(self._late_s * 1e9)
+        min_stamp_ns = newest - round(self._options.late_s * 1e9)
         if stamp < min_stamp_ns:
             raise TelemetryError(
                 f"timestamp_ns: expected {min_stamp_ns} or later ({newest} was the newest frame), got {stamp}"
             )
         return True
 
-    def sample(
-        self, frame: Frame, velocity: VelocityEstimate | None, seen: GroundMotion | None = None
-    ) -> OdometrySample:
-        """The sample of a frame; changes no state.
+    def interval_s(self, frame: Frame) -> float:
+        """Time from the newest frame to this one; negative for a late one."""
+        if frame.timestamp_ns is None or self._newest_ns is None:
+            return self._options.default_interval_s
+        return (frame.timestamp_ns - self._newest_ns) * 1e-9
 
-        Args:
-            frame: a new one, or a late one.
-            velocity: assumed if the frame came without one; None assumes none.
-            seen: motion since the newest frame, measured from pictures; replaces an assumed velocity.
+    def told(self, frame: Frame) -> Step | None:
+        """The way to a new frame by the velocities that came with it and with the newest.
+
+        Between the two the velocity walks at random, by the vehicle's acceleration.
         """
-        last = self.last
-        if last is None:
-            return OdometrySample(0.0, np.zeros(2), 0.0)
-        interval_s = self._default_interval_s
-        if frame.timestamp_ns is not None and self._newest_ns is not None:
-            interval_s = (frame.timestamp_ns - self._newest_ns) * 1e-9
-        if interval_s < 0.0:
-            return self._between(last.time_s + interval_s)
-        measured = _velocity_of(frame)
-        if measured is not None:
-            mean = measured if self._measured is None else 0.5 * (measured + self._measured)
-            step_m, sigma_mps = mean * interval_s, frame.velocity_sigma_mps
-            stated_s, lasting_m = (0.0, 0.0) if sigma_mps is None else (interval_s, sigma_mps * interval_s)
-            return replace(
-                last,
-                time_s=last.time_s + interval_s,
-                moved_m=last.moved_m + step_m,
-                stated_s=last.stated_s + stated_s,
-                lasting_m=last.lasting_m + lasting_m,
-            )
-        if seen is not None and math.isclose(seen.interval_s, interval_s, abs_tol=1e-6):
-            return seen.added_to(last)  # else a frame in between failed: its way is unknown
-        step_m = np.zeros(2) if velocity is None else velocity.mps * interval_s
-        return replace(
-            last,
-            time_s=last.time_s + interval_s,
-            moved_m=last.moved_m + step_m,
-            blind_s=last.blind_s + interval_s,
-        )
+        end_mps, begin_mps = velocity_of(frame), self._told_mps
+        if end_mps is None:
+            return None
+        interval_s, mean_mps, changes = self.interval_s(frame), end_mps, 3.0
+        if begin_mps is not None:
+            mean_mps, changes = 0.5 * (begin_mps + end_mps), 12.0
+        between_m2 = self._options.acceleration_mps2**2 * interval_s**3 / changes  # of a walk between known ends
+        return Step(mean_mps * interval_s, begin_mps, end_mps, self.sigma_mps(frame), between_m2)
 
-    def append(self, frame: Frame, sample: OdometrySample) -> None:
+    def sigma_mps(self, frame: Frame) -> float:
+        """Standard deviation of the frame's velocity."""
+        stated = frame.velocity_sigma_mps
+        return self._options.measured_velocity_sigma_mps if stated is None else stated
+
+    def append(self, frame: Frame) -> None:
         """Add a frame that was matched."""
         stamp, newest = frame.timestamp_ns, self._newest_ns
         if stamp is not None:
@@ -175,69 +175,8 @@ class DeadReckoning:
             if newest is not None and stamp <= newest:
                 return  # late
             self._newest_ns = stamp
-            self._stamps = deque(known for known in self._stamps if known >= stamp - self._late_s * 1e9)
-        self._measured = _velocity_of(frame)
-        self._samples.append(sample)
-        while len(self._samples) > 2 and self._samples[1].time_s < sample.time_s - self._late_s:
-            self._samples.popleft()
-
-    def _between(self, time_s: float) -> OdometrySample:
-        """The sample at a time, interpolated between frames; before the first frame, the first sample."""
-        times = [sample.time_s for sample in self._samples]
-        rows = np.array([(*s.moved_m, s.blind_s, s.stated_s, s.lasting_m, s.noise_m2) for s in self._samples])
-        east, north, *others = (float(np.interp(time_s, times, column)) for column in rows.T)
-        return OdometrySample(time_s, np.array([east, north]), *others)
-
-
-@dataclass(frozen=True, slots=True)
-class DriftModel:
-    """How the error of dead reckoning grows.
-
-    Attributes:
-        measured_sigma_mps: of a measured velocity. Such errors last: they grow with time, not its square root.
-        acceleration_mps2: the vehicle's acceleration while its velocity is not measured; its direction changes
-            every second.
-        max_speed_mps: speed assumed if it is unknown.
-    """
-
-    measured_sigma_mps: float
-    acceleration_mps2: float
-    max_speed_mps: float
-
-    def sigma_m(
-        self, start: OdometrySample, end: OdometrySample, velocity: VelocityEstimate | None = None
-    ) -> float:
-        """Standard deviation, per axis, of the displacement between two samples.
-
-        Args:
-            start: either of the two.
-            end: the other.
-            velocity: assumed if none was measured; None if none was assumed.
-        """
-        blind_s = abs(end.blind_s - start.blind_s)
-        measured_s = max(0.0, abs(end.time_s - start.time_s) - blind_s - abs(end.stated_s - start.stated_s))
-        lasting_m = self.measured_sigma_mps * measured_s + abs(end.lasting_m - start.lasting_m)
-        blind_m = 0.5 * self.max_speed_mps * blind_s
-        if velocity is not None:
-            changed_m = self.acceleration_mps2 * math.sqrt(blind_s**3 / 3.0)  # a random walk of the velocity
-            blind_m = min(velocity.sigma_mps * blind_s + changed_m, 2.0 * blind_m)
-        return math.hypot(lasting_m + blind_m, math.sqrt(abs(end.noise_m2 - start.noise_m2)))
-
-    def velocity(self, apart_m: Array, sigma_m: float, interval_s: float) -> VelocityEstimate | None:
-        """The velocity at the later of two fixes; None if they are so far apart that it predicts nothing.
-
-        Args:
-            apart_m: (2,) from the earlier to the later.
-            sigma_m: standard deviation of that difference, per axis.
-            interval_s: between them.
-
-        Returns:
-            VelocityEstimate | None: (2,) m/s to the east and north, and its standard deviation.
-        """
-        changed_mps = self.acceleration_mps2 * math.sqrt(interval_s / 3.0)
-        if 2.0 * changed_mps >= 0.5 * self.max_speed_mps:  # it changes as much again in the next interval
-            return None
-        return VelocityEstimate(apart_m / interval_s, sigma_m / interval_s + changed_mps)
+            self._stamps = deque(known for known in self._stamps if known >= stamp - self._options.late_s * 1e9)
+        self._told_mps = velocity_of(frame)
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,13 +186,11 @@ class PositionEstimate:
     Attributes:
         en_m: (2,) east and north.
         sigma_m: one standard deviation of each.
-        log_odds: log(p / (1 - p)), with p the probability that it is right to within its standard deviation.
         on_map: whether it came from the same map and so shares its georeferencing error.
     """
 
     en_m: Array
     sigma_m: float
-    log_odds: float = 0.0
     on_map: bool = False
 
     def difference_covariance_m2(self, fix: Fix) -> Array:
@@ -272,6 +209,14 @@ class PositionEstimate:
         """Squared Mahalanobis distance to a fix by both covariances: two degrees of freedom."""
         return chi_square(en_m(fix) - self.en_m, self.difference_covariance_m2(fix))
 
+    def log_likelihood_ratio(self, fix: Fix, area_m2: float) -> float:
+        """How much more probable the fix is here than anywhere in an area, as a natural logarithm.
+
+        An estimate vaguer than the area says nothing by that, only by how far the fix is off.
+        """
+        own_m2 = 2.0 * math.pi * math.sqrt(float(np.linalg.det(self.difference_covariance_m2(fix))))
+        return math.log(max(area_m2 / own_m2, 1.0)) - 0.5 * self.chi_square(fix)
+
     def refusal(self, fix: Fix) -> NoFix:
         """The refusal of a fix that contradicts this estimate."""
         apart_m = float(np.hypot(*(en_m(fix) - self.en_m)))
@@ -285,17 +230,36 @@ class PositionEstimate:
         Args:
             widened: factor on the standard deviation; the product is at most :data:`engine.values.MAX_SIGMA_M`.
             moved_m: (2,) movement east and north since the last frame; None is 0.
-            map_sigma_m: error of the map between this position and a place on it.
+            map_sigma_m: error of the map between this position and a place on it, or in the world.
 
         Returns:
             Prior: in metres east and north of the map's origin.
         """
         east, north = (float(v) for v in self.en_m)
         moved_east, moved_north = (0.0, 0.0) if moved_m is None else (float(v) for v in moved_m)
-        sigma_m = min(math.hypot(self.sigma_m * widened, map_sigma_m), MAX_SIGMA_M)
+        sigma_m = math.hypot(self.sigma_m * widened, map_sigma_m)
         return Prior(
-            east_m=east, north_m=north, sigma_m=sigma_m, moved_east_m=moved_east, moved_north_m=moved_north
+            east_m=east,
+            north_m=north,
+            sigma_m=min(sigma_m, MAX_SIGMA_M),
+            moved_east_m=moved_east,
+            moved_north_m=moved_north,
         )
+
+
+def position_of(prior: Prior, site: OrthoMap) -> PositionEstimate:
+    """The position from another source.
+
+    Args:
+        prior: by the other source.
+        site: the map that defines the axes.
+    """
+    if prior.east_m is not None and prior.north_m is not None:
+        return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m)
+    assert prior.lat_deg is not None  # a Prior has one of the two
+    assert prior.lon_deg is not None
+    place_m = site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
+    return PositionEstimate(np.asarray(place_m[:2], np.float64), prior.sigma_m)
 
 
 def en_m(fix: Fix) -> Array:
@@ -318,7 +282,15 @@ def is_valid(fix: Fix) -> bool:
     return bool(np.linalg.eigvalsh(fix.relative_covariance_m2)[0] > 0.0)
 
 
-def _velocity_of(frame: Frame) -> Array | None:
+def velocity_of(frame: Frame) -> Array | None:
+    """The telemetry's velocity.
+
+    Args:
+        frame: any.
+
+    Returns:
+        (2,) m/s east and north; None if the frame came without.
+    """
     if frame.east_velocity_mps is None or frame.north_velocity_mps is None:
         return None
     return np.array([frame.east_velocity_mps, frame.north_velocity_mps])

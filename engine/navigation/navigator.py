@@ -3,45 +3,54 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections import deque
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.budget import Budget, Deadline
 from engine.matching.covariance import map_sigma_of
-from engine.matching.evidence import RELIABILITY
-from engine.navigation.anchors import Anchor, RecentAnchors
-from engine.navigation.hypotheses import Hypotheses, Hypothesis, Match
+from engine.matching.evidence import SEARCHED
 from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
 from engine.navigation.motion import (
-    DeadReckoning,
-    DriftModel,
+    Array,
+    FrameClock,
     GroundMotion,
-    OdometrySample,
     PositionEstimate,
+    Ways,
     en_m,
     is_valid,
-)
-from engine.navigation.odds import (
-    MAX_PROBABILITY,
-    Sources,
-    log_odds,
-    match_log_odds,
     position_of,
-    probability,
+    velocity_of,
 )
+from engine.navigation.odds import MISS, RELIABLE, probability
 from engine.navigation.odometry import VisualOdometry, odometry_of
 from engine.navigation.repeats import Repeats
 from engine.navigation.state import NavigatorState
 from engine.navigation.telemetry_errors import Calibration, TelemetryErrors, considered
-from engine.navigation.velocity_check import VelocityCheck
+from engine.navigation.tracks import Match, Track, Tracks, Weighed
 from engine.options import MatcherOptions, NavigatorOptions
 from engine.orthomap import OrthoMap
-from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason
+from engine.values import Fix, Frame, NoFix, Prior, Reason
 
-Array = NDArray[np.float64]
+
+@dataclass(frozen=True, slots=True)
+class _Moment:
+    """The flight at one frame: its time, the way to it, and the tracks after it."""
+
+    time_s: float
+    ways: Ways
+    tracks: Tracks
+
+
+@dataclass(frozen=True, slots=True)
+class _Accepted:
+    """The last accepted fix, when its frame was taken, and the account that it belongs to."""
+
+    fix: Fix
+    time_s: float
+    number: int
 
 
 class Matcher(Protocol):
@@ -76,19 +85,17 @@ class Navigator:
         self._matcher = matcher
         self._budget = budget
         self._options = o = options or NavigatorOptions()
-        self._drift = DriftModel(o.measured_velocity_sigma_mps, o.acceleration_mps2, o.max_speed_mps)
-        self._odometry = DeadReckoning(o.late_s, o.default_interval_s)
+        self._clock = FrameClock(o)
         options_of = getattr(matcher, "options", None)
         assumed = options_of.ncc.errors if isinstance(options_of, MatcherOptions) else None
         self._errors = TelemetryErrors(o, assumed)
         self._pictures = odometry_of(matcher) if o.odometry else None
         self._motion: GroundMotion | None = None  # up to the newest frame
         self._repeats = Repeats()
-        self._velocity = VelocityCheck(o.measured_velocity_sigma_mps, o.acceleration_mps2)
-        self._recent = RecentAnchors(self._drift)
-        self._anchor = None if start is None else Anchor(position_of(start, matcher.site), None)
         self._map_offset = MapOffsetEstimator()
-        self._hypotheses = Hypotheses(self._drift, o.gate)
+        self._start = None if start is None else position_of(start, matcher.site)
+        self._moments: deque[_Moment] = deque()  # of the last late_s
+        self._accepted: _Accepted | None = None
         self._refusals = self._frames_lost = 0  # in a row
         self._fixed = self._lost = False  # whether the newest frame was fixed; whether the flight is lost
         self._resets = 0
@@ -96,7 +103,7 @@ class Navigator:
     @property
     def state(self) -> NavigatorState:
         """How well the position is known after the last frame."""
-        if self._anchor is None or self._anchor.fix is None:
+        if self._accepted is None:
             return NavigatorState.SEARCHING
         if self._lost:
             return NavigatorState.LOST
@@ -110,10 +117,7 @@ class Navigator:
     @property
     def anchor_age_s(self) -> float | None:
         """Age of the last fix when the newest frame was taken, or None before the first."""
-        anchor, now = self._anchor, self._odometry.last
-        if anchor is None or anchor.fix is None or anchor.sample is None or now is None:
-            return None
-        return now.time_s - anchor.sample.time_s
+        return None if self._accepted is None else self._moments[-1].time_s - self._accepted.time_s
 
     @property
     def healthy(self) -> bool:
@@ -129,10 +133,13 @@ class Navigator:
     @property
     def prediction(self) -> Prior | None:
         """Dead reckoning at the newest frame with its uncertainty; None without a start or a fix."""
-        now = self._odometry.last
-        if now is None or (estimate := self._reckoned(now)) is None:
+        if not self._moments:
             return None
-        return estimate.prior(map_sigma_m=map_sigma_of(self._matcher.site) if estimate.on_map else 0.0)
+        tracks, last = self._moments[-1].tracks, self._accepted
+        track = tracks.best if last is None else tracks.of(last.number) or tracks.best
+        if track is None:
+            return None
+        return track.estimate.prior(map_sigma_m=map_sigma_of(self._matcher.site) if track.fix else 0.0)
 
     @property
     def ground_motion(self) -> GroundMotion | None:
@@ -164,38 +171,38 @@ class Navigator:
             CalibrationError: the frame is not of the camera's resolution.
         """
         clock, budget = Deadline(Budget()), budget or self._budget
-        late, raw = self._odometry.is_late(frame), frame
-        frame = self._velocity.shown(frame)
+        late = self._clock.is_late(frame)
         self._motion = None if late or self._pictures is None else self._seen_motion(self._pictures, frame)
-        now = self._odometry.sample(frame, self._recent.velocity, self._motion)
-        repeated = None if late else self._repeats.refusal(frame, now)
+        moment = self._past(frame) if late else self._next(frame)
+        repeated = None if late else self._repeats.refusal(frame, moment.ways)
         if repeated is not None:
-            self._odometry.append(frame, now)
+            self._take(frame, moment)
             self._fixed = False
-            self._note_loss(now)
+            self._note_loss(moment.tracks)
             return repeated
-        sources = self._sources(now, prior, late=late)
-        shown = self._errors.corrected(frame, now.time_s, late=late, refusals=self._refusals)
+        searched, is_given = self._searched(moment.tracks, prior, late=late)
+        shown = self._errors.corrected(frame, moment.time_s, late=late, refusals=self._refusals)
         left = budget and budget.after(clock.elapsed_ms if self._pictures else 0.0)
-        result = self._matcher.locate(self._with_height(shown), sources.prior, left)
+        result = self._matcher.locate(self._with_height(shown), searched, left)
         if isinstance(result, Fix):
             result = considered(result, frame, shown, getattr(self._matcher, "camera", None))
-        if self._anchor is not None and self._anchor.sample is None:
-            self._anchor = replace(self._anchor, sample=now)
-        self._odometry.append(frame, now)
+            if not is_valid(result):
+                result = result.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
+        self._take(frame, None if late else moment)
         if isinstance(result, Fix):
-            result = self._judge(result, now, sources, raw, late=late)
-            if isinstance(result, Fix) and sources.given is not None:
-                self._map_offset.add(result, sources.given, now.time_s)
-        elif not late and result.reason is not Reason.LATE:
-            self._hypotheses.add(None, now, sources, 0.0, frame.height_agl_m)
+            given = None if prior is None else position_of(prior, self._matcher.site)
+            match = self._match(result, frame, searched, None if is_given else given)
+            result = self._judge(match, moment, late=late)
+            if isinstance(result, Fix) and given is not None:
+                self._map_offset.add(result, given, moment.time_s)
+        elif not late and result.reason is not Reason.LATE:  # a lack of time is no evidence about the position
+            self._refusals += 1
+            self._moments[-1] = replace(moment, tracks=moment.tracks.missed())
         if not late:
+            self._fixed = isinstance(result, Fix)
             if isinstance(result, Fix):
                 self._errors.note(result, self._ground_below(result))
-            self._fixed = isinstance(result, Fix)
-            if isinstance(result, NoFix) and result.reason is not Reason.LATE:
-                self._refusals += 1  # a lack of time is no evidence about the position
-            self._note_loss(now)
+            self._note_loss(self._moments[-1].tracks)
         return result
 
     # ------------------------------------------------------------------------------------------ predictions
@@ -205,66 +212,56 @@ class Navigator:
         motion = pictures.update(self._with_height(self._errors.without_errors(frame)))
         return motion if isinstance(motion, GroundMotion) else None
 
-    def _reckoned(self, now: OdometrySample, anchor: Anchor | None = None) -> PositionEstimate | None:
-        """Dead reckoning from an anchor; by default the last one."""
-        anchor = anchor or self._anchor
-        if anchor is None or anchor.sample is None:
-            return None if anchor is None else anchor.position
-        drift_m = self._drift.sigma_m(anchor.sample, now, self._recent.velocity)
-        sigma_m = min(math.hypot(anchor.position.sigma_m, drift_m), MAX_SIGMA_M)
-        odds = 0.0 if self._refusals >= self._options.lost_after else anchor.position.log_odds
-        if now.blind_s != anchor.sample.blind_s:
-            odds = min(odds, log_odds(RELIABILITY))
-        place_m = anchor.position.en_m + now.moved_m - anchor.sample.moved_m
-        return PositionEstimate(place_m, sigma_m, odds, anchor.position.on_map)
+    def _next(self, frame: Frame) -> _Moment:
+        """A new frame, by what was known before."""
+        if not self._moments:
+            tracks, start = Tracks(self._options), self._start
+            return _Moment(0.0, Ways(0.0), tracks.begun(start, self._velocity(frame)) if start else tracks)
+        last, interval_s, motion = self._moments[-1], self._clock.interval_s(frame), self._motion
+        seen = None
+        if motion is not None and math.isclose(motion.interval_s, interval_s, abs_tol=1e-6):
+            seen = motion.step(None if last.ways.seen is None else last.ways.seen.end_mps)
+        ways = Ways(interval_s, self._clock.told(frame), seen)  # not seen if a frame in between failed
+        return _Moment(last.time_s + interval_s, ways, last.tracks.carried(ways))
 
-    def _forget_way(self, now: OdometrySample) -> None:
-        """Treat the way since the last fix as unknown, because the velocity that measured it is wrong."""
-        anchor = self._anchor
-        if anchor is not None and anchor.sample is not None:
-            unknown_s = now.time_s - anchor.sample.time_s
-            start = replace(now, time_s=anchor.sample.time_s, blind_s=now.blind_s - unknown_s)
-            self._anchor = replace(anchor, sample=start)
-        self._recent = RecentAnchors(self._drift)
-        self._hypotheses.clear()
+    def _past(self, frame: Frame) -> _Moment:
+        """A late frame, by what was known when the newest frame before it had been matched."""
+        time_s = self._moments[-1].time_s + self._clock.interval_s(frame)
+        known = [each for each in self._moments if each.time_s <= time_s]
+        if not known:
+            return replace(self._moments[0], time_s=time_s)
+        last, after = known[-1], self._moments[len(known)]
+        share = (time_s - last.time_s) / after.ways.interval_s
+        return replace(last, time_s=time_s, tracks=last.tracks.carried(after.ways.part(0.0, share)))
 
-    def _sources(self, now: OdometrySample, prior: Prior | None, *, late: bool) -> Sources:
-        """What is known about the position, and where the matcher searches."""
-        given = None if prior is None else position_of(prior, self._matcher.site)
-        sources = Sources(self._reckoned(now), given, self._pending_position(now))
-        chosen, chosen_prior = self._searched(sources, now, late=late)
-        misled = self._refusals >= self._options.lost_after and self._is_turn(self._refusals)
-        if prior is not None and not misled and (chosen_prior is None or prior.sigma_m < chosen_prior.sigma_m):
-            sigma_m = math.hypot(prior.sigma_m, map_sigma_of(self._matcher.site))
-            chosen, chosen_prior = given, replace(prior, sigma_m=sigma_m)
-        return replace(sources, searched=chosen, prior=chosen_prior)
+    def _take(self, frame: Frame, moment: _Moment | None) -> None:
+        """Add a frame that was matched, and its moment unless it is late."""
+        self._clock.append(frame)
+        if moment is None:
+            return
+        self._moments.append(moment)
+        while len(self._moments) > 2 and self._moments[1].time_s < moment.time_s - self._options.late_s:
+            self._moments.popleft()
 
-    def _searched(
-        self, sources: Sources, now: OdometrySample, *, late: bool
-    ) -> tuple[PositionEstimate | None, Prior | None]:
-        """The navigator's own estimate to search around, and the prior made from it; None for the whole map."""
-        estimate, options = sources.own, self._options
-        if self._lost or estimate is None:
-            pending = sources.pending
-            if pending is not None and pending.sigma_m <= options.trusted_sigma_m:
-                return pending, pending.prior()
-            vague = estimate is None or estimate.sigma_m > options.lost_sigma_m
-            if estimate is None or self._is_turn(0 if vague else self._frames_lost):
-                return None, None
-        growth = options.growth ** min(self._refusals, options.lost_after)
-        last = self._odometry.last
-        moved_m = None if late or last is None else now.moved_m - last.moved_m
-        map_m = 0.0 if estimate.on_map else map_sigma_of(self._matcher.site)
-        return estimate, estimate.prior(growth, moved_m, map_m)
+    def _searched(self, tracks: Tracks, prior: Prior | None, *, late: bool) -> tuple[Prior | None, bool]:
+        """Where the matcher searches: about the best track, or the other source if that is tighter (True)."""
+        own, track, map_m = None, tracks.sought, map_sigma_of(self._matcher.site)
+        if track is not None and not self._leads_nowhere(track):
+            moved_m = None if late else track.moved_m
+            own = track.estimate.prior(track.widened, moved_m, 0.0 if track.fix else map_m)
+        misled = self._refusals * MISS >= RELIABLE and self._is_turn(self._refusals)
+        if prior is None or misled or (own is not None and own.sigma_m <= prior.sigma_m):
+            return own, False
+        return replace(prior, sigma_m=math.hypot(prior.sigma_m, map_m)), True
+
+    def _leads_nowhere(self, track: Track) -> bool:
+        """Whether the whole map is searched instead: if the flight is lost, in turns."""
+        vague = track.estimate.sigma_m > self._options.lost_sigma_m
+        return self._lost and (vague or track.is_lost) and self._is_turn(0 if vague else self._frames_lost)
 
     def _is_turn(self, count: int) -> bool:
         """Whether this frame, of those without a useful prediction, searches the whole map."""
         return self._matcher.site.is_searchable and count % self._options.search_every == 0
-
-    def _pending_position(self, now: OdometrySample) -> PositionEstimate | None:
-        """Dead reckoning from the strongest pending match."""
-        pending = self._hypotheses.pending
-        return None if pending is None else self._hypotheses.position(pending, now)
 
     def _ground_below(self, fix: Fix) -> float | None:
         """Height of the ground below a fix that measured its height; None if the ground is assumed flat."""
@@ -274,7 +271,7 @@ class Navigator:
 
     def _with_height(self, frame: Frame) -> Frame:
         """The frame, with the last fix's height if it came without one."""
-        fix = None if self._anchor is None or self._lost else self._anchor.fix
+        fix = None if self._accepted is None or self._lost else self._accepted.fix
         if frame.height_agl_m is not None or fix is None or fix.up_m is None:
             return frame
         site = self._matcher.site
@@ -283,107 +280,75 @@ class Navigator:
 
     # ---------------------------------------------------------------------------------------------- acceptance
 
-    def _judge(self, fix: Fix, now: OdometrySample, sources: Sources, raw: Frame, *, late: bool) -> Fix | NoFix:
-        """The fix if there is enough evidence for it; otherwise keep it pending and refuse it for now."""
-        if not is_valid(fix):
-            return fix.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
-        if not late and self._velocity.note(fix, raw, now.time_s):
-            self._forget_way(now)
-            sources = replace(sources, own=self._reckoned(now), pending=None)
-        required, against = self._options.min_log_odds, self._against(fix, now)
-        own, given = (self._evidence_of(source, fix, sources) for source in (sources.own, sources.given))
-        disputed = given < 0.0
-        if self._anchor is not None and self._anchor.disputed:
-            given = 0.0  # an error of the other source lasts: ignore it until it agrees again
-        others = match_log_odds(fix) + given
-        if against is None and own + others >= required:
-            self._accept(fix, now, 1, own + others, jump=False, disputed=disputed)
+    def _match(self, fix: Fix, frame: Frame, searched: Prior | None, given: PositionEstimate | None) -> Match:
+        """A match, with what it is to be judged by."""
+        relative_m2 = fix.relative_covariance_m2
+        area_m2 = 0.0
+        if searched is None or fix.confidence is None:  # without a confidence it has not weighed the prior
+            area_m2 = fix.window.area_px * self._matcher.site.gsd_m_per_px**2
+        if searched is not None:
+            relative_m2 = relative_m2 + searched.sigma_m**2 * np.eye(2)
+        least_m2 = 2.0 * math.pi * SEARCHED * math.sqrt(float(np.linalg.det(relative_m2)))
+        return Match(fix, max(area_m2, least_m2), frame.height_agl_m, self._velocity(frame), given)
+
+    def _velocity(self, frame: Frame) -> tuple[Array, float] | None:
+        """The frame's velocity and its standard deviation."""
+        told_mps = velocity_of(frame)
+        return None if told_mps is None else (told_mps, self._clock.sigma_mps(frame))
+
+    def _judge(self, match: Match, moment: _Moment, *, late: bool) -> Fix | NoFix:
+        """The fix if there is enough evidence for it; otherwise its account is remembered and it is refused."""
+        fix, weighed = match.fix, moment.tracks.weighed(match)
+        if weighed.log_odds >= self._options.min_log_odds:
+            self._accept(fix, weighed, moment, late=late)
             return fix
+        if not late:
+            self._refusals += 1
+            self._moments[-1] = replace(moment, tracks=weighed.tracks)
+        best = moment.tracks.best
+        if best is not None and self._is_known(best) and best.estimate.chi_square(fix) > self._options.gate:
+            return replace(best.estimate.refusal(fix), match=fix)
+        asked = f"{self._options.min_confidence:g} is required"
+        return fix.refused(
+            Reason.UNCONFIRMED, f"right with a probability of {probability(weighed.log_odds):.4f}, {asked}"
+        )
+
+    def _is_known(self, track: Track) -> bool:
+        """Whether a track may contradict a match: a start, or one that gave a fix, if it is not too uncertain."""
+        known = track.fix is None or track.log_odds >= self._options.min_log_odds
+        return known and track.estimate.sigma_m <= self._options.lost_sigma_m
+
+    def _accept(self, fix: Fix, weighed: Weighed, moment: _Moment, *, late: bool) -> None:
+        """Continue from this fix; a late one counts if it is newer than the last fix."""
+        last = self._accepted
         if late:
-            return self._refuse_match(fix, against, own + others)
-        match = Match(fix, others if against is not None else own + others)
-        found = self._hypotheses.add(match, now, sources, self._map_m2(fix), raw.height_agl_m)
-        odds = match.log_odds if found is None else found.log_odds
-        return self._decide(found, now, fix, disputed=disputed) or self._refuse_match(fix, against, odds)
-
-    def _decide(self, found: Hypothesis | None, now: OdometrySample, fix: Fix, *, disputed: bool) -> Fix | None:
-        """The fix of a hypothesis that enough matches support."""
-        if found is None or found.count < 2 or found.log_odds < self._options.min_log_odds:
-            return None
-        against = self._against(fix, now)
-        if against is not None and self._dead_reckoning_outweighs(now, found.count):
-            return None
-        self._accept(fix, now, found.count, found.log_odds, jump=against is not None, disputed=disputed)
-        return fix
-
-    def _evidence_of(self, estimate: PositionEstimate | None, fix: Fix, sources: Sources) -> float:
-        """What an estimate adds to the log-odds of a match."""
-        options = self._options
-        return sources.evidence_of(estimate, fix, self._map_m2(fix), options.gate, options.trusted_sigma_m)
-
-    def _map_m2(self, fix: Fix) -> float:  # area of the window
-        return float(fix.window.area_px * self._matcher.site.gsd_m_per_px**2)
-
-    def _against(self, fix: Fix, now: OdometrySample) -> PositionEstimate | None:
-        """A trusted prediction that a fix contradicts: from the last fix, or from one some seconds ago.
-
-        Wrong matches may drift too slowly to show from frame to frame; velocities over seconds reveal it.
-        """
-        predictions = [self._reckoned(now)]
-        oldest = self._recent.oldest
-        if oldest is not None and now.blind_s == oldest.odometry.blind_s:
-            predictions.append(self._reckoned(now, oldest))
-        for estimate in predictions:
-            known = estimate is not None and estimate.sigma_m <= self._options.trusted_sigma_m
-            if estimate is not None and known and estimate.chi_square(fix) > self._options.gate:
-                return estimate
-        return None
-
-    def _dead_reckoning_outweighs(self, now: OdometrySample, against: int) -> bool:
-        """Whether dead reckoning outweighs this many fixes that agree with each other but not with it."""
-        anchor = self._anchor
-        if anchor is None or anchor.sample is None or now.blind_s > anchor.sample.blind_s:
-            return False  # the velocity was not measured
-        return against <= anchor.support and now.time_s - anchor.sample.time_s <= self._options.hold_s
-
-    def _accept(
-        self, fix: Fix, now: OdometrySample, count: int, odds: float, *, jump: bool, disputed: bool
-    ) -> None:
-        """Continue dead reckoning from this fix, with the log-odds of all evidence for it."""
-        last = self._anchor
-        known = last is not None and last.fix is not None
-        if known and last is not None and last.sample is not None and now.time_s < last.sample.time_s:
-            return  # a late one
-        jump = jump or self._lost
-        self._resets += known and jump
+            if last is not None and moment.time_s < last.time_s:
+                return
+            self._replay(replace(moment, tracks=weighed.tracks))
+        else:
+            self._moments[-1] = replace(moment, tracks=weighed.tracks)
+        jump = last is not None and (self._lost or weighed.number != last.number)
+        self._resets += jump
         if jump:  # what was learnt came from a wrong position
             self._errors.forget()
-        support = count if last is None or jump else last.support + count
-        odds = min(odds, log_odds(MAX_PROBABILITY))
-        position = PositionEstimate(en_m(fix), fix.relative_sigma_m, odds, on_map=True)
-        self._anchor = Anchor(position, now, fix, support, disputed)
-        self._recent.append(self._anchor, jump=jump)
+        self._accepted = _Accepted(fix, moment.time_s, weighed.number)
         self._refusals, self._frames_lost, self._lost = 0, 0, False
-        self._hypotheses.clear()
 
-    def _refuse_match(self, fix: Fix, against: PositionEstimate | None, odds: float) -> NoFix:
-        """The refusal of a match without enough evidence."""
-        if against is not None:
-            return replace(against.refusal(fix), match=fix)
-        asked = f"{self._options.min_confidence:g} is required"
-        return fix.refused(Reason.UNCONFIRMED, f"right with a probability of {probability(odds):.4f}, {asked}")
+    def _replay(self, moment: _Moment) -> None:
+        """Carry the tracks of a late frame to the newest."""
+        tracks = moment.tracks
+        for k, after in enumerate(self._moments):
+            if after.time_s > moment.time_s:
+                left_s = min(after.time_s - moment.time_s, after.ways.interval_s)
+                tracks = tracks.carried(after.ways.part(1.0 - left_s / (after.ways.interval_s or 1.0), 1.0))
+                self._moments[k] = replace(after, tracks=tracks)
 
-    def _note_loss(self, now: OdometrySample) -> None:
-        """Declare the flight lost, or drop its start, after too many refusals or too much uncertainty."""
-        anchor, options = self._anchor, self._options
-        if anchor is None or self._fixed:
+    def _note_loss(self, tracks: Tracks) -> None:
+        """Declare the flight lost after too many refusals or too much uncertainty."""
+        track = tracks.best
+        if self._fixed or track is None:
             return
-        if self._refusals == options.lost_after:  # a wrong or outdated bias would keep them refused
-            self._errors.forget()
-        estimate = self._reckoned(now)
-        far = estimate is not None and estimate.sigma_m > options.lost_sigma_m
-        if anchor.fix is not None:
-            self._frames_lost += self._lost
-            self._lost = self._lost or far or self._refusals >= options.lost_after
-        elif self._refusals >= options.lost_after:
-            self._anchor = None
+        self._frames_lost += self._lost
+        if not self._lost and (track.is_lost or track.estimate.sigma_m > self._options.lost_sigma_m):
+            self._lost = True
+            self._errors.forget()  # a wrong or outdated bias would keep frames refused

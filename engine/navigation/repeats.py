@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 
-from engine.navigation.motion import OdometrySample
+from engine.navigation.motion import Ways
 from engine.values import Frame, NoFix, Reason
 
 _MIN_M = 0.5  # a noise-free camera at rest may repeat an image
@@ -18,18 +18,23 @@ class Repeats:
 
     def __init__(self) -> None:
         self._digest: tuple[object, ...] | None = None
-        self._sample: OdometrySample | None = None
+        self._since_s, self._moved_m = 0.0, np.zeros(2)
+        self._is_measured = True  # the movement since then
 
-    def refusal(self, frame: Frame, now: OdometrySample) -> NoFix | None:
+    def refusal(self, frame: Frame, ways: Ways) -> NoFix | None:
         """Refuse a picture that repeats the last one although the vehicle has moved since; else None."""
-        digest, sample = _digest(frame), self._sample
-        if sample is None or digest != self._digest:
-            self._digest, self._sample = digest, now
+        digest, step = _digest(frame), ways.told or ways.seen
+        if digest != self._digest:
+            self._digest = digest
+            self._since_s, self._moved_m, self._is_measured = 0.0, np.zeros(2), True
             return None
-        moved_m = float(np.hypot(*(now.moved_m - sample.moved_m)))
-        if now.blind_s != sample.blind_s or moved_m < _MIN_M:  # movement not measured, or none
+        self._since_s += ways.interval_s
+        self._is_measured &= step is not None
+        self._moved_m = self._moved_m + (0.0 if step is None else step.moved_m)
+        moved_m = float(np.hypot(*self._moved_m))
+        if not self._is_measured or moved_m < _MIN_M:
             return None
-        detail = f"the picture repeats the one {now.time_s - sample.time_s:.1f} s and {moved_m:.1f} m ago"
+        detail = f"the picture repeats the one {self._since_s:.1f} s and {moved_m:.1f} m ago"
         return NoFix(reason=Reason.FAILED, detail=detail, timestamp_ns=frame.timestamp_ns)
 
 

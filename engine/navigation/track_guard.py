@@ -18,6 +18,7 @@ from engine.values import Fix, Frame, NoFix, Reason
 TOLERANCE_M = 5.0
 """Smaller contradictions are left to the estimator's own gate."""
 _IN_A_ROW = 3  # matches that contradict the track to start a dispute, or agree with it to end one
+_KNOWN_M = 50.0  # sigma up to which a track is known
 _MAX_GAP_S = 1.0  # longest gap between frames to integrate a stated velocity over
 
 
@@ -197,7 +198,7 @@ class TrackGuard:
                 return False
             track = self._rival.track
         elif was_disputed:
-            self._agreements += track.estimate.sigma_m <= self._options.trusted_sigma_m
+            self._agreements += track.estimate.sigma_m <= _KNOWN_M
             if self._agreements < _IN_A_ROW:
                 return False
         self._rival, self._agreements = None, 0

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.navigation.live import Answer, Live, LiveOptions
+from engine.navigation.motion import position_of
 from engine.navigation.navigator import Navigator
-from engine.navigation.odds import position_of
 from engine.navigation.track_guard import TrackGuard
 from engine.orthomap import OrthoMap
 from engine.runtime.realtime import start_thread

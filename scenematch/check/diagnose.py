@@ -11,7 +11,7 @@ import numpy as np
 from engine.camera import Camera
 from engine.geo import Array
 from engine.matching.covariance import map_sigma_of
-from engine.navigation.odds import position_of
+from engine.navigation.motion import position_of
 from engine.orthomap import OrthoMap
 from engine.values import Frame, Prior
 from scenematch.check.causes import findings, is_known

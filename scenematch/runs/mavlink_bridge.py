@@ -14,7 +14,7 @@ from engine.errors import BackendError, CalibrationError, OptionError, Telemetry
 from engine.matching import METHODS
 from engine.matching.matcher import SceneMatcher
 from engine.navigation.live import LiveOptions
-from engine.navigation.odds import position_of
+from engine.navigation.motion import position_of
 from engine.options import MatcherOptions, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.garbage import no_collection

@@ -48,10 +48,11 @@ def test_a_fix_tells_what_of_its_covariance_is_the_maps():
 
 def test_the_maps_error_cancels_between_fixes_on_it():
     """The window of the next frame is not wider for it, and a match 5 m off contradicts a fix known to 0.5 m."""
-    results, priors, navigator = fly([(0.0, 0.0), (5.0, 0.0)])
+    results, priors, _ = fly([(0.0, 0.0), (5.0, 0.0)])
     assert [isinstance(result, Fix) for result in results] == [True, False]
-    assert priors[1].sigma_m == pytest.approx(math.hypot(0.5, 0.5))
-    assert navigator.prediction.sigma_m == pytest.approx(math.sqrt(0.5 + 9.0))  # of a place in the world
+    assert priors[1].sigma_m == pytest.approx(math.hypot(0.5, 0.5, math.sqrt(9.0 / 12.0)))
+    navigator = fly([(0.0, 0.0), (90.0, 0.0)])[2]
+    assert navigator.prediction.sigma_m == pytest.approx(math.hypot(priors[1].sigma_m, 3.0))  # in the world
 
 
 @pytest.mark.parametrize("is_start", [True, False])

@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine import Attitude, Budget, Camera, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, Reason
-from engine.navigation.motion import DeadReckoning, DriftModel, GroundMotion
+from engine.navigation.motion import FrameClock, GroundMotion, Ways
 from engine.navigation.odometry import NoMotion, VisualOdometry
+from engine.navigation.tracks import Track
 from scenematch.runs.settings import TrackSettings, load_settings
 from tests.support.matchers import ScriptedMatcher, a_site
 
@@ -215,39 +216,37 @@ def test_the_way_after_a_picture_that_repeats_is_unknown():
 # Dead reckoning
 
 
+def test_motions_add_up_and_so_do_their_errors():
+    """Four of 5 m: the share of height and heading lasts, the rest does not."""
+    motion = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
+    track = Track(np.zeros(2), motion.velocity_mps, np.diag([0.0, 0.1**2]), 20.0, trusts_velocity=True, number=0)
+    for _ in range(4):
+        track = track.carried(Ways(1.0, seen=motion.step(motion.velocity_mps)), NavigatorOptions())
+    assert track.en_m == pytest.approx([12.0, 16.0])
+    assert track.estimate.sigma_m == pytest.approx(math.hypot(0.02 * 20.0, 0.2 * math.sqrt(4)))
+
+
 def still(seconds, **velocity):
     return Frame(np.zeros((2, 2), np.uint8), round(seconds * 1e9), **velocity)
 
 
-def test_motions_add_up_and_so_do_their_errors():
-    reckoning, drift = DeadReckoning(2.0, 0.2), DriftModel(0.5, 3.0, 15.0)
-    begin = reckoning.sample(still(0.0), None)
-    reckoning.append(still(0.0), begin)
-    step = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
-    for k in range(1, 5):
-        sample = reckoning.sample(still(k), None, step)
-        reckoning.append(still(k), sample)
-    assert sample.moved_m == pytest.approx([12.0, 16.0])
-    assert sample.blind_s == 0.0
-    assert drift.sigma_m(begin, sample) == pytest.approx(math.hypot(0.02 * 20.0, 0.2 * math.sqrt(4)))
+def test_a_motion_counts_over_its_own_interval_only(monkeypatch):
+    """The frame at 1 s failed: what the pictures show is not the way of two seconds."""
+    motion = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
+    monkeypatch.setattr(VisualOdometry, "update", lambda *_: motion)
+    for seconds, moved_m in ((1.0, 3.0), (2.0, 0.0)):
+        navigator = Navigator(blind(camera=CAMERA), START, options=NavigatorOptions(odometry=True))
+        for stamp in (0.0, seconds):
+            navigator.update(still(stamp))
+        assert navigator.prediction.east_m == pytest.approx(moved_m)
 
 
-def test_a_motion_counts_over_its_own_interval_only():
-    reckoning = DeadReckoning(2.0, 0.2)
-    reckoning.append(still(0.0), reckoning.sample(still(0.0), None))
-    step = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
-    after = reckoning.sample(still(2.0), None, step)  # the frame at 1 s failed
-    assert (after.time_s, after.blind_s, list(after.moved_m)) == (2.0, 2.0, [0.0, 0.0])
-
-
-def test_a_velocity_with_its_own_accuracy_is_taken_at_its_word():
-    drift = DriftModel(0.5, 3.0, 15.0)
-    for sigma_mps, expected_m in ((None, 0.5), (0.1, 0.1), (2.0, 2.0)):
-        reckoning = DeadReckoning(2.0, 0.2)
-        stated = {"east_velocity_mps": 1.0, "north_velocity_mps": 0.0, "velocity_sigma_mps": sigma_mps}
-        begin = reckoning.sample(still(0.0, **stated), None)
-        reckoning.append(still(0.0, **stated), begin)
-        assert drift.sigma_m(begin, reckoning.sample(still(1.0, **stated), None)) == pytest.approx(expected_m)
+@pytest.mark.parametrize(("sigma_mps", "expected_mps"), [(None, 0.5), (0.1, 0.1), (2.0, 2.0)])
+def test_a_velocity_with_its_own_accuracy_is_taken_at_its_word(sigma_mps, expected_mps):
+    stated = {"east_velocity_mps": 1.0, "north_velocity_mps": 0.0, "velocity_sigma_mps": sigma_mps}
+    clock = FrameClock(NavigatorOptions())
+    clock.append(still(0.0, **stated))
+    assert clock.told(still(1.0, **stated)).sigma_mps == expected_mps
 
 
 def blind(**known):

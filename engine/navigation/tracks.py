@@ -1,0 +1,321 @@
+"""Tracks: accounts of one flight as a bounded set of weighed Gaussians, which matches confirm or contradict.
+
+Each is one account of which matches are right, and of whether the telemetry's velocity is. Its Gaussian is over
+position and velocity; its log-odds, against "the vehicle is elsewhere", add up over its matches. This is multiple
+hypothesis tracking (Reid 1979, https://doi.org/10.1109/TAC.1979.1102177) with two models of motion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from engine.matching.evidence import RELIABILITY
+from engine.navigation.motion import Array, PositionEstimate, Step, Ways, en_m
+from engine.navigation.odds import CERTAIN, MISS, RELIABLE, stated_nats
+from engine.options import NavigatorOptions
+from engine.values import Fix
+
+MAX_TRACKS = 16
+_SAME_GROUND = 0.5  # weight of a match of ground that was matched before
+_HEIGHT_M = 100.0  # assumed if it is unknown
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """One account of the flight.
+
+    Attributes:
+        en_m: (2,) position at the newest frame.
+        velocity_mps: (2,) at the same time.
+        covariance: (2, 2) of position and velocity, along each axis.
+        support: log-odds from its matches.
+        trusts_velocity: whether the telemetry's velocity moves it; else only what pictures show, or inertia.
+        number: of the account; two tracks share it, of which one trusts the velocity.
+        fix: its newest match; None for a start.
+        misses: frames since then.
+        moved_m: (2,) its last movement.
+    """
+
+    en_m: Array
+    velocity_mps: Array
+    covariance: Array
+    support: float
+    trusts_velocity: bool
+    number: int
+    fix: Fix | None = None
+    misses: int = 0
+    moved_m: Array | None = None
+
+    @property
+    def estimate(self) -> PositionEstimate:
+        """Its position, which is on the map once a match gave it."""
+        return PositionEstimate(self.en_m, math.sqrt(self.covariance[0, 0]), self.fix is not None)
+
+    @property
+    def log_odds(self) -> float:
+        """Log-odds of this account at the newest frame."""
+        return self.support - MISS * self.misses
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether so many frames in a row did not match it that it is no better than any other place."""
+        return min(self.support, CERTAIN) <= MISS * self.misses
+
+    @property
+    def widened(self) -> float:
+        """Factor on sigma for a search: a miss that halves the odds of the place doubles the area to search."""
+        return math.exp(0.5 * min(MISS * self.misses, CERTAIN))
+
+    def missed(self) -> Track:
+        """The track after a frame that did not match it."""
+        return replace(self, misses=self.misses + 1)
+
+    def told(self, mps: Array, sigma_mps: float) -> Track:
+        """The track with the velocity of another source in place of its own.
+
+        Args:
+            mps: (2,) east and north.
+            sigma_mps: standard deviation of each.
+
+        Returns:
+            Track: at the same position.
+        """
+        covariance = np.diag([self.covariance[0, 0], sigma_mps**2])
+        return replace(self, velocity_mps=mps, covariance=covariance)
+
+    def matched(self, fix: Fix, support: float) -> Track:
+        """The track after a match: its position is the match's own, its velocity is filtered."""
+        variance_m2, covariance = fix.relative_sigma_m**2, self.covariance
+        gain = covariance[0, 1] / (covariance[0, 0] + variance_m2)
+        velocity_m2ps2 = covariance[1, 1] - gain * covariance[0, 1]
+        both = gain * variance_m2
+        return replace(
+            self,
+            en_m=en_m(fix),
+            velocity_mps=self.velocity_mps + gain * (en_m(fix) - self.en_m),
+            covariance=np.array([[variance_m2, both], [both, velocity_m2ps2]]),
+            support=support,
+            fix=fix,
+            misses=0,
+        )
+
+    def carried(self, ways: Ways, options: NavigatorOptions) -> Track:
+        """The track at the next frame."""
+        fades = math.exp(-ways.interval_s / options.memory_s)
+        support = min(self.support, CERTAIN + (self.support - CERTAIN) * fades)
+        step = ways.told if self.trusts_velocity and ways.told is not None else ways.seen
+        track = self._drifted(ways.interval_s, options) if step is None else self._led(step, ways.interval_s)
+        return replace(track, support=support, moved_m=track.en_m - self.en_m)
+
+    def _led(self, step: Step, interval_s: float) -> Track:
+        """The track after a step that a source measured, whose velocity has the error that matches found."""
+        track = self if step.begin_mps is not None else self.told(step.end_mps, step.sigma_mps)
+        begin_mps = step.end_mps if step.begin_mps is None else step.begin_mps
+        off_mps = track.velocity_mps - begin_mps
+        way = np.array([[1.0, interval_s], [0.0, 1.0]])
+        covariance = way @ track.covariance @ way.T
+        covariance[0, 0] += step.noise_m2
+        covariance[1, 1] = max(covariance[1, 1], step.sigma_mps**2)  # the error may change
+        place_m = track.en_m + step.moved_m + off_mps * interval_s
+        return replace(track, en_m=place_m, velocity_mps=step.end_mps + off_mps, covariance=covariance)
+
+    def _drifted(self, interval_s: float, options: NavigatorOptions) -> Track:
+        """The track after a way that nothing measured: an acceleration that changes every second, bounded speed.
+
+        The velocity is an Ornstein-Uhlenbeck process whose standard deviation is half of the highest speed.
+        """
+        sigma_mps = 0.5 * options.max_speed_mps
+        fades_s = 2.0 * (sigma_mps / options.acceleration_mps2) ** 2
+        kept = math.exp(-interval_s / fades_s)
+        way = np.array([[1.0, fades_s * (1.0 - kept)], [0.0, kept]])
+        place = fades_s**2 * (2.0 * interval_s / fades_s - 3.0 + 4.0 * kept - kept**2)
+        both = fades_s * (1.0 - kept) ** 2
+        noise = sigma_mps**2 * np.array([[place, both], [both, 1.0 - kept**2]])
+        return replace(
+            self,
+            en_m=self.en_m + way[0, 1] * self.velocity_mps,
+            velocity_mps=kept * self.velocity_mps,
+            covariance=way @ self.covariance @ way.T + noise,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """A match of the newest frame, and what it is to be judged by.
+
+    Attributes:
+        fix: the match.
+        searched_m2: area that was searched.
+        height_m: above the ground, if known.
+        velocity: (2,) m/s told with the frame and its standard deviation; None if none came.
+        given: another source's position, unless it was searched about; it speaks for or against a place that no
+            track predicted.
+    """
+
+    fix: Fix
+    searched_m2: float
+    height_m: float | None = None
+    velocity: tuple[Array, float] | None = None
+    given: PositionEstimate | None = None
+
+    @property
+    def support(self) -> float:
+        """What it adds to the log-odds of a place that no track predicted."""
+        own = min(stated_nats(self.fix), CERTAIN)
+        if self.given is None:
+            return own
+        here = min(self.given.log_likelihood_ratio(self.fix, self.searched_m2), CERTAIN)
+        return own + float(np.logaddexp(math.log(RELIABILITY) + here, math.log(1.0 - RELIABILITY)))
+
+    def new_share(self, track: Track) -> float:
+        """The share of its ground that the track's last match did not show; a frame shows about its height."""
+        if track.fix is None:
+            return 1.0
+        return min(1.0, float(np.hypot(*(en_m(self.fix) - en_m(track.fix)))) / (self.height_m or _HEIGHT_M))
+
+
+@dataclass(frozen=True, slots=True)
+class Weighed:
+    """The tracks after a match.
+
+    Attributes:
+        tracks: all of them.
+        number: of the account that the match belongs to.
+        log_odds: that the match is right.
+    """
+
+    tracks: Tracks
+    number: int
+    log_odds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """The accounts of one flight, the most probable first.
+
+    Attributes:
+        options: of the navigator.
+        known: at most :data:`MAX_TRACKS`.
+        count: of accounts so far.
+    """
+
+    options: NavigatorOptions
+    known: tuple[Track, ...] = ()
+    count: int = 0
+
+    @property
+    def best(self) -> Track | None:
+        """The most probable one."""
+        return self.known[0] if self.known else None
+
+    @property
+    def sought(self) -> Track | None:
+        """Where to look: the most probable one that is not lost, if there is one."""
+        return next((each for each in self.known if not each.is_lost), self.best)
+
+    def of(self, number: int) -> Track | None:
+        """The more probable track of an account."""
+        return next((each for each in self.known if each.number == number), None)
+
+    def begun(self, start: PositionEstimate, velocity: tuple[Array, float] | None) -> Tracks:
+        """With an account that begins at a position of another source.
+
+        Args:
+            start: the position.
+            velocity: (2,) m/s told with the first frame and its standard deviation; None if none came.
+
+        Returns:
+            Tracks: with one account more.
+        """
+        return self._kept([*self.known, *self._born(start, RELIABLE, velocity, None)], self.count + 1)
+
+    def carried(self, ways: Ways) -> Tracks:
+        """At the next frame."""
+        return replace(self, known=tuple(each.carried(ways, self.options) for each in self.known))
+
+    def missed(self) -> Tracks:
+        """After a frame without a match."""
+        return self._kept(each.missed() for each in self.known)
+
+    def weighed(self, match: Match) -> Weighed:
+        """After a match, with the probability that it is right.
+
+        A match that agrees with a track confirms it: by its own evidence, as far as its ground is new, and by how
+        much better it lies there than anywhere in the searched area. One that is more probable by itself begins an
+        account.
+        """
+        fix, gate = match.fix, self.options.gate
+        agreeing = [each for each in self.known if each.estimate.chi_square(fix) <= gate]
+        others = [each.missed() for each in self.known if each.estimate.chi_square(fix) > gate]
+        ratios = [max(each.estimate.log_likelihood_ratio(fix, match.searched_m2), -CERTAIN) for each in agreeing]
+        grown = [_grown(each, match, ratio, max(ratios)) for each, ratio in zip(agreeing, ratios, strict=True)]
+        own = [stated_nats(fix) + ratio + MISS for ratio in ratios]  # of the match, if the track is right
+        right = [each.log_odds - np.logaddexp(0.0, -nats) for each, nats in zip(grown, own, strict=True)]
+        wrong = [each.log_odds - np.logaddexp(0.0, nats) for each, nats in zip(grown, own, strict=True)]
+        wrong += [0.0, *(each.log_odds for each in others)]
+        count = self.count
+        if all(each.log_odds < match.support for each in grown):  # the vehicle is rather elsewhere, namely here
+            place = PositionEstimate(en_m(fix), fix.relative_sigma_m, on_map=True)
+            grown += self._born(place, match.support, match.velocity, fix)
+            right.append(match.support)
+            count += 1
+        odds = float(np.logaddexp.reduce(right) - np.logaddexp.reduce(wrong))
+        number = max(grown, key=lambda each: each.log_odds).number
+        return Weighed(self._kept([*others, *grown], count), number, odds)
+
+    def _born(
+        self, place: PositionEstimate, support: float, velocity: tuple[Array, float] | None, fix: Fix | None
+    ) -> list[Track]:
+        """The two tracks of a new account, whose velocity is unknown but for the telemetry's."""
+        covariance = np.diag([place.sigma_m**2, (0.5 * self.options.max_speed_mps) ** 2])
+        free = Track(place.en_m, np.zeros(2), covariance, support, velocity is None, self.count, fix)
+        if velocity is None:
+            return [free]
+        led = replace(free, trusts_velocity=True).told(*velocity)
+        return [led, replace(free, support=support - CERTAIN)]
+
+    def _kept(self, tracks: Iterable[Track], count: int | None = None) -> Tracks:
+        """The most probable tracks of these, of each account one with the velocity and one without.
+
+        The velocity may become wrong, or right again, at any frame: neither becomes improbable for good.
+        """
+        pairs: dict[int, list[Track]] = {}
+        for each in tracks:
+            pairs.setdefault(each.number, []).append(each)
+        accounts = sorted(map(_paired, pairs.values()), key=lambda pair: -pair[0].log_odds)
+        known = [each for k, pair in enumerate(accounts) if k == 0 or not pair[0].is_lost for each in pair]
+        return replace(self, known=tuple(known[:MAX_TRACKS]), count=self.count if count is None else count)
+
+
+def _grown(track: Track, match: Match, ratio: float, best: float) -> Track:
+    """A track after a match that agrees with it.
+
+    A wrong match of repeated structure recurs as long as the frame shows the same ground.
+
+    Args:
+        track: at the match's frame.
+        match: the match.
+        ratio: how much better it lies here than anywhere, by the track's Gaussian.
+        best: the same for the best of the tracks that it agrees with.
+    """
+    share = match.new_share(track)
+    own = (_SAME_GROUND + (1.0 - _SAME_GROUND) * share) * min(stated_nats(match.fix), CERTAIN)
+    gain = own + share * min(best, CERTAIN) + ratio - best
+    return track.matched(match.fix, track.log_odds + gain)
+
+
+def _paired(pair: list[Track]) -> list[Track]:
+    """Both tracks of an account, none of them much less probable than the other."""
+    first = max(pair, key=lambda each: each.log_odds)
+    other = next((each for each in pair if each.trusts_velocity is not first.trusts_velocity), None)
+    if other is None:
+        return [first]
+    least = first.log_odds - CERTAIN
+    if other.log_odds < least:
+        state = other if other.fix is first.fix else first
+        other = replace(state, trusts_velocity=other.trusts_velocity, support=least, misses=0)
+    return [first, other]

@@ -1,0 +1,321 @@
+"""Tracks: their motion against independent figures, their odds by Bayes' rule, and flights."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from engine import Fix, Frame, Navigator, NavigatorOptions, Prior, Window
+from engine.navigation.motion import PositionEstimate, Step, Ways
+from engine.navigation.odds import CERTAIN, MAX_PROBABILITY, MISS, log_odds, probability, stated_nats
+from engine.navigation.tracks import MAX_TRACKS, Match, Track, Tracks
+from tests.support.fixes import a_fix
+from tests.support.matchers import ScriptedMatcher
+
+OPTIONS = NavigatorOptions()
+SECOND = 1_000_000_000
+NUMBERS = itertools.count()
+AREA_M2 = 1e4
+LONG_AGO = NavigatorOptions(memory_s=1e12)  # nothing fades
+
+
+def new_image():
+    """A picture like no other: one that repeats is refused."""
+    return np.full((8, 8), next(NUMBERS) % 256, np.uint8)
+
+
+def fix_at(east_m, north_m=0.0, confidence=0.9999, sigma_m=1.0):
+    window = Window(0, 0, 1000, 1000)
+    return a_fix(east_m, north_m, sigma_m, method="sift", window=window, confidence=confidence)
+
+
+def a_track(velocity=(0.0, 0.0), covariance=((4.0, 1.0), (1.0, 2.0)), **known):
+    usual = {"support": 20.0, "trusts_velocity": True, "number": 0, "fix": fix_at(0.0)}
+    return Track(np.zeros(2), np.array(velocity, float), np.array(covariance, float), **(usual | known))
+
+
+# Motion
+
+
+def test_a_measured_step_carries_position_and_velocity_with_the_error_that_matches_found():
+    """Told 4 to 6 m/s east, found to be 1 m/s less: 5 m/s over 2 s, less 2 m."""
+    step = Step(np.array([10.0, 0.0]), np.array([4.0, 0.0]), np.array([6.0, 0.0]), sigma_mps=0.5, noise_m2=0.3)
+    track = a_track(velocity=(3.0, 0.0)).carried(Ways(2.0, told=step), OPTIONS)
+    assert track.en_m == pytest.approx([8.0, 0.0])
+    assert track.velocity_mps == pytest.approx([5.0, 0.0])
+    assert track.covariance == pytest.approx(np.array([[4.0 + 2 * 2.0 + 4 * 2.0 + 0.3, 5.0], [5.0, 2.0]]))
+
+
+def test_the_error_of_a_measured_velocity_is_never_known_better_than_it_may_change():
+    step = Step(np.zeros(2), np.zeros(2), np.zeros(2), sigma_mps=0.5)
+    track = a_track(covariance=((1.0, 0.0), (0.0, 1e-6))).carried(Ways(1.0, told=step), OPTIONS)
+    assert track.covariance[1, 1] == 0.25
+
+
+@pytest.mark.parametrize("interval_s", [0.1, 1.0, 10.0, 100.0])
+def test_without_a_measurement_it_drifts_as_a_process_of_bounded_velocity(interval_s):
+    """Against the same process integrated in small steps."""
+    sigma_mps = 0.5 * OPTIONS.max_speed_mps
+    fades_s = 2.0 * (sigma_mps / OPTIONS.acceleration_mps2) ** 2
+    state, covariance, steps = np.array([0.0, 7.0]), np.array([[4.0, 1.0], [1.0, 2.0]]), 20_000
+    way = np.eye(2) + interval_s / steps * np.array([[0.0, 1.0], [0.0, -1.0 / fades_s]])
+    for _ in range(steps):
+        state = way @ state
+        covariance = way @ covariance @ way.T
+        covariance[1, 1] += 2.0 * sigma_mps**2 / fades_s * interval_s / steps
+    track = a_track(velocity=(7.0, 0.0)).carried(Ways(interval_s), OPTIONS)
+    assert (track.en_m[0], track.velocity_mps[0]) == pytest.approx(tuple(state), rel=1e-3, abs=1e-3)
+    assert track.covariance == pytest.approx(covariance, rel=2e-3)
+
+
+def test_a_match_gives_the_position_and_filters_the_velocity():
+    """Against the errors of position, velocity and match, written out."""
+    track, sigma_m = a_track(velocity=(3.0, 0.0)), 1.5
+    after = track.matched(fix_at(2.0, sigma_m=sigma_m), 30.0)
+    gain = 1.0 / (4.0 + sigma_m**2)
+    assert (after.en_m[0], after.velocity_mps[0]) == pytest.approx((2.0, 3.0 + gain * 2.0))
+    errors = np.array([[0.0, 0.0, 1.0], [-gain, 1.0, gain]])  # of the two, by position, velocity and match
+    before = np.block([[track.covariance, np.zeros((2, 1))], [np.zeros((1, 2)), sigma_m**2]])
+    assert after.covariance == pytest.approx(errors @ before @ errors.T)
+    assert (after.support, after.misses) == (30.0, 0)
+
+
+@given(
+    legs=st.lists(
+        st.tuples(st.floats(0.01, 30.0), st.sampled_from(["told", "seen", "blind"]), st.floats(0.05, 30.0)),
+        min_size=1,
+        max_size=12,
+    )
+)
+@settings(max_examples=60)
+def test_a_covariance_stays_one_whatever_happens(legs):
+    track = a_track()
+    for interval_s, source, sigma_m in legs:
+        step = Step(np.ones(2), None if sigma_m > 10 else np.ones(2), np.ones(2), 0.01 * sigma_m, 0.01)
+        ways = {"told": Ways(interval_s, told=step), "seen": Ways(interval_s, seen=step)}
+        track = track.carried(ways.get(source, Ways(interval_s)), OPTIONS)
+        assert np.linalg.eigvalsh(track.covariance)[0] > 0.0
+        track = track.matched(fix_at(0.0, sigma_m=sigma_m), 20.0)
+        assert np.linalg.eigvalsh(track.covariance)[0] >= 0.0
+
+
+def test_a_way_in_two_parts_is_the_whole_way():
+    step = Step(np.array([10.0, 0.0]), np.array([4.0, 0.0]), np.array([6.0, 2.0]), 0.5, 0.3)
+    ways, track = Ways(2.0, told=step), a_track(velocity=(3.0, 1.0))
+    whole = track.carried(ways, OPTIONS)
+    parts = track.carried(ways.part(0.0, 0.3), OPTIONS).carried(ways.part(0.3, 1.0), OPTIONS)
+    assert parts.en_m == pytest.approx(whole.en_m)
+    assert parts.velocity_mps == pytest.approx(whole.velocity_mps)
+    assert parts.covariance == pytest.approx(whole.covariance)
+    assert parts.support == pytest.approx(whole.support)
+
+
+def test_past_evidence_fades_to_that_of_one_match():
+    for support, later in ((CERTAIN + 100.0, CERTAIN + 100.0 / math.e), (CERTAIN - 1.0, CERTAIN - 1.0)):
+        assert a_track(support=support).carried(Ways(OPTIONS.memory_s), OPTIONS).support == pytest.approx(later)
+
+
+# Bayes' rule
+
+
+def tracks_of(*known, options=LONG_AGO):
+    return Tracks(options, known, len(known))
+
+
+def test_a_match_where_a_track_predicts_it_is_right_by_both():
+    """The track: 20 nats. The match: 9.2 of its own, that it lies here, and that every second frame is empty."""
+    track = a_track(covariance=((3.0, 0.0), (0.0, 1.0)))
+    weighed = tracks_of(track).weighed(Match(fix_at(0.0), AREA_M2))
+    own = CERTAIN + math.log(AREA_M2 / (2.0 * math.pi * 4.0)) + MISS
+    grown = 20.0 + 0.5 * CERTAIN  # of the same ground
+    right, wrong = grown - np.logaddexp(0.0, -own), np.logaddexp(grown - np.logaddexp(0.0, own), 0.0)
+    assert weighed.log_odds == pytest.approx(right - wrong)
+    assert (weighed.number, weighed.tracks.best.log_odds) == (0, pytest.approx(grown))
+
+
+def test_a_match_elsewhere_is_weighed_against_the_track():
+    weighed = tracks_of(a_track()).weighed(Match(fix_at(500.0), AREA_M2))
+    assert weighed.log_odds == pytest.approx(CERTAIN - np.logaddexp(0.0, 20.0 - MISS))
+    assert [each.number for each in weighed.tracks.known] == [0, 1]
+    assert [each.log_odds for each in weighed.tracks.known] == pytest.approx([20.0 - MISS, CERTAIN])
+
+
+@pytest.mark.parametrize(("moved_m", "share"), [(0.0, 0.0), (30.0, 0.25), (300.0, 1.0)])
+def test_a_match_of_the_same_ground_counts_half_and_its_agreement_nothing(moved_m, share):
+    track = replace(a_track(covariance=((3.0, 0.0), (0.0, 1.0))), en_m=np.array([moved_m, 0.0]))
+    weighed = tracks_of(track).weighed(Match(fix_at(moved_m), AREA_M2, height_m=120.0))
+    here = math.log(AREA_M2 / (2.0 * math.pi * 4.0))
+    assert weighed.tracks.best.log_odds == pytest.approx(20.0 + (0.5 + 0.5 * share) * CERTAIN + share * here)
+
+
+def test_of_two_motions_the_better_one_gains_whatever_the_ground():
+    near, far = (
+        a_track(trusts_velocity=told, covariance=((v, 0.0), (0.0, 1.0)))
+        for told, v in ((True, 3.0), (False, 15.0))
+    )
+    weighed = tracks_of(near, far).weighed(Match(fix_at(0.0), AREA_M2))
+    first, second = weighed.tracks.known
+    assert first.trusts_velocity
+    assert first.log_odds - second.log_odds == pytest.approx(math.log(16.0 / 4.0))
+
+
+def test_neither_motion_becomes_improbable_for_good():
+    told, free = (
+        a_track(trusts_velocity=told, support=support) for told, support in ((True, 500.0), (False, 20.0))
+    )
+    known = tracks_of(told, free).missed().known
+    assert [each.log_odds for each in known] == pytest.approx([500.0 - MISS, 500.0 - MISS - CERTAIN])
+
+
+def test_another_source_speaks_for_or_against_a_new_place_by_its_reliability():
+    """It is right 99 times in 100; where it is wrong, it says nothing."""
+    at_odds = [
+        Match(fix_at(0.0, confidence=0.9), AREA_M2, given=PositionEstimate(np.array([e, 0.0]), 3.0))
+        for e in (0.0, 500.0)
+    ]
+    assert at_odds[0].support > log_odds(0.9) + 3.0
+    assert at_odds[1].support == pytest.approx(log_odds(0.9) + math.log(0.01))
+    vague = PositionEstimate(np.zeros(2), 500.0)
+    assert Match(fix_at(0.0, confidence=0.9), 1.0, given=vague).support == pytest.approx(log_odds(0.9))
+
+
+def test_no_single_match_gives_a_place_more_than_was_tested():
+    assert Match(fix_at(0.0, confidence=1.0 - 1e-12), AREA_M2).support == log_odds(MAX_PROBABILITY)
+    assert stated_nats(fix_at(0.0, confidence=None)) == pytest.approx(math.log(999.0))
+    assert probability(log_odds(0.3)) == pytest.approx(0.3)
+
+
+def test_a_place_is_lost_when_misses_have_eaten_its_odds_and_the_search_has_grown_as_much():
+    track = a_track(support=500.0)
+    while not track.is_lost:
+        track = track.missed()
+    assert track.misses == math.ceil(CERTAIN / MISS) == 14
+    assert track.widened**2 == pytest.approx(math.exp(CERTAIN))
+
+
+@given(places=st.lists(st.tuples(st.floats(-500, 500), st.floats(-500, 500)), min_size=1, max_size=60))
+@settings(max_examples=40)
+def test_the_set_is_bounded_and_sorted_and_holds_at_most_two_motions_of_an_account(places):
+    tracks = Tracks(OPTIONS)
+    for place in places:
+        match = Match(fix_at(*place), AREA_M2, velocity=(np.zeros(2), 0.5))
+        tracks = tracks.carried(Ways(0.2)).weighed(match).tracks
+        kinds = [(each.number, each.trusts_velocity) for each in tracks.known]
+        assert len(kinds) == len(set(kinds)) <= MAX_TRACKS
+        firsts = [tracks.of(number).log_odds for number in dict.fromkeys(number for number, _ in kinds)]
+        assert firsts == sorted(firsts, reverse=True)
+
+
+# Flights
+
+
+def fly(places, confidence, seconds=1.0, velocity=None, priors=None):
+    """Which frames, so many seconds apart, are fixed, and the navigator."""
+    navigator, fixed = Navigator(ScriptedMatcher(*(fix_at(*place, confidence) for place in places))), []
+    for k in range(len(places)):
+        told = (
+            {}
+            if velocity is None
+            else dict(zip(("east_velocity_mps", "north_velocity_mps"), velocity, strict=True))
+        )
+        frame = Frame(new_image(), round(k * seconds * SECOND), 100.0, 0.0, **told)
+        if isinstance(navigator.update(frame, priors and priors[k]), Fix):
+            fixed.append(k)
+    return fixed, navigator
+
+
+WAY = [(80.0 * k, 0.0) for k in range(8)]
+
+
+def test_matches_that_agree_are_a_fix_in_the_end():
+    """Each of them is right with a probability of 0.99, and 0.999 is asked for."""
+    fixed, navigator = fly([(50.0 * k, 0.0) for k in range(8)], 0.99, velocity=(50.0, 0.0))
+    assert 0 < fixed[0] < 4
+    assert fixed == list(range(fixed[0], 8))
+    assert navigator.tracking
+
+
+def test_chance_never_adds_up():
+    places = np.random.default_rng(3).uniform(-60.0, 60.0, (60, 2))
+    fixed, _ = fly([(50.0 * k + x, y) for k, (x, y) in enumerate(places)], 0.8, velocity=(50.0, 0.0))
+    assert not fixed
+
+
+def test_photographs_seconds_apart_are_fixes_where_each_is_probable():
+    assert fly(WAY, 0.9999, seconds=14.0)[0] == list(range(8))
+
+
+def test_photographs_with_positions_of_their_own_are_fixes_one_by_one():
+    priors = [Prior(east_m=east + 7.0, north_m=north, sigma_m=15.0) for east, north in WAY]
+    fixed, navigator = fly(WAY, 0.9999, seconds=14.0, priors=priors)
+    assert fixed == list(range(8))
+    assert [prior.sigma_m for prior in navigator._matcher.priors] == [15.0] * 8
+
+
+def test_a_match_that_what_was_flown_contradicts_is_refused():
+    places = [(0.0, 0.0), (8.0, 0.0), (16.0, 0.0), (900.0, 0.0), (32.0, 0.0)]
+    assert fly(places, 0.9999, seconds=2.0)[0] == [0, 1, 2, 4]
+
+
+def test_telemetry_that_leads_nowhere_is_left_in_turns():
+    """It is right 99 times in 100: after seven refusals every third frame searches the whole map."""
+    script = ScriptedMatcher(*[None] * 18)
+    navigator = Navigator(script)
+    for k in range(18):
+        navigator.update(Frame(new_image(), k * SECOND, 100.0, 0.0), Prior(east_m=0.0, north_m=0.0, sigma_m=15.0))
+    assert [k for k, prior in enumerate(script.priors) if prior is None] == [9, 12, 15]
+
+
+# Velocities that are wrong
+
+FAULTS = {
+    "swapped": lambda v: v[::-1],
+    "reversed": lambda v: -v,
+    "km/h": lambda v: 3.6 * v,
+    "knots for metres": lambda v: v / 0.5144,
+    "feet": lambda v: 3.28 * v,
+    "drifting": lambda v: v + np.array([4.3, 0.0]),
+}
+
+
+def flown(told=lambda v: v, seconds=30.0, rate_hz=5.0, seed=1):
+    """The frames refused, in seconds since the start, of a vehicle that turns and brakes; the navigator."""
+    rng, count = np.random.default_rng(seed), int(seconds * rate_hz)
+    place, places, velocities, phase = np.zeros(2), [], [], rng.uniform(0, 2 * math.pi)
+    for k in range(count):
+        course = phase + 0.8 * math.sin(0.2 * k / rate_hz + phase)
+        speed_mps = 7.0 * (0.6 + 0.4 * math.cos(0.3 * k / rate_hz))
+        velocity = speed_mps * np.array([math.sin(course), math.cos(course)])
+        velocities.append(told(velocity + rng.normal(0.0, 0.2, 2)))
+        places.append(place + rng.normal(0.0, 0.3, 2))
+        place = place + velocity / rate_hz
+    script = ScriptedMatcher(*(fix_at(*map(float, each), confidence=1.0 - 1e-6, sigma_m=0.3) for each in places))
+    navigator, refused = Navigator(script, Prior(east_m=0.0, north_m=0.0, sigma_m=5.0)), []
+    for k, (east, north) in enumerate(velocities):
+        told_mps = {"east_velocity_mps": float(east), "north_velocity_mps": float(north)}
+        frame = Frame(new_image(), round(k * SECOND / rate_hz), 100.0, 0.0, **told_mps)
+        if not isinstance(navigator.update(frame), Fix):
+            refused.append(k / rate_hz)
+    return refused, navigator
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, pytest.param(30.0, marks=pytest.mark.slow)])
+def test_a_right_velocity_costs_no_fix_and_is_believed(rate_hz):
+    for seed in range(6):
+        refused, navigator = flown(rate_hz=rate_hz, seed=seed)
+        assert not refused
+        assert navigator._moments[-1].tracks.best.trusts_velocity
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_wrong_velocity_costs_few_fixes_and_is_not_believed_for_long(fault):
+    for seed in range(3):
+        refused, navigator = flown(FAULTS[fault], seed=seed)
+        assert len(refused) <= 8
+        assert navigator.reset_count == 0
