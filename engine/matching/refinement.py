@@ -50,6 +50,8 @@ reached 0.6. Poses with a wrong tilt reached 0.30 to 0.35, and 0.87 as soon as t
 # of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; with correct angles all
 # were confirmed.
 _UNCONFIRMED_TILT_DEG = 1.5
+# Standard deviation of each angle of an attitude that the image does not confirm.
+_DOUBTED_DEG = 6.0
 _HEIGHT_SHARE = 2e-4  # bias of the height from walls and the ground hidden behind them: 3 cm at 150 m
 _COARSE_SAMPLES = 800  # on a coarser level
 
@@ -107,10 +109,12 @@ class Refinement:
         return self._refined(fix, prior, self._through_levels(prior, _COARSER))
 
     def _doubting(self) -> Refinement:
-        """The same for a frame whose attitude is known no better than a tilt that it came without."""
-        frame, unknown_deg = self.query.frame, self.options.errors.unknown_tilt_deg
-        heading_sigma_deg = max(frame.heading_sigma_deg or 0.0, unknown_deg)
-        frame = replace(frame, tilt_sigma_deg=unknown_deg, heading_sigma_deg=heading_sigma_deg)
+        """The same for a frame whose attitude is hardly known."""
+        frame = replace(
+            self.query.frame,
+            tilt_sigma_deg=_DOUBTED_DEG,
+            heading_sigma_deg=max(self.query.frame.heading_sigma_deg or 0.0, _DOUBTED_DEG),
+        )
         return replace(self, query=replace(self.query, frame=frame), knows_tilt=False)
 
     def _through_all(self, fix: Fix) -> Fix | None:
