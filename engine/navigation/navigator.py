@@ -289,7 +289,8 @@ class Navigator:
         if searched is not None:
             relative_m2 = relative_m2 + searched.sigma_m**2 * np.eye(2)
         least_m2 = 2.0 * math.pi * SEARCHED * math.sqrt(float(np.linalg.det(relative_m2)))
-        return Match(fix, max(area_m2, least_m2), frame.height_agl_m, self._velocity(frame), given)
+        area_m2 = max(area_m2, least_m2)
+        return Match(fix, area_m2, frame.height_agl_m, self._velocity(frame), self._refusals, given)
 
     def _velocity(self, frame: Frame) -> tuple[Array, float] | None:
         """The frame's velocity and its standard deviation."""

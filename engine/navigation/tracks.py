@@ -152,6 +152,7 @@ class Match:
         searched_m2: area that was searched.
         height_m: above the ground, if known.
         velocity: (2,) m/s told with the frame and its standard deviation; None if none came.
+        refusals: frames in a row before it without a fix.
         given: another source's position, unless it was searched about; it speaks for or against a place that no
             track predicted.
     """
@@ -160,12 +161,16 @@ class Match:
     searched_m2: float
     height_m: float | None = None
     velocity: tuple[Array, float] | None = None
+    refusals: int = 0
     given: PositionEstimate | None = None
 
     @property
     def support(self) -> float:
-        """What it adds to the log-odds of a place that no track predicted."""
-        own = min(stated_nats(self.fix), CERTAIN)
+        """What it adds to the log-odds of a place that no track predicted.
+
+        Its own evidence takes every second frame to show a place. After n refusals it is one in n + 2 (Laplace).
+        """
+        own = min(stated_nats(self.fix) - math.log1p(self.refusals), CERTAIN)
         if self.given is None:
             return own
         here = min(self.given.log_likelihood_ratio(self.fix, self.searched_m2), CERTAIN)

@@ -187,12 +187,12 @@ def test_a_given_prior_is_used_where_it_knows_nothing_itself(sim_site):
 
 def test_a_match_of_the_whole_map_is_believed_once_others_agree():
     """Right with a probability of 0.99 each, by the motion that was measured; others are sought near the first."""
-    answers = None, (100.0, 0.0), (104.1, 0.0), (108.0, 0.0), None
+    answers = None, (100.0, 0.0), (104.1, 0.0), (108.0, 0.0), (112.0, 0.0), None
     ends, priors, navigator = flown(*answers, start=None, velocity=(4.0, 0.0), confidence=0.99)
-    assert ends == ["low_score", "unconfirmed", "unconfirmed", "fix", "low_score"]
+    assert ends == ["low_score", *["unconfirmed"] * 3, "fix", "low_score"]
     assert priors[:2] == [None, None]
     assert_prior(priors[2], 104.0, 0.0, math.hypot(1.0, drift_m(1.0)))
-    assert priors[4].east_m == pytest.approx(112.0, abs=0.2)
+    assert priors[5].east_m == pytest.approx(116.0, abs=0.2)
     assert (navigator.state, navigator.reset_count) == (NavigatorState.COASTING, 0)
 
 

@@ -191,6 +191,13 @@ def test_no_single_match_gives_a_place_more_than_was_tested():
     assert probability(log_odds(0.3)) == pytest.approx(0.3)
 
 
+def test_after_refusals_a_new_place_needs_more_evidence():
+    """Two prior odds: one frame in two shows a place, and one in forty; and nothing adds more than was tested."""
+    supports = [Match(fix_at(0.0, confidence=0.9999), AREA_M2, refusals=each).support for each in (0, 38)]
+    assert supports[0] - supports[1] == pytest.approx(math.log((38 + 1) / 1))
+    assert Match(fix_at(0.0, confidence=1.0 - 1e-9), AREA_M2, refusals=38).support == CERTAIN
+
+
 def test_a_place_is_lost_when_misses_have_eaten_its_odds_and_the_search_has_grown_as_much():
     track = a_track(support=500.0)
     while not track.is_lost:
