@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError, TelemetryError
-from engine.geo import wrap_heading_deg
+from engine.geo import larger_variance, wrap_heading_deg
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -331,12 +331,12 @@ class Fix:
     @property
     def relative_sigma_m(self) -> float:
         """As :attr:`sigma_m`, without the map's own error."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.relative_covariance_m2)[-1]))
+        return math.sqrt(larger_variance(self.relative_covariance_m2))
 
     @property
     def sigma_m(self) -> float:
         """Horizontal standard deviation, the larger of the two axes of the ellipse."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2[:2, :2])[-1]))
+        return math.sqrt(larger_variance(self.covariance_m2[:2, :2]))
 
     def protection_level_m(self, risk: float = 1e-4) -> float:
         """Horizontal radius around the fix that the vehicle exceeds with at most this probability.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
-from engine.geo import chi_square
+from engine.geo import chi_square, larger_variance
 from engine.options import NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason
@@ -107,7 +107,7 @@ class GroundMotion:
             Step: its lasting error is a share of the velocity.
         """
         sigma_mps = self.lasting_share * float(np.hypot(*self.velocity_mps))
-        noise_m2 = self.drift * float(np.linalg.eigvalsh(self.noise_m2)[-1])
+        noise_m2 = self.drift * larger_variance(self.noise_m2)
         return Step(self.moved_m, begin_mps, self.velocity_mps, sigma_mps, noise_m2)
 
 
@@ -202,8 +202,10 @@ class PositionEstimate:
         Returns:
             (2, 2) square metres, east and north.
         """
-        covariance = fix.relative_covariance_m2 if self.on_map else fix.covariance_m2[:2, :2]
-        return np.asarray(covariance + self.sigma_m**2 * np.eye(2))
+        covariance_m2 = fix.relative_covariance_m2 if self.on_map else fix.covariance_m2[:2, :2].copy()
+        covariance_m2[0, 0] += self.sigma_m**2
+        covariance_m2[1, 1] += self.sigma_m**2
+        return covariance_m2
 
     def chi_square(self, fix: Fix) -> float:
         """Squared Mahalanobis distance to a fix by both covariances: two degrees of freedom."""
@@ -214,8 +216,10 @@ class PositionEstimate:
 
         An estimate vaguer than the area says nothing by that, only by how far the fix is off.
         """
-        own_m2 = 2.0 * math.pi * math.sqrt(float(np.linalg.det(self.difference_covariance_m2(fix))))
-        return math.log(max(area_m2 / own_m2, 1.0)) - 0.5 * self.chi_square(fix)
+        covariance_m2 = self.difference_covariance_m2(fix)
+        (a, b), (c, d) = covariance_m2.tolist()
+        own_m2 = 2.0 * math.pi * math.sqrt(a * d - b * c)
+        return math.log(max(area_m2 / own_m2, 1.0)) - 0.5 * chi_square(en_m(fix) - self.en_m, covariance_m2)
 
     def refusal(self, fix: Fix) -> NoFix:
         """The refusal of a fix that contradicts this estimate."""

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import OptionError
+from engine.geo import larger_variance
 from engine.matching.align import to_gray
 from engine.matching.covariance import with_frame_accuracy
 from engine.navigation.motion import GroundMotion
@@ -134,7 +135,7 @@ class VisualOdometry:
         self, frame: Frame, interval_s: float, moved_m: Array, noise_m2: Array, points: int
     ) -> GroundMotion | NoMotion:
         """The motion, unless it is too uncertain."""
-        sigma_mps = math.sqrt(float(np.linalg.eigvalsh(noise_m2)[-1])) / interval_s
+        sigma_mps = math.sqrt(larger_variance(noise_m2)) / interval_s
         if not sigma_mps <= _MAX_SIGMA_MPS:
             return NoMotion(f"the velocity is uncertain by {sigma_mps:.1f} m/s")
         errors, height_m = with_frame_accuracy(frame, AssumedErrors()), frame.height_agl_m or 1.0

@@ -87,16 +87,25 @@ class Track:
         covariance = np.diag([self.covariance[0, 0], sigma_mps**2])
         return replace(self, velocity_mps=mps, covariance=covariance)
 
-    def matched(self, fix: Fix, support: float) -> Track:
-        """The track after a match: its position is the match's own, its velocity is filtered."""
-        variance_m2, covariance = fix.relative_sigma_m**2, self.covariance
+    def matched(self, place: PositionEstimate, fix: Fix, support: float) -> Track:
+        """The track after a match: its position is the match's own, its velocity is filtered.
+
+        Args:
+            place: of the match.
+            fix: the match.
+            support: with its evidence.
+
+        Returns:
+            Track: at the same time.
+        """
+        variance_m2, covariance = place.sigma_m**2, self.covariance
         gain = covariance[0, 1] / (covariance[0, 0] + variance_m2)
         velocity_m2ps2 = covariance[1, 1] - gain * covariance[0, 1]
         both = gain * variance_m2
         return replace(
             self,
-            en_m=en_m(fix),
-            velocity_mps=self.velocity_mps + gain * (en_m(fix) - self.en_m),
+            en_m=place.en_m,
+            velocity_mps=self.velocity_mps + gain * (place.en_m - self.en_m),
             covariance=np.array([[variance_m2, both], [both, velocity_m2ps2]]),
             support=support,
             fix=fix,
@@ -108,11 +117,19 @@ class Track:
         fades = math.exp(-ways.interval_s / options.memory_s)
         support = min(self.support, CERTAIN + (self.support - CERTAIN) * fades)
         step = ways.told if self.trusts_velocity and ways.told is not None else ways.seen
-        track = self._drifted(ways.interval_s, options) if step is None else self._led(step, ways.interval_s)
-        return replace(track, support=support, moved_m=track.en_m - self.en_m)
+        moved = self._drifted(ways.interval_s, options) if step is None else self._led(step, ways.interval_s)
+        place_m, velocity_mps, covariance = moved
+        return replace(
+            self,
+            en_m=place_m,
+            velocity_mps=velocity_mps,
+            covariance=covariance,
+            support=support,
+            moved_m=place_m - self.en_m,
+        )
 
-    def _led(self, step: Step, interval_s: float) -> Track:
-        """The track after a step that a source measured, whose velocity has the error that matches found."""
+    def _led(self, step: Step, interval_s: float) -> tuple[Array, Array, Array]:
+        """Its state after a step that a source measured, whose velocity has the error that matches found."""
         track = self if step.begin_mps is not None else self.told(step.end_mps, step.sigma_mps)
         begin_mps = step.end_mps if step.begin_mps is None else step.begin_mps
         off_mps = track.velocity_mps - begin_mps
@@ -120,11 +137,10 @@ class Track:
         covariance = way @ track.covariance @ way.T
         covariance[0, 0] += step.noise_m2
         covariance[1, 1] = max(covariance[1, 1], step.sigma_mps**2)  # the error may change
-        place_m = track.en_m + step.moved_m + off_mps * interval_s
-        return replace(track, en_m=place_m, velocity_mps=step.end_mps + off_mps, covariance=covariance)
+        return track.en_m + step.moved_m + off_mps * interval_s, step.end_mps + off_mps, covariance
 
-    def _drifted(self, interval_s: float, options: NavigatorOptions) -> Track:
-        """The track after a way that nothing measured: an acceleration that changes every second, bounded speed.
+    def _drifted(self, interval_s: float, options: NavigatorOptions) -> tuple[Array, Array, Array]:
+        """Its state after a way that nothing measured: an acceleration that changes every second, bounded speed.
 
         The velocity is an Ornstein-Uhlenbeck process whose standard deviation is half of the highest speed.
         """
@@ -135,12 +151,8 @@ class Track:
         place = fades_s**2 * (2.0 * interval_s / fades_s - 3.0 + 4.0 * kept - kept**2)
         both = fades_s * (1.0 - kept) ** 2
         noise = sigma_mps**2 * np.array([[place, both], [both, 1.0 - kept**2]])
-        return replace(
-            self,
-            en_m=self.en_m + way[0, 1] * self.velocity_mps,
-            velocity_mps=kept * self.velocity_mps,
-            covariance=way @ self.covariance @ way.T + noise,
-        )
+        covariance = way @ self.covariance @ way.T + noise
+        return self.en_m + way[0, 1] * self.velocity_mps, kept * self.velocity_mps, covariance
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,21 +266,25 @@ class Tracks:
         account.
         """
         fix, gate = match.fix, self.options.gate
-        agreeing = [each for each in self.known if each.estimate.chi_square(fix) <= gate]
-        others = [each.missed() for each in self.known if each.estimate.chi_square(fix) > gate]
+        off = [each.estimate.chi_square(fix) for each in self.known]
+        agreeing = [each for each, chi_square in zip(self.known, off, strict=True) if chi_square <= gate]
+        others = [each.missed() for each, chi_square in zip(self.known, off, strict=True) if chi_square > gate]
         ratios = [max(each.estimate.log_likelihood_ratio(fix, match.searched_m2), -CERTAIN) for each in agreeing]
-        grown = [_grown(each, match, ratio, max(ratios)) for each, ratio in zip(agreeing, ratios, strict=True)]
+        place = PositionEstimate(en_m(fix), fix.relative_sigma_m, on_map=True)
+        gains = [_gain(each, match, ratio, max(ratios)) for each, ratio in zip(agreeing, ratios, strict=True)]
+        grown = [
+            each.matched(place, fix, each.log_odds + gain) for each, gain in zip(agreeing, gains, strict=True)
+        ]
         own = [stated_nats(fix) + ratio + MISS for ratio in ratios]  # of the match, if the track is right
         right = [each.log_odds - np.logaddexp(0.0, -nats) for each, nats in zip(grown, own, strict=True)]
         wrong = [each.log_odds - np.logaddexp(0.0, nats) for each, nats in zip(grown, own, strict=True)]
         wrong += [0.0, *(each.log_odds for each in others)]
         count = self.count
         if all(each.log_odds < match.support for each in grown):  # the vehicle is rather elsewhere, namely here
-            place = PositionEstimate(en_m(fix), fix.relative_sigma_m, on_map=True)
             grown += self._born(place, match.support, match.velocity, fix)
             right.append(match.support)
             count += 1
-        odds = float(np.logaddexp.reduce(right) - np.logaddexp.reduce(wrong))
+        odds = float(np.logaddexp.reduce(right)) - float(np.logaddexp.reduce(wrong))
         number = max(grown, key=lambda each: each.log_odds).number
         return Weighed(self._kept([*others, *grown], count), number, odds)
 
@@ -277,11 +293,9 @@ class Tracks:
     ) -> list[Track]:
         """The two tracks of a new account, whose velocity is unknown but for the telemetry's."""
         covariance = np.diag([place.sigma_m**2, (0.5 * self.options.max_speed_mps) ** 2])
-        free = Track(place.en_m, np.zeros(2), covariance, support, velocity is None, self.count, fix)
-        if velocity is None:
-            return [free]
-        led = replace(free, trusts_velocity=True).told(*velocity)
-        return [led, replace(free, support=support - CERTAIN)]
+        led = Track(place.en_m, np.zeros(2), covariance, support, trusts_velocity=True, number=self.count, fix=fix)
+        free = replace(led, support=support - CERTAIN, trusts_velocity=False)
+        return [led if velocity is None else led.told(*velocity), free]
 
     def _kept(self, tracks: Iterable[Track], count: int | None = None) -> Tracks:
         """The most probable tracks of these, of each account one with the velocity and one without.
@@ -296,8 +310,8 @@ class Tracks:
         return replace(self, known=tuple(known[:MAX_TRACKS]), count=self.count if count is None else count)
 
 
-def _grown(track: Track, match: Match, ratio: float, best: float) -> Track:
-    """A track after a match that agrees with it.
+def _gain(track: Track, match: Match, ratio: float, best: float) -> float:
+    """What a match that agrees with a track adds to its log-odds.
 
     A wrong match of repeated structure recurs as long as the frame shows the same ground.
 
@@ -309,8 +323,7 @@ def _grown(track: Track, match: Match, ratio: float, best: float) -> Track:
     """
     share = match.new_share(track)
     own = (_SAME_GROUND + (1.0 - _SAME_GROUND) * share) * min(stated_nats(match.fix), CERTAIN)
-    gain = own + share * min(best, CERTAIN) + ratio - best
-    return track.matched(match.fix, track.log_odds + gain)
+    return own + share * min(best, CERTAIN) + ratio - best
 
 
 def _paired(pair: list[Track]) -> list[Track]:
@@ -322,5 +335,5 @@ def _paired(pair: list[Track]) -> list[Track]:
     least = first.log_odds - CERTAIN
     if other.log_odds < least:
         state = other if other.fix is first.fix else first
-        other = replace(state, trusts_velocity=other.trusts_velocity, support=least, misses=0)
+        other = replace(state, trusts_velocity=other.trusts_velocity, support=least + MISS * state.misses)
     return [first, other]

@@ -77,7 +77,7 @@ def test_without_a_measurement_it_drifts_as_a_process_of_bounded_velocity(interv
 def test_a_match_gives_the_position_and_filters_the_velocity():
     """Against the errors of position, velocity and match, written out."""
     track, sigma_m = a_track(velocity=(3.0, 0.0)), 1.5
-    after = track.matched(fix_at(2.0, sigma_m=sigma_m), 30.0)
+    after = track.matched(PositionEstimate(np.array([2.0, 0.0]), sigma_m), fix_at(2.0), 30.0)
     gain = 1.0 / (4.0 + sigma_m**2)
     assert (after.en_m[0], after.velocity_mps[0]) == pytest.approx((2.0, 3.0 + gain * 2.0))
     errors = np.array([[0.0, 0.0, 1.0], [-gain, 1.0, gain]])  # of the two, by position, velocity and match
@@ -101,7 +101,7 @@ def test_a_covariance_stays_one_whatever_happens(legs):
         ways = {"told": Ways(interval_s, told=step), "seen": Ways(interval_s, seen=step)}
         track = track.carried(ways.get(source, Ways(interval_s)), OPTIONS)
         assert np.linalg.eigvalsh(track.covariance)[0] > 0.0
-        track = track.matched(fix_at(0.0, sigma_m=sigma_m), 20.0)
+        track = track.matched(PositionEstimate(np.zeros(2), sigma_m), fix_at(0.0), 20.0)
         assert np.linalg.eigvalsh(track.covariance)[0] >= 0.0
 
 
@@ -142,8 +142,8 @@ def test_a_match_where_a_track_predicts_it_is_right_by_both():
 def test_a_match_elsewhere_is_weighed_against_the_track():
     weighed = tracks_of(a_track()).weighed(Match(fix_at(500.0), AREA_M2))
     assert weighed.log_odds == pytest.approx(CERTAIN - np.logaddexp(0.0, 20.0 - MISS))
-    assert [each.number for each in weighed.tracks.known] == [0, 1]
-    assert [each.log_odds for each in weighed.tracks.known] == pytest.approx([20.0 - MISS, CERTAIN])
+    assert [each.number for each in weighed.tracks.known] == [0, 1, 1]
+    assert [each.log_odds for each in weighed.tracks.known] == pytest.approx([20.0 - MISS, CERTAIN, 0.0])
 
 
 @pytest.mark.parametrize(("moved_m", "share"), [(0.0, 0.0), (30.0, 0.25), (300.0, 1.0)])
