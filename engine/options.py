@@ -281,7 +281,7 @@ class NavigatorOptions:
     min_confidence: float = 0.999
     lost_sigma_m: float = 100.0
     search_every: int = 3
-    memory_s: float = 60.0
+    memory_s: float = 30.0
     late_s: float = 2.0
     attitude_lag_s: float = 0.1
     attitude_jitter_s: float = 0.03

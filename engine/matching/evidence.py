@@ -107,8 +107,9 @@ def probability(nats: float) -> float:
 
 
 def nats_of(probability: float) -> float:
-    """The evidence that gives a probability; capped for a probability of 1."""
-    return min(math.log(probability / max(1.0 - probability, math.exp(-_MAX_NATS))), _MAX_NATS)
+    """The evidence that gives a probability; capped for one of 0 or 1."""
+    least = math.exp(-_MAX_NATS)
+    return min(math.log(max(probability, least) / max(1.0 - probability, least)), _MAX_NATS)
 
 
 def is_beyond_doubt(nats: float, risk: float) -> bool:

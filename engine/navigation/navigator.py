@@ -11,7 +11,7 @@ import numpy as np
 
 from engine.budget import Budget, Deadline
 from engine.matching.covariance import map_sigma_of
-from engine.matching.evidence import SEARCHED
+from engine.matching.evidence import SEARCHED, probability
 from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
 from engine.navigation.motion import (
     Array,
@@ -24,7 +24,7 @@ from engine.navigation.motion import (
     position_of,
     velocity_of,
 )
-from engine.navigation.odds import MISS, RELIABLE, probability
+from engine.navigation.odds import MISS, RELIABLE
 from engine.navigation.odometry import VisualOdometry, odometry_of
 from engine.navigation.repeats import Repeats
 from engine.navigation.state import NavigatorState
@@ -163,7 +163,7 @@ class Navigator:
             frame: the newest, or one late by at most ``late_s``. A late frame is matched where the vehicle was
                 then, and does not turn back the navigator's state.
             prior: this frame's position from a source other than the map. The search centres on it if it is
-                tighter than dead reckoning; it always counts as evidence for or against a match.
+                tighter than dead reckoning; else it is evidence for or against a place that no track predicts.
             budget: of this frame; replaces the navigator's.
 
         Raises:
@@ -239,6 +239,7 @@ class Navigator:
         self._clock.append(frame)
         if moment is None:
             return
+        self._repeats.take()
         self._moments.append(moment)
         while len(self._moments) > 2 and self._moments[1].time_s < moment.time_s - self._options.late_s:
             self._moments.popleft()

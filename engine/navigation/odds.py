@@ -19,11 +19,6 @@ def log_odds(probability: float) -> float:
     return math.log(p / (1.0 - p))
 
 
-def probability(odds: float) -> float:
-    """The probability of log-odds."""
-    return 1.0 / (1.0 + math.exp(-odds))
-
-
 def stated_nats(fix: Fix) -> float:
     """Log-odds of a match by itself, if every second frame shows a place in its window."""
     return nats_of(UNSTATED_PROBABILITY if fix.confidence is None else fix.confidence)

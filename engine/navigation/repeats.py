@@ -3,39 +3,49 @@
 from __future__ import annotations
 
 import zlib
+from dataclasses import dataclass
 
 import numpy as np
 
-from engine.navigation.motion import Ways
+from engine.navigation.motion import Array, Ways
 from engine.values import Frame, NoFix, Reason
 
 _MIN_M = 0.5  # a noise-free camera at rest may repeat an image
 _SAMPLES = 1 << 16  # pixels of a picture that enter its digest
 
 
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """The last new picture: its digest, and the time and way since then; None if the way was not measured."""
+
+    digest: tuple[object, ...] | None = None
+    since_s: float = 0.0
+    moved_m: Array | None = None
+
+
 class Repeats:
-    """Remembers the last new picture by its digest, since buffers are reused, and where it was taken."""
+    """Remembers the last new picture by its digest, since buffers are reused, and the way since then."""
 
     def __init__(self) -> None:
-        self._digest: tuple[object, ...] | None = None
-        self._since_s, self._moved_m = 0.0, np.zeros(2)
-        self._is_measured = True  # the movement since then
+        self._last = self._next = _Picture()
 
     def refusal(self, frame: Frame, ways: Ways) -> NoFix | None:
         """Refuse a picture that repeats the last one although the vehicle has moved since; else None."""
-        digest, step = _digest(frame), ways.told or ways.seen
-        if digest != self._digest:
-            self._digest = digest
-            self._since_s, self._moved_m, self._is_measured = 0.0, np.zeros(2), True
+        last, digest, step = self._last, _digest(frame), ways.told or ways.seen
+        if digest != last.digest:
+            self._next = _Picture(digest, 0.0, np.zeros(2))
             return None
-        self._since_s += ways.interval_s
-        self._is_measured &= step is not None
-        self._moved_m = self._moved_m + (0.0 if step is None else step.moved_m)
-        moved_m = float(np.hypot(*self._moved_m))
-        if not self._is_measured or moved_m < _MIN_M:
+        moved_m = None if step is None or last.moved_m is None else last.moved_m + step.moved_m
+        self._next = _Picture(digest, last.since_s + ways.interval_s, moved_m)
+        if moved_m is None or np.hypot(*moved_m) < _MIN_M:
             return None
-        detail = f"the picture repeats the one {self._since_s:.1f} s and {moved_m:.1f} m ago"
+        ago = f"{self._next.since_s:.1f} s and {np.hypot(*moved_m):.1f} m ago"
+        detail = f"the picture repeats the one {ago}"
         return NoFix(reason=Reason.FAILED, detail=detail, timestamp_ns=frame.timestamp_ns)
+
+    def take(self) -> None:
+        """Remember the picture last asked about: its frame was matched."""
+        self._last = self._next
 
 
 def _digest(frame: Frame) -> tuple[object, ...]:

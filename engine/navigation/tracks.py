@@ -74,6 +74,16 @@ class Track:
         """The track after a frame that did not match it."""
         return replace(self, misses=self.misses + 1)
 
+    def at(self, log_odds: float) -> Track:
+        """The track with these odds."""
+        return replace(self, support=log_odds + MISS * self.misses)
+
+    def faded(self, kept: float) -> Track:
+        """The track with this share of the evidence beyond that of one match."""
+        return (
+            self if self.support <= CERTAIN else replace(self, support=CERTAIN + kept * (self.support - CERTAIN))
+        )
+
     def told(self, mps: Array, sigma_mps: float) -> Track:
         """The track with the velocity of another source in place of its own.
 
@@ -114,8 +124,7 @@ class Track:
 
     def carried(self, ways: Ways, options: NavigatorOptions) -> Track:
         """The track at the next frame."""
-        fades = math.exp(-ways.interval_s / options.memory_s)
-        support = min(self.support, CERTAIN + (self.support - CERTAIN) * fades)
+        kept = math.exp(-ways.interval_s / options.memory_s)
         step = ways.told if self.trusts_velocity and ways.told is not None else ways.seen
         moved = self._drifted(ways.interval_s, options) if step is None else self._led(step, ways.interval_s)
         place_m, velocity_mps, covariance = moved
@@ -124,7 +133,7 @@ class Track:
             en_m=place_m,
             velocity_mps=velocity_mps,
             covariance=covariance,
-            support=support,
+            support=self.faded(kept).support,
             moved_m=place_m - self.en_m,
         )
 
@@ -255,38 +264,50 @@ class Tracks:
         return replace(self, known=tuple(each.carried(ways, self.options) for each in self.known))
 
     def missed(self) -> Tracks:
-        """After a frame without a match."""
-        return self._kept(each.missed() for each in self.known)
+        """After a frame without a match; it leaves half of the past evidence, and half of the odds."""
+        return self._kept(each.faded(0.5).missed() for each in self.known)
 
     def weighed(self, match: Match) -> Weighed:
         """After a match, with the probability that it is right.
 
-        A match that agrees with a track confirms it: by its own evidence, as far as its ground is new, and by how
-        much better it lies there than anywhere in the searched area. One that is more probable by itself begins an
-        account.
+        The match belongs to the account that predicts it best. If that is right, the match is right by its own
+        evidence and by how much better it lies there than anywhere in the searched area; else it lies there by
+        chance. The track goes on from it and, unless it is right with the probability asked for, also without it.
+        A match that is more probable by itself than by any account begins one.
         """
-        fix, gate = match.fix, self.options.gate
-        off = [each.estimate.chi_square(fix) for each in self.known]
-        agreeing = [each for each, chi_square in zip(self.known, off, strict=True) if chi_square <= gate]
-        others = [each.missed() for each, chi_square in zip(self.known, off, strict=True) if chi_square > gate]
-        ratios = [max(each.estimate.log_likelihood_ratio(fix, match.searched_m2), -CERTAIN) for each in agreeing]
+        fix = match.fix
         place = PositionEstimate(en_m(fix), fix.relative_sigma_m, on_map=True)
-        gains = [_gain(each, match, ratio, max(ratios)) for each, ratio in zip(agreeing, ratios, strict=True)]
-        grown = [
-            each.matched(place, fix, each.log_odds + gain) for each, gain in zip(agreeing, gains, strict=True)
-        ]
-        own = [stated_nats(fix) + ratio + MISS for ratio in ratios]  # of the match, if the track is right
-        right = [each.log_odds - np.logaddexp(0.0, -nats) for each, nats in zip(grown, own, strict=True)]
-        wrong = [each.log_odds - np.logaddexp(0.0, nats) for each, nats in zip(grown, own, strict=True)]
-        wrong += [0.0, *(each.log_odds for each in others)]
+        owners, others = self._owners(match)
+        best = max((ratio for ratio, _ in owners), default=0.0)
+        with_it, right, wrong = [], [], [0.0, *(each.log_odds for each in others)]
+        for ratio, each in owners:
+            log_odds = each.log_odds + _gain(each, match, ratio, best)
+            nats = stated_nats(fix) + ratio + MISS  # of the match, if the track is right
+            with_it.append(each.matched(place, fix, log_odds))
+            right.append(log_odds - float(np.logaddexp(0.0, -nats)))
+            wrong.append(log_odds - float(np.logaddexp(0.0, nats)))
+            if nats < self.options.min_log_odds:
+                others.append(each.missed().at(wrong[-1]))
         count = self.count
-        if all(each.log_odds < match.support for each in grown):  # the vehicle is rather elsewhere, namely here
-            grown += self._born(place, match.support, match.velocity, fix)
+        if all(each.log_odds < match.support for each in with_it):  # the vehicle is rather elsewhere, namely here
+            with_it += self._born(place, match.support, match.velocity, fix)
             right.append(match.support)
             count += 1
         odds = float(np.logaddexp.reduce(right)) - float(np.logaddexp.reduce(wrong))
-        number = max(grown, key=lambda each: each.log_odds).number
-        return Weighed(self._kept([*others, *grown], count), number, odds)
+        number = max(with_it, key=lambda each: each.log_odds).number
+        return Weighed(self._kept([*others, *with_it], count), number, odds)
+
+    def _owners(self, match: Match) -> tuple[list[tuple[float, Track]], list[Track]]:
+        """The tracks of the account that predicts a match best, with how well they do, and all others."""
+        near, gate = [], self.options.gate
+        for each in self.known:
+            if each.estimate.chi_square(match.fix) <= gate:
+                ratio = each.estimate.log_likelihood_ratio(match.fix, match.searched_m2)
+                near.append((max(ratio, -CERTAIN), each))
+        number = max(near, key=lambda pair: pair[0])[1].number if near else None
+        owners = [(ratio, each) for ratio, each in near if each.number == number]
+        taken = {id(each) for _, each in owners}
+        return owners, [each.missed() for each in self.known if id(each) not in taken]
 
     def _born(
         self, place: PositionEstimate, support: float, velocity: tuple[Array, float] | None, fix: Fix | None
@@ -298,15 +319,12 @@ class Tracks:
         return [led if velocity is None else led.told(*velocity), free]
 
     def _kept(self, tracks: Iterable[Track], count: int | None = None) -> Tracks:
-        """The most probable tracks of these, of each account one with the velocity and one without.
-
-        The velocity may become wrong, or right again, at any frame: neither becomes improbable for good.
-        """
-        pairs: dict[int, list[Track]] = {}
+        """The most probable tracks of these; of those that share their newest match, one of each motion."""
+        groups: dict[int, list[Track]] = {}
         for each in tracks:
-            pairs.setdefault(each.number, []).append(each)
-        accounts = sorted(map(_paired, pairs.values()), key=lambda pair: -pair[0].log_odds)
-        known = [each for k, pair in enumerate(accounts) if k == 0 or not pair[0].is_lost for each in pair]
+            groups.setdefault(id(each.fix), []).append(each)
+        pairs = sorted(map(_paired, groups.values()), key=lambda pair: -pair[0].log_odds)
+        known = [each for k, pair in enumerate(pairs) if k == 0 or not pair[0].is_lost for each in pair]
         return replace(self, known=tuple(known[:MAX_TRACKS]), count=self.count if count is None else count)
 
 
@@ -326,14 +344,15 @@ def _gain(track: Track, match: Match, ratio: float, best: float) -> float:
     return own + share * min(best, CERTAIN) + ratio - best
 
 
-def _paired(pair: list[Track]) -> list[Track]:
-    """Both tracks of an account, none of them much less probable than the other."""
-    first = max(pair, key=lambda each: each.log_odds)
-    other = next((each for each in pair if each.trusts_velocity is not first.trusts_velocity), None)
-    if other is None:
-        return [first]
+def _paired(tracks: list[Track]) -> list[Track]:
+    """Of tracks that share their newest match the best with the velocity and the best without; the better first.
+
+    The velocity may become wrong, or right again, at any frame: neither becomes improbable for good.
+    """
+    first = max(tracks, key=lambda each: each.log_odds)
+    others = (each for each in tracks if each.trusts_velocity is not first.trusts_velocity)
+    other = max(others, key=lambda each: each.log_odds, default=None)
     least = first.log_odds - CERTAIN
-    if other.log_odds < least:
-        state = other if other.fix is first.fix else first
-        other = replace(state, trusts_velocity=other.trusts_velocity, support=least + MISS * state.misses)
+    if other is None or other.log_odds < least:
+        other = replace(other or first, trusts_velocity=not first.trusts_velocity).at(least)
     return [first, other]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from engine import Fix, Frame, Navigator, NavigatorOptions, Prior, Window
 from engine.navigation.motion import PositionEstimate, Step, Ways
-from engine.navigation.odds import CERTAIN, MAX_PROBABILITY, MISS, log_odds, probability, stated_nats
+from engine.navigation.odds import CERTAIN, MAX_PROBABILITY, MISS, log_odds, stated_nats
 from engine.navigation.tracks import MAX_TRACKS, Match, Track, Tracks
 from tests.support.fixes import a_fix
 from tests.support.matchers import ScriptedMatcher
@@ -142,8 +142,9 @@ def test_a_match_where_a_track_predicts_it_is_right_by_both():
 def test_a_match_elsewhere_is_weighed_against_the_track():
     weighed = tracks_of(a_track()).weighed(Match(fix_at(500.0), AREA_M2))
     assert weighed.log_odds == pytest.approx(CERTAIN - np.logaddexp(0.0, 20.0 - MISS))
-    assert [each.number for each in weighed.tracks.known] == [0, 1, 1]
-    assert [each.log_odds for each in weighed.tracks.known] == pytest.approx([20.0 - MISS, CERTAIN, 0.0])
+    assert [each.number for each in weighed.tracks.known] == [0, 0, 1, 1]
+    left = 20.0 - MISS
+    assert [each.log_odds for each in weighed.tracks.known] == pytest.approx([left, left - CERTAIN, CERTAIN, 0.0])
 
 
 @pytest.mark.parametrize(("moved_m", "share"), [(0.0, 0.0), (30.0, 0.25), (300.0, 1.0)])
@@ -166,11 +167,38 @@ def test_of_two_motions_the_better_one_gains_whatever_the_ground():
 
 
 def test_neither_motion_becomes_improbable_for_good():
-    told, free = (
-        a_track(trusts_velocity=told, support=support) for told, support in ((True, 500.0), (False, 20.0))
-    )
-    known = tracks_of(told, free).missed().known
+    told = a_track(support=500.0)
+    free = replace(told, trusts_velocity=False, support=20.0)
+    known = tracks_of(told, free).weighed(Match(fix_at(500.0), AREA_M2)).tracks.known[:2]
     assert [each.log_odds for each in known] == pytest.approx([500.0 - MISS, 500.0 - MISS - CERTAIN])
+
+
+def test_a_frame_without_a_match_leaves_half_of_the_past_evidence():
+    (known, *_) = tracks_of(a_track(support=CERTAIN + 100.0)).missed().known
+    assert known.log_odds == pytest.approx(CERTAIN + 50.0 - MISS)
+
+
+def test_a_match_of_little_evidence_far_from_the_prediction_leaves_a_track_without_it():
+    """Right with probability 0.99: the next match decides between the two."""
+    tracks = tracks_of(a_track(covariance=((3.0, 0.0), (0.0, 1.0))))
+    weighed = tracks.weighed(Match(fix_at(7.0, confidence=0.99), AREA_M2))
+    assert weighed.log_odds < math.log(999.0)
+    assert sorted({each.en_m[0] for each in weighed.tracks.known}) == [0.0, 7.0]
+    assert weighed.tracks.weighed(Match(fix_at(-1.0), AREA_M2)).tracks.best.en_m[0] == -1.0
+
+
+def test_a_match_belongs_to_the_account_that_predicts_it_best():
+    vague = a_track(covariance=((900.0, 0.0), (0.0, 1.0)), support=40.0)
+    rival = replace(a_track(support=20.0, number=1), en_m=np.array([50.0, 0.0]))
+    weighed = tracks_of(vague, rival).weighed(Match(fix_at(50.0), AREA_M2))
+    assert weighed.number == 1
+    assert [each.misses for each in weighed.tracks.known if each.number == 0] == [1, 1]
+
+
+def test_tracks_that_share_their_newest_match_are_one_account():
+    fix = fix_at(5.0)
+    twice = [replace(a_track(support=odds), fix=fix) for odds in (30.0, 20.0)]
+    assert [each.trusts_velocity for each in tracks_of(*twice).missed().known] == [True, False]
 
 
 def test_another_source_speaks_for_or_against_a_new_place_by_its_reliability():
@@ -188,7 +216,6 @@ def test_another_source_speaks_for_or_against_a_new_place_by_its_reliability():
 def test_no_single_match_gives_a_place_more_than_was_tested():
     assert Match(fix_at(0.0, confidence=1.0 - 1e-12), AREA_M2).support == log_odds(MAX_PROBABILITY)
     assert stated_nats(fix_at(0.0, confidence=None)) == pytest.approx(math.log(999.0))
-    assert probability(log_odds(0.3)) == pytest.approx(0.3)
 
 
 def test_after_refusals_a_new_place_needs_more_evidence():
@@ -208,14 +235,14 @@ def test_a_place_is_lost_when_misses_have_eaten_its_odds_and_the_search_has_grow
 
 @given(places=st.lists(st.tuples(st.floats(-500, 500), st.floats(-500, 500)), min_size=1, max_size=60))
 @settings(max_examples=40)
-def test_the_set_is_bounded_and_sorted_and_holds_at_most_two_motions_of_an_account(places):
+def test_the_set_is_bounded_and_sorted_and_holds_two_motions_of_each_account(places):
     tracks = Tracks(OPTIONS)
     for place in places:
         match = Match(fix_at(*place), AREA_M2, velocity=(np.zeros(2), 0.5))
         tracks = tracks.carried(Ways(0.2)).weighed(match).tracks
-        kinds = [(each.number, each.trusts_velocity) for each in tracks.known]
+        kinds = [(id(each.fix), each.trusts_velocity) for each in tracks.known]
         assert len(kinds) == len(set(kinds)) <= MAX_TRACKS
-        firsts = [tracks.of(number).log_odds for number in dict.fromkeys(number for number, _ in kinds)]
+        firsts = [each.log_odds for each in tracks.known[::2]]
         assert firsts == sorted(firsts, reverse=True)
 
 
@@ -326,3 +353,38 @@ def test_a_wrong_velocity_costs_few_fixes_and_is_not_believed_for_long(fault):
         refused, navigator = flown(FAULTS[fault], seed=seed)
         assert len(refused) <= 8
         assert navigator.reset_count == 0
+
+
+def test_a_velocity_that_comes_later_and_is_wrong_is_left_too():
+    """The first frame came before the velocity."""
+    script = ScriptedMatcher(*(fix_at(1.4 * k, confidence=1.0 - 1e-6, sigma_m=0.3) for k in range(100)))
+    navigator, fixed = Navigator(script), 0
+    for k in range(100):
+        told = {} if k == 0 else {"east_velocity_mps": -7.0, "north_velocity_mps": 0.0}
+        fixed += isinstance(navigator.update(Frame(new_image(), k * SECOND // 5, 100.0, 0.0, **told)), Fix)
+    assert fixed >= 92
+
+
+def test_of_a_wrong_match_in_five_none_is_a_fix_and_few_right_ones_are_lost():
+    """8 m off, a second apart, beside a right velocity."""
+    rng = np.random.default_rng(0)
+    places = [(7.0 * k + 8.0 * (k > 50 and k % 5 == 0), 0.0) for k in range(120)]
+    fixed, _ = fly([(x + rng.normal(0, 0.4), y) for x, y in places], 0.9999, velocity=(7.0, 0.0))
+    wrong = set(range(55, 120, 5))
+    assert not wrong & set(fixed)
+    assert len(fixed) >= 120 - 2 * len(wrong)
+
+
+@pytest.mark.parametrize("velocity", [(7.0, 0.0), None])
+def test_after_a_loss_a_place_far_away_is_found_within_a_second(velocity):
+    answers = [
+        *[fix_at(1.4 * k) for k in range(300)],
+        *[None] * 100,
+        *[fix_at(1000.0 + 1.4 * k) for k in range(10)],
+    ]
+    navigator, fixed = Navigator(ScriptedMatcher(*answers)), []
+    told = {} if velocity is None else {"east_velocity_mps": 7.0, "north_velocity_mps": 0.0}
+    for k in range(len(answers)):
+        if isinstance(navigator.update(Frame(new_image(), k * SECOND // 5, 100.0, 0.0, **told)), Fix):
+            fixed.append(k)
+    assert next(k for k in fixed if k >= 400) <= 404

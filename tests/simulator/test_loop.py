@@ -171,7 +171,7 @@ def test_a_shifted_map_is_never_followed():
     flown = fly(58.0, Fault(kind="shifted", start_s=20.0, duration_s=math.inf))
     shift_ns = START_NS + 20_000_000_000
     assert not [stamp for stamp in flown.used if stamp >= shift_ns]
-    assert not any(row.healthy for row in rows_between(flown, 21.3, 33.0))  # then the matches outweigh the flight
+    assert not any(row.healthy for row in rows_between(flown, 21.3, 30.0))  # then the matches outweigh the flight
     last = flown.record[-1]
     assert last.time_s < 57.0
     assert last.mode is Mode.HANDED_OVER
