@@ -207,6 +207,11 @@ class PositionEstimate:
         covariance_m2[1, 1] += self.sigma_m**2
         return covariance_m2
 
+    def spread_m2(self, fix: Fix) -> float:
+        """Area of the Gaussian of the difference to a fix: where both agree, its density is one over it."""
+        (a, b), (c, d) = self.difference_covariance_m2(fix).tolist()
+        return 2.0 * math.pi * math.sqrt(a * d - b * c)
+
     def chi_square(self, fix: Fix) -> float:
         """Squared Mahalanobis distance to a fix by both covariances: two degrees of freedom."""
         return chi_square(en_m(fix) - self.en_m, self.difference_covariance_m2(fix))
@@ -216,10 +221,7 @@ class PositionEstimate:
 
         An estimate vaguer than the area says nothing by that, only by how far the fix is off.
         """
-        covariance_m2 = self.difference_covariance_m2(fix)
-        (a, b), (c, d) = covariance_m2.tolist()
-        own_m2 = 2.0 * math.pi * math.sqrt(a * d - b * c)
-        return math.log(max(area_m2 / own_m2, 1.0)) - 0.5 * chi_square(en_m(fix) - self.en_m, covariance_m2)
+        return math.log(max(area_m2 / self.spread_m2(fix), 1.0)) - 0.5 * self.chi_square(fix)
 
     def refusal(self, fix: Fix) -> NoFix:
         """The refusal of a fix that contradicts this estimate."""

@@ -257,8 +257,12 @@ class Navigator:
 
     def _leads_nowhere(self, track: Track) -> bool:
         """Whether the whole map is searched instead: if the flight is lost, in turns."""
-        vague = track.estimate.sigma_m > self._options.lost_sigma_m
+        vague = self._is_vague(track)
         return self._lost and (vague or track.is_lost) and self._is_turn(0 if vague else self._frames_lost)
+
+    def _is_vague(self, track: Track) -> bool:
+        """Whether a track is too uncertain to lead a search, or to contradict a match."""
+        return track.estimate.sigma_m > self._options.lost_sigma_m
 
     def _is_turn(self, count: int) -> bool:
         """Whether this frame, of those without a useful prediction, searches the whole map."""
@@ -283,14 +287,10 @@ class Navigator:
 
     def _match(self, fix: Fix, frame: Frame, searched: Prior | None, given: PositionEstimate | None) -> Match:
         """A match, with what it is to be judged by."""
-        relative_m2 = fix.relative_covariance_m2
-        area_m2 = 0.0
+        about = PositionEstimate(en_m(fix), 0.0 if searched is None else searched.sigma_m, on_map=True)
+        area_m2 = SEARCHED * about.spread_m2(fix)
         if searched is None or fix.confidence is None:  # without a confidence it has not weighed the prior
-            area_m2 = fix.window.area_px * self._matcher.site.gsd_m_per_px**2
-        if searched is not None:
-            relative_m2 = relative_m2 + searched.sigma_m**2 * np.eye(2)
-        least_m2 = 2.0 * math.pi * SEARCHED * math.sqrt(float(np.linalg.det(relative_m2)))
-        area_m2 = max(area_m2, least_m2)
+            area_m2 = max(area_m2, fix.window.area_px * self._matcher.site.gsd_m_per_px**2)
         return Match(fix, area_m2, frame.height_agl_m, self._velocity(frame), self._refusals, given)
 
     def _velocity(self, frame: Frame) -> tuple[Array, float] | None:
@@ -318,7 +318,7 @@ class Navigator:
     def _is_known(self, track: Track) -> bool:
         """Whether a track may contradict a match: a start, or one that gave a fix, if it is not too uncertain."""
         known = track.fix is None or track.log_odds >= self._options.min_log_odds
-        return known and track.estimate.sigma_m <= self._options.lost_sigma_m
+        return known and not self._is_vague(track)
 
     def _accept(self, fix: Fix, weighed: Weighed, moment: _Moment, *, late: bool) -> None:
         """Continue from this fix; a late one counts if it is newer than the last fix."""
@@ -351,6 +351,6 @@ class Navigator:
         if self._fixed or track is None:
             return
         self._frames_lost += self._lost
-        if not self._lost and (track.is_lost or track.estimate.sigma_m > self._options.lost_sigma_m):
+        if not self._lost and (track.is_lost or self._is_vague(track)):
             self._lost = True
             self._errors.forget()  # a wrong or outdated bias would keep frames refused

@@ -13,20 +13,14 @@ UNSTATED_PROBABILITY = 0.999
 """Of a match that states none, as the paper's: enough for a navigator by default if nothing contradicts it."""
 
 
-def log_odds(probability: float) -> float:
-    """log(p / (1 - p)), limited to :data:`MAX_PROBABILITY` on either side."""
-    p = min(max(probability, 1.0 - MAX_PROBABILITY), MAX_PROBABILITY)
-    return math.log(p / (1.0 - p))
-
-
 def stated_nats(fix: Fix) -> float:
     """Log-odds of a match by itself, if every second frame shows a place in its window."""
     return nats_of(UNSTATED_PROBABILITY if fix.confidence is None else fix.confidence)
 
 
-CERTAIN = log_odds(MAX_PROBABILITY)
+CERTAIN = nats_of(MAX_PROBABILITY)
 """Most that one match adds for a place; most that the two motions of an account may differ by."""
-RELIABLE = log_odds(RELIABILITY)
+RELIABLE = nats_of(RELIABILITY)
 """Of another source's position."""
 MISS = math.log(2.0)
 """What a frame without a match of a place speaks against it: every second frame shows nothing that matches."""

@@ -70,21 +70,19 @@ class Track:
         """Factor on sigma for a search: a miss that halves the odds of the place doubles the area to search."""
         return math.exp(0.5 * min(MISS * self.misses, CERTAIN))
 
-    def missed(self) -> Track:
-        """The track after a frame that did not match it."""
-        return replace(self, misses=self.misses + 1)
+    def missed(self, kept: float = 1.0) -> Track:
+        """The track after a frame that did not match it, with a share of its past evidence."""
+        return replace(self, support=self._faded(kept), misses=self.misses + 1)
 
     def at(self, log_odds: float) -> Track:
         """The track with these odds."""
         return replace(self, support=log_odds + MISS * self.misses)
 
-    def faded(self, kept: float) -> Track:
-        """The track with this share of the evidence beyond that of one match."""
-        return (
-            self if self.support <= CERTAIN else replace(self, support=CERTAIN + kept * (self.support - CERTAIN))
-        )
+    def _faded(self, kept: float) -> float:
+        """The support with this share of what goes beyond that of one match."""
+        return min(self.support, CERTAIN + kept * (self.support - CERTAIN))
 
-    def told(self, mps: Array, sigma_mps: float) -> Track:
+    def with_velocity(self, mps: Array, sigma_mps: float) -> Track:
         """The track with the velocity of another source in place of its own.
 
         Args:
@@ -133,13 +131,13 @@ class Track:
             en_m=place_m,
             velocity_mps=velocity_mps,
             covariance=covariance,
-            support=self.faded(kept).support,
+            support=self._faded(kept),
             moved_m=place_m - self.en_m,
         )
 
     def _led(self, step: Step, interval_s: float) -> tuple[Array, Array, Array]:
         """Its state after a step that a source measured, whose velocity has the error that matches found."""
-        track = self if step.begin_mps is not None else self.told(step.end_mps, step.sigma_mps)
+        track = self if step.begin_mps is not None else self.with_velocity(step.end_mps, step.sigma_mps)
         begin_mps = step.end_mps if step.begin_mps is None else step.begin_mps
         off_mps = track.velocity_mps - begin_mps
         way = np.array([[1.0, interval_s], [0.0, 1.0]])
@@ -248,16 +246,16 @@ class Tracks:
         return next((each for each in self.known if each.number == number), None)
 
     def begun(self, start: PositionEstimate, velocity: tuple[Array, float] | None) -> Tracks:
-        """With an account that begins at a position of another source.
+        """With the flight's first account, at a position of another source.
 
         Args:
             start: the position.
             velocity: (2,) m/s told with the first frame and its standard deviation; None if none came.
 
         Returns:
-            Tracks: with one account more.
+            Tracks: of this account alone.
         """
-        return self._kept([*self.known, *self._born(start, RELIABLE, velocity, None)], self.count + 1)
+        return self._kept(self._born(start, RELIABLE, velocity, None), self.count + 1)
 
     def carried(self, ways: Ways) -> Tracks:
         """At the next frame."""
@@ -265,7 +263,7 @@ class Tracks:
 
     def missed(self) -> Tracks:
         """After a frame without a match; it leaves half of the past evidence, and half of the odds."""
-        return self._kept(each.faded(0.5).missed() for each in self.known)
+        return self._kept(each.missed(0.5) for each in self.known)
 
     def weighed(self, match: Match) -> Weighed:
         """After a match, with the probability that it is right.
@@ -301,8 +299,9 @@ class Tracks:
         """The tracks of the account that predicts a match best, with how well they do, and all others."""
         near, gate = [], self.options.gate
         for each in self.known:
-            if each.estimate.chi_square(match.fix) <= gate:
-                ratio = each.estimate.log_likelihood_ratio(match.fix, match.searched_m2)
+            estimate = each.estimate
+            if estimate.chi_square(match.fix) <= gate:
+                ratio = estimate.log_likelihood_ratio(match.fix, match.searched_m2)
                 near.append((max(ratio, -CERTAIN), each))
         number = max(near, key=lambda pair: pair[0])[1].number if near else None
         owners = [(ratio, each) for ratio, each in near if each.number == number]
@@ -316,7 +315,7 @@ class Tracks:
         covariance = np.diag([place.sigma_m**2, (0.5 * self.options.max_speed_mps) ** 2])
         led = Track(place.en_m, np.zeros(2), covariance, support, trusts_velocity=True, number=self.count, fix=fix)
         free = replace(led, support=support - CERTAIN, trusts_velocity=False)
-        return [led if velocity is None else led.told(*velocity), free]
+        return [led if velocity is None else led.with_velocity(*velocity), free]
 
     def _kept(self, tracks: Iterable[Track], count: int | None = None) -> Tracks:
         """The most probable tracks of these; of those that share their newest match, one of each motion."""

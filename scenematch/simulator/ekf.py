@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from engine.geo import Array, chi_square, enu_from_body
+from engine.geo import Array, chi_square, enu_from_body, larger_variance
 from engine.values import Attitude, Fix
 from scenematch.simulator.quadrotor import GRAVITY, STEP_S, IdealImu, next_time_s
 from scenematch.simulator.rotations import cross_matrix, rotation
@@ -56,7 +56,7 @@ class FilterState:
     @property
     def sigma_m(self) -> float:
         """Horizontal standard deviation, the larger axis of the ellipse."""
-        return math.sqrt(float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))
+        return math.sqrt(larger_variance(self.covariance[:2, :2]))
 
 
 def initial_state(position_m: Array, sigma_m: float, attitude: Attitude, suite: SensorSuite) -> FilterState:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 
@@ -28,9 +27,8 @@ from engine import (
 )
 from engine.options import ACCEPT_ALL
 from tests.support.fixes import a_fix
-from tests.support.matchers import ScriptedMatcher, a_site
+from tests.support.matchers import ScriptedMatcher, a_site, at
 
-NUMBERS = itertools.count()
 START = Prior(east_m=10.0, north_m=20.0, sigma_m=5.0)
 STILL = (0.0, 0.0)
 SECOND = 1_000_000_000
@@ -44,17 +42,6 @@ def script(*answers, sigma_m=1.0, site=None, **stated):
     """A matcher that answers from a list: a place, None for a refusal, or its reason."""
     fixes = (fix_at(*a, sigma_m, **stated) if isinstance(a, tuple) else a for a in answers)
     return ScriptedMatcher(*fixes, site=site)
-
-
-def new_image():
-    """A picture like no other: one that repeats is refused."""
-    return np.full((8, 8), next(NUMBERS) % 256, np.uint8)
-
-
-def at(seconds, velocity=(None, None), height_agl_m=100.0):
-    stamp = None if seconds is None else round(seconds * SECOND)
-    east, north = velocity
-    return Frame(new_image(), stamp, height_agl_m, 0.0, east_velocity_mps=east, north_velocity_mps=north)
 
 
 def reasons(results):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 
@@ -11,23 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine import Fix, Frame, Navigator, NavigatorOptions, Prior, Window
+from engine import Fix, Navigator, NavigatorOptions, Prior, Window
+from engine.matching.evidence import nats_of
 from engine.navigation.motion import PositionEstimate, Step, Ways
-from engine.navigation.odds import CERTAIN, MAX_PROBABILITY, MISS, log_odds, stated_nats
+from engine.navigation.odds import CERTAIN, MAX_PROBABILITY, MISS, stated_nats
 from engine.navigation.tracks import MAX_TRACKS, Match, Track, Tracks
 from tests.support.fixes import a_fix
-from tests.support.matchers import ScriptedMatcher
+from tests.support.matchers import ScriptedMatcher, at
 
 OPTIONS = NavigatorOptions()
-SECOND = 1_000_000_000
-NUMBERS = itertools.count()
+UNKNOWN = (None, None)  # velocity
 AREA_M2 = 1e4
 LONG_AGO = NavigatorOptions(memory_s=1e12)  # nothing fades
-
-
-def new_image():
-    """A picture like no other: one that repeats is refused."""
-    return np.full((8, 8), next(NUMBERS) % 256, np.uint8)
 
 
 def fix_at(east_m, north_m=0.0, confidence=0.9999, sigma_m=1.0):
@@ -207,14 +201,14 @@ def test_another_source_speaks_for_or_against_a_new_place_by_its_reliability():
         Match(fix_at(0.0, confidence=0.9), AREA_M2, given=PositionEstimate(np.array([e, 0.0]), 3.0))
         for e in (0.0, 500.0)
     ]
-    assert at_odds[0].support > log_odds(0.9) + 3.0
-    assert at_odds[1].support == pytest.approx(log_odds(0.9) + math.log(0.01))
+    assert at_odds[0].support > nats_of(0.9) + 3.0
+    assert at_odds[1].support == pytest.approx(nats_of(0.9) + math.log(0.01))
     vague = PositionEstimate(np.zeros(2), 500.0)
-    assert Match(fix_at(0.0, confidence=0.9), 1.0, given=vague).support == pytest.approx(log_odds(0.9))
+    assert Match(fix_at(0.0, confidence=0.9), 1.0, given=vague).support == pytest.approx(nats_of(0.9))
 
 
 def test_no_single_match_gives_a_place_more_than_was_tested():
-    assert Match(fix_at(0.0, confidence=1.0 - 1e-12), AREA_M2).support == log_odds(MAX_PROBABILITY)
+    assert Match(fix_at(0.0, confidence=1.0 - 1e-12), AREA_M2).support == nats_of(MAX_PROBABILITY)
     assert stated_nats(fix_at(0.0, confidence=None)) == pytest.approx(math.log(999.0))
 
 
@@ -249,17 +243,11 @@ def test_the_set_is_bounded_and_sorted_and_holds_two_motions_of_each_account(pla
 # Flights
 
 
-def fly(places, confidence, seconds=1.0, velocity=None, priors=None):
+def fly(places, confidence, seconds=1.0, velocity=UNKNOWN, priors=None):
     """Which frames, so many seconds apart, are fixed, and the navigator."""
     navigator, fixed = Navigator(ScriptedMatcher(*(fix_at(*place, confidence) for place in places))), []
     for k in range(len(places)):
-        told = (
-            {}
-            if velocity is None
-            else dict(zip(("east_velocity_mps", "north_velocity_mps"), velocity, strict=True))
-        )
-        frame = Frame(new_image(), round(k * seconds * SECOND), 100.0, 0.0, **told)
-        if isinstance(navigator.update(frame, priors and priors[k]), Fix):
+        if isinstance(navigator.update(at(k * seconds, velocity), priors and priors[k]), Fix):
             fixed.append(k)
     return fixed, navigator
 
@@ -302,7 +290,7 @@ def test_telemetry_that_leads_nowhere_is_left_in_turns():
     script = ScriptedMatcher(*[None] * 18)
     navigator = Navigator(script)
     for k in range(18):
-        navigator.update(Frame(new_image(), k * SECOND, 100.0, 0.0), Prior(east_m=0.0, north_m=0.0, sigma_m=15.0))
+        navigator.update(at(k), Prior(east_m=0.0, north_m=0.0, sigma_m=15.0))
     assert [k for k, prior in enumerate(script.priors) if prior is None] == [9, 12, 15]
 
 
@@ -332,9 +320,7 @@ def flown(told=lambda v: v, seconds=30.0, rate_hz=5.0, seed=1):
     script = ScriptedMatcher(*(fix_at(*map(float, each), confidence=1.0 - 1e-6, sigma_m=0.3) for each in places))
     navigator, refused = Navigator(script, Prior(east_m=0.0, north_m=0.0, sigma_m=5.0)), []
     for k, (east, north) in enumerate(velocities):
-        told_mps = {"east_velocity_mps": float(east), "north_velocity_mps": float(north)}
-        frame = Frame(new_image(), round(k * SECOND / rate_hz), 100.0, 0.0, **told_mps)
-        if not isinstance(navigator.update(frame), Fix):
+        if not isinstance(navigator.update(at(k / rate_hz, (float(east), float(north)))), Fix):
             refused.append(k / rate_hz)
     return refused, navigator
 
@@ -360,8 +346,7 @@ def test_a_velocity_that_comes_later_and_is_wrong_is_left_too():
     script = ScriptedMatcher(*(fix_at(1.4 * k, confidence=1.0 - 1e-6, sigma_m=0.3) for k in range(100)))
     navigator, fixed = Navigator(script), 0
     for k in range(100):
-        told = {} if k == 0 else {"east_velocity_mps": -7.0, "north_velocity_mps": 0.0}
-        fixed += isinstance(navigator.update(Frame(new_image(), k * SECOND // 5, 100.0, 0.0, **told)), Fix)
+        fixed += isinstance(navigator.update(at(0.2 * k, (-7.0, 0.0) if k else UNKNOWN)), Fix)
     assert fixed >= 92
 
 
@@ -375,7 +360,7 @@ def test_of_a_wrong_match_in_five_none_is_a_fix_and_few_right_ones_are_lost():
     assert len(fixed) >= 120 - 2 * len(wrong)
 
 
-@pytest.mark.parametrize("velocity", [(7.0, 0.0), None])
+@pytest.mark.parametrize("velocity", [(7.0, 0.0), UNKNOWN])
 def test_after_a_loss_a_place_far_away_is_found_within_a_second(velocity):
     answers = [
         *[fix_at(1.4 * k) for k in range(300)],
@@ -383,8 +368,7 @@ def test_after_a_loss_a_place_far_away_is_found_within_a_second(velocity):
         *[fix_at(1000.0 + 1.4 * k) for k in range(10)],
     ]
     navigator, fixed = Navigator(ScriptedMatcher(*answers)), []
-    told = {} if velocity is None else {"east_velocity_mps": 7.0, "north_velocity_mps": 0.0}
     for k in range(len(answers)):
-        if isinstance(navigator.update(Frame(new_image(), k * SECOND // 5, 100.0, 0.0, **told)), Fix):
+        if isinstance(navigator.update(at(0.2 * k, velocity)), Fix):
             fixed.append(k)
     assert next(k for k in fixed if k >= 400) <= 404

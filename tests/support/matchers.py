@@ -1,12 +1,29 @@
-"""A matcher for navigators that answers from a list, over a map that is none."""
+"""A matcher for navigators that answers from a list, over a map that is none, and frames for it."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-from engine import Fix, NoFix, Reason
+import numpy as np
+
+from engine import Fix, Frame, NoFix, Reason
+
+_NUMBERS = itertools.count()
+
+
+def at(
+    seconds: float | None,
+    velocity: tuple[float | None, float | None] = (None, None),
+    height_agl_m: float | None = 100.0,
+) -> Frame:
+    """A frame with a picture like no other: one that repeats is refused."""
+    image = np.full((8, 8), next(_NUMBERS) % 256, np.uint8)
+    stamp = None if seconds is None else round(seconds * 1_000_000_000)
+    east, north = velocity
+    return Frame(image, stamp, height_agl_m, 0.0, east_velocity_mps=east, north_velocity_mps=north)
 
 
 def a_site(**known: Any) -> SimpleNamespace:
