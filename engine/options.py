@@ -129,8 +129,8 @@ class SiftOptions:
         scale: the frame is reduced to this before detection.
         max_keypoints: features taken from a frame of usual size; the map's are as dense.
         keypoints_per_px: features taken from a larger frame, per map pixel that it covers on its level.
-        backend: computes the features of frame and map: "compiled" loops (CPU) or "kornia" (any device); "auto"
-            takes "compiled" on the CPU, else "kornia".
+        backend: computes the features of frame and map: "compiled" loops on the CPU, whatever the device, or
+            "kornia" on the device; "auto" is "compiled".
         upsample: samples per pixel in the first octave of a frame that is drawn in the map's pixels. 2 locates
             small keypoints more exactly and takes three times as long. The map always has 2.
         map_features: "prepared" once for the map, or found "per_frame" in the window, as the paper does.

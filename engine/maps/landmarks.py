@@ -74,12 +74,12 @@ class LandmarkMap:
 
     Args:
         site: the map.
-        device: of detection and of the returned features; the cache is in host memory.
+        device: of detection and of the returned features, the frame's too; the cache is in host memory.
         backend: of :func:`engine.features.sift`.
     """
 
     def __init__(self, site: OrthoMap, device: Device, backend: str = "auto") -> None:
-        self._site, self._device = site, device
+        self._site, self.device = site, device
         self._backend = chosen_backend(backend, device)
         self._tiles: RecentlyUsed[_Key, NamedArrays] = RecentlyUsed()
         self._max_landmarks = MAX_LANDMARKS
@@ -161,11 +161,11 @@ class LandmarkMap:
         if not mask.any():
             return {field: np.zeros((0, *shape), dtype) for field, (dtype, shape) in _STORED.items()}
         found = sift(
-            as_picture(self._site.gray(wide, level), self._device),
+            as_picture(self._site.gray(wide, level), self.device),
             max_keypoints=_SLOTS,
             backend=self._backend,
             upright=upright,
-            mask=placed(mask[None, None], self._device),
+            mask=placed(mask[None, None], self.device),
             contrast_threshold=MIN_CONTRAST,
             spread=1,  # by strength alone; the level's cells spread landmarks
         )
@@ -187,7 +187,7 @@ class LandmarkMap:
 
     def _to_landmarks(self, found: NamedArrays) -> Landmarks:
         columns = [found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors")]
-        xy, scale, angle, descriptors = (column[None] for column in all_placed(columns, self._device))
+        xy, scale, angle, descriptors = (column[None] for column in all_placed(columns, self.device))
         valid = scale > 0.0  # of every landmark
         features = Features(xy, scale, angle, as_float(descriptors, "float32"), valid)
         return Landmarks(features, found["xy_px"], found["points_m"])

@@ -26,7 +26,7 @@ from engine.matching.views import MapView, TelemetryHypothesis, map_px_per_pixel
 from engine.matching.votes import Vote, similarity, vote
 from engine.options import PAPER_SCALE, SiftOptions
 from engine.orthomap import OrthoMap
-from engine.runtime.device import Picture, all_on_host, all_placed, as_float, on_host, placed
+from engine.runtime.device import Device, Picture, all_on_host, all_placed, as_float, on_host, placed
 from engine.values import Attitude
 
 if TYPE_CHECKING:  # it loads torch
@@ -139,7 +139,7 @@ def _feature_pairs(
     with query.scheduler.stage("frame features"):
         shown_px = int(np.count_nonzero(photo.valid))
         keypoints = max(options.max_keypoints, min(round(shown_px * options.keypoints_per_px), MAX_KEYPOINTS))
-        gray, valid = all_placed([photo.gray, photo.valid], query.device)
+        gray, valid = all_placed([photo.gray, photo.valid], landmarks.device)
         features = sift(
             as_float(gray, "float32")[None, None] / 255.0,
             max_keypoints=keypoints,
@@ -223,7 +223,7 @@ def _by_frame(
     turn = hypothesis.x_axis_deg
     upright = turn is not None
     with query.scheduler.stage("frame features"):
-        reduced = _reduce(query, options.scale)
+        reduced = _reduce(query, options.scale, landmarks.device)
         features = sift(
             reduced.picture,
             max_keypoints=options.max_keypoints,
@@ -251,7 +251,7 @@ def _by_frame(
 
 def _by_reduced(query: Query, finder: PointFinder, options: SiftOptions, views: list[MapView]) -> list[Matched]:
     """Points that an image matcher finds with the reduced frame, view by view."""
-    reduced, matched = _reduce(query, options.scale), []
+    reduced, matched = _reduce(query, options.scale, query.device), []
     valid = np.ones(reduced.picture.shape[2:], np.bool_)
     for view in views:
         points_px, map_px = finder.find(query, reduced.picture, valid, view)
@@ -266,11 +266,11 @@ def _frame_tolerance_px(options: SiftOptions) -> float:
     return options.pose.reprojection_px * max(1.0, PAPER_SCALE / options.scale)
 
 
-def _reduce(query: Query, scale: float) -> _Reduced:
+def _reduce(query: Query, scale: float, device: Device) -> _Reduced:
     height, width = query.gray.shape
     size = (max(16, round(width * scale)), max(16, round(height * scale)))
     picture = cv2.resize(query.gray, size, interpolation=cv2.INTER_AREA)
-    shrunk = as_picture(np.asarray(picture, np.uint8), query.device)
+    shrunk = as_picture(np.asarray(picture, np.uint8), device)
     return _Reduced(shrunk, np.array(size) / [width, height])
 
 
@@ -288,8 +288,8 @@ def _map_features(
     )
     mask = None
     if not site.fully_valid:
-        mask = placed(site.valid(crop, view.level), query.device)[None, None]
-    picture = as_picture(site.gray(crop, view.level), query.device)
+        mask = placed(site.valid(crop, view.level), landmarks.device)[None, None]
+    picture = as_picture(site.gray(crop, view.level), landmarks.device)
     features = sift(picture, max_keypoints=int(count), backend=options.backend, upright=upright, mask=mask)
     xy_px = on_host(features.xy_px[0])
     return Landmarks(features, xy_px, lifted(site, site.full_from_level(xy_px + view.corner_px, view.level)))

@@ -21,7 +21,7 @@ from engine.matching.refinement import CONFIRMING_CORRELATION, Refinement, with_
 from engine.matching.views import coarser_scale, drawn_px
 from engine.options import MatcherOptions, SiftOptions
 from engine.orthomap import OrthoMap
-from engine.runtime.device import Device
+from engine.runtime.device import CPU, Device
 from engine.values import Fix, NoFix, Result, Window
 
 _FEW_SHARE = 0.5  # of the keypoints, if a pose is refined from few
@@ -33,7 +33,7 @@ class Sift(Method):
 
     Args:
         site: the map.
-        device: where tensors live.
+        device: where kornia's features are computed; the compiled ones are on the CPU.
         options: settings; uses ``options.sift`` and, for refinement, NCC's enhancement of the map.
         samples: of the map for the refinement, if another method already has them.
     """
@@ -57,7 +57,9 @@ class Sift(Method):
         self, site: OrthoMap, device: Device, options: MatcherOptions, samples: SampleMap | None = None
     ) -> None:
         self.options = options.sift
-        self.landmarks = LandmarkMap(site, device, self.options.backend)
+        # kornia launches thousands of operations, which takes a GPU far longer than the compiled loops take.
+        on = device if self.options.backend == "kornia" else CPU
+        self.landmarks = LandmarkMap(site, on, self.options.backend)
         self._few = replace(
             self.options,
             max_keypoints=max(MIN_VOTES, round(self.options.max_keypoints * _FEW_SHARE)),
@@ -84,7 +86,7 @@ class Sift(Method):
         """Run every variant of every step, so that it is compiled and its cost known."""
         # An orthophoto's side has at most twice the frame's pixels; half as many more if turned by 45 degrees.
         longest_px = 3 * max(query.gray.shape)
-        if chosen_backend(self.options.backend, query.device) == "compiled":
+        if chosen_backend(self.options.backend, self.landmarks.device) == "compiled":
             prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX))
         looks = Looks(self, query)
         rehearse(query, looks.few, None)
