@@ -11,8 +11,7 @@ import math
 import cv2
 
 from engine.errors import OptionError
-from engine.kernels import sums
-from engine.kernels.accuracy import FLAT_SHARE, FLOAT32_NORM_RATIO
+from engine.kernels.accuracy import FLAT_SHARE
 from engine.runtime.tensors import Tensor, torch
 
 # Lower bound on a template's norm; a template of zeros scores 0.
@@ -55,28 +54,15 @@ def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor
         search = (search - search.mean(dim=(-2, -1), keepdim=True, dtype=torch.float64)).to(search.dtype)
         templates = templates - templates.mean(dim=(-2, -1), keepdim=True, dtype=torch.float64)
         templates = templates - templates.mean(dim=(-2, -1), keepdim=True)  # the rounding residue of a flat one
-    scores = [_one_surface(picture, group, zero_mean) for picture, group in zip(search, templates, strict=True)]
-    check_finite(**given)  # last: the host waits for it
-    return torch.stack(scores).to(search.dtype)
-
-
-def _one_surface(search: Tensor, templates: Tensor, zero_mean: bool) -> Tensor:
     h, w = templates.shape[-2:]
     sums = integrals(search)
     energy = box_energy(sums, h, w) if zero_mean else box_sum(sums[1], h, w)
-    window_energy = sums[1, -1, -1]
-    energy.masked_fill_(energy <= FLAT_SHARE * window_energy, torch.inf)
-    work = torch.float32 if _suits_float32(search, window_energy, energy) else torch.float64
+    energy.masked_fill_(energy <= FLAT_SHARE * sums[1, :, -1:, -1:], torch.inf)
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True, dtype=torch.float64)
-    normal = (templates / norm.clamp_min(_TINY)).to(work)  # a flat template is all zeros, and scores 0 everywhere
-    return correlate(search.to(work), normal).mul_(energy.to(work).rsqrt_()).clamp_(-1.0, 1.0)
-
-
-def _suits_float32(search: Tensor, window_energy: Tensor, energy: Tensor) -> bool:
-    """Whether no patch is too weak for float32; not checked on a GPU, since the host would wait for it."""
-    if search.device.type != "cpu" or search.dtype == torch.float64:
-        return False
-    return float(window_energy) <= FLOAT32_NORM_RATIO**2 * float(energy.min())
+    normal = templates.double() / norm.clamp_min(_TINY)  # a flat template is all zeros, and scores 0 everywhere
+    scores = correlate(search.double(), normal).mul_(energy.rsqrt_()[:, None]).clamp_(-1.0, 1.0)
+    check_finite(**given)  # last: the host waits for it
+    return scores.to(search.dtype)
 
 
 def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) -> Tensor:
@@ -91,7 +77,7 @@ def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) ->
         (T, H-h+1, W-w+1) float32 in [-1, 1].
     """
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True).clamp_min_(_TINY)
-    return correlate(image, templates / norm).mul_(inverse_norms).clamp_(-1.0, 1.0)
+    return correlate(image[None], (templates / norm)[None])[0].mul_(inverse_norms).clamp_(-1.0, 1.0)
 
 
 def peak_numbers(scores: Tensor, exclusion_px: float) -> list[float]:
@@ -139,21 +125,23 @@ def correlate(search: Tensor, templates: Tensor) -> Tensor:
     """Cross-correlation by the correlation theorem.
 
     Args:
-        search: (H, W) floating point.
-        templates: (T, h, w) of the same dtype.
+        search: (B, H, W) floating point.
+        templates: (B, T, h, w) of the same dtype.
 
     Returns:
-        (T, H-h+1, W-w+1) sums of products.
+        (B, T, H-h+1, W-w+1) sums of products.
     """
-    (H, W), (h, w) = search.shape, templates.shape[1:]
+    (H, W), (h, w) = search.shape[1:], templates.shape[2:]
     rows, columns = size = cv2.getOptimalDFTSize(H), cv2.getOptimalDFTSize(W)
-    count = max(1, _CHUNK_NUMBERS // (2 * rows * (columns // 2 + 1)))
-    spectrum = torch.fft.rfft2(search, s=size)
-    parts = [
-        _inverse(spectrum * torch.fft.rfft2(group, s=size).conj(), H - h + 1, W - w + 1, columns)
-        for group in templates.split(count)
-    ]
-    return parts[0] if len(parts) == 1 else torch.cat(parts)
+    most = max(1, _CHUNK_NUMBERS // (2 * rows * (columns // 2 + 1)))
+    found = []
+    for pictures, models in zip(search.split(most), templates.split(most), strict=True):
+        spectra = torch.fft.rfft2(pictures, s=size)[:, None]
+        products = (
+            spectra * torch.fft.rfft2(group, s=size).conj() for group in models.split(most // len(pictures), 1)
+        )
+        found.append(torch.cat([_inverse(product, H - h + 1, W - w + 1, columns) for product in products], 1))
+    return found[0] if len(found) == 1 else torch.cat(found)
 
 
 def _inverse(spectrum: Tensor, height: int, width: int, columns: int) -> Tensor:
@@ -164,16 +152,14 @@ def _inverse(spectrum: Tensor, height: int, width: int, columns: int) -> Tensor:
 
 
 def integrals(image: Tensor) -> Tensor:
-    """Integral images of a picture and of its square.
+    """Integral images of pictures and of their squares.
 
     Args:
-        image: (H, W) floating point.
+        image: (..., H, W) floating point.
 
     Returns:
-        (2, H+1, W+1) float64 running sums; the first row and column are 0.
+        (2, ..., H+1, W+1) float64 running sums; the first row and column are 0.
     """
-    if image.device.type == "cpu":
-        return torch.from_numpy(sums.integrals(image.detach().numpy()))
     wide = torch.nn.functional.pad(image.double(), (1, 0, 1, 0))
     return torch.stack([wide, wide.square()]).cumsum_(-1).cumsum_(-2)
 
@@ -196,12 +182,12 @@ def box_energy(sums: Tensor, h: int, w: int) -> Tensor:
     """Sum of squares about the mean of every patch.
 
     Args:
-        sums: (2, H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
+        sums: (2, ..., H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
         h: rows of a patch.
         w: columns of a patch.
 
     Returns:
-        (H-h+1, W-w+1) float64.
+        (..., H-h+1, W-w+1) float64.
     """
     total, square = box_sum(sums, h, w)
     energy: Tensor = square.addcmul_(total, total, value=-1.0 / (h * w))

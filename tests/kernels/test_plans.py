@@ -38,8 +38,8 @@ def test_a_flight_of_many_window_sizes_plans_few_transforms(monkeypatch):
     monkeypatch.setattr(torch.fft, "rfft2", recorded)
     sizes = set(adaptive_windows(64))
     assert len(sizes) > 50
-    template = torch.rand(1, 48, 40, generator=torch.Generator().manual_seed(0))
+    template = torch.rand(1, 1, 48, 40, generator=torch.Generator().manual_seed(0))
     for height, width in sizes:
-        products = tensors.correlate(torch.zeros(height, width), template)
-        assert products.shape == (1, height - 47, width - 39)
+        products = tensors.correlate(torch.zeros(1, height, width), template)
+        assert products.shape == (1, 1, height - 47, width - 39)
     assert len(plans) <= 24
