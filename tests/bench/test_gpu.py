@@ -23,16 +23,19 @@ def test_the_table_has_a_row_for_every_task(capsys):
     assert [row[0].strip("| ") for row in rows] == [
         "task",
         "NCC 228 in 425",
+        "NCC surfaces, 1",
+        "SIFT of 1",
         "locate, ncc",
         "locate, sift",
+        "whole map, ncc",
     ]
     assert {len(row) for row in rows} == {len(gpu.COLUMNS)}
-    assert [row[4] for row in rows[2:]] == ["0e+00 m"] * 2  # the CPU beside itself
+    assert [row[5] for row in rows[1:]] == ["0e+00 px, 0e+00", "0e+00", "100.0% shared", *["0e+00 m"] * 3]
 
 
-def test_a_row_has_times_and_their_rate():
-    row = gpu.Row("x", [2.0, 2.0, 2.0], "0", (1, 1))
-    assert row.cells() == ["x", "2.000", "2.000", "500", "0", "1", "1"]
+def test_a_row_has_times_beside_those_of_its_peers():
+    row = gpu.Row("x", ([2.0, 2.0, 2.0], [3.0, 4.0, 9.0], []), "0", (1, 1))
+    assert row.cells() == ["x", "2.000", "2.000", "4.000", "", "0", "1", "1"]
 
 
 def test_copies_are_told_apart_by_their_direction():

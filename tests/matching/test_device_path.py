@@ -233,19 +233,22 @@ def test_matches_are_the_cpus():
 # ------------------------------------------------------------------------- whole frames
 
 # Copies to the host per frame once the map is prepared: the peak, the pairs.
-DOWNLOADS = {"ncc": 1, "sift": 1, "auto": 2}
+DOWNLOADS = {("ncc", "auto"): 1, ("sift", "kornia"): 1, ("sift", "auto"): 0, ("auto", "kornia"): 2}
 METRES = {"ncc": 1e-6, "sift": 1e-2, "auto": 1e-6}
 
 
-@pytest.mark.parametrize("method", ["ncc", "sift", pytest.param("auto", marks=pytest.mark.slow)])
-def test_a_frame_crosses_once_each_way_and_its_fix_is_the_cpus(method, monkeypatch):
+@pytest.mark.parametrize(
+    ("method", "backend"),
+    [case if case[0] != "auto" else pytest.param(*case, marks=pytest.mark.slow) for case in DOWNLOADS],
+)
+def test_a_frame_crosses_once_each_way_and_its_fix_is_the_cpus(method, backend, monkeypatch):
     scene = flight(1)
-    options = MatcherOptions(sift=SiftOptions(backend="kornia"))
+    options = MatcherOptions(sift=SiftOptions(backend=backend))
     matcher = SceneMatcher(scene.site, scene.camera, method, "cpu", options)
     expected = [matcher.locate(*pair) for pair in zip(scene.frames, scene.priors, strict=True)]
     monkeypatch.setattr(engine.runtime.device, "resolve", lambda name: DEVICE)
     with pretended_device() as crossings:
-        matcher = SceneMatcher(scene.site, scene.camera, method)
+        matcher = SceneMatcher(scene.site, scene.camera, method, options=options)
         for frame, prior in zip(scene.frames, scene.priors, strict=True):
             matcher.locate(frame, prior)  # regions, landmarks and plans are made
         for frame, prior, fix in zip(scene.frames, scene.priors, expected, strict=True):
@@ -253,11 +256,69 @@ def test_a_frame_crosses_once_each_way_and_its_fix_is_the_cpus(method, monkeypat
             crossings.downloads.clear()
             crossings.waits.clear()
             found = matcher.locate(frame, prior)
-            assert len(crossings.downloads) == DOWNLOADS[method]
-            if method == "ncc":  # the template goes up; kornia counts its extrema, and the host waits for it
-                assert len(crossings.uploads) == 1
+            assert len(crossings.downloads) == DOWNLOADS[method, backend]
+            if backend == "auto":  # NCC's template goes up; kornia counts its extrema, and the host waits for it
+                assert len(crossings.uploads) == DOWNLOADS[method, backend]
                 assert crossings.waits == []
             assert isinstance(found, Fix)
             assert isinstance(fix, Fix)
             apart_m = math.hypot(found.east_m - fix.east_m, found.north_m - fix.north_m)
             assert apart_m < METRES[method]
+
+
+# ------------------------------------------------------------------------- a real one, where there is one
+
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+
+
+@needs_cuda
+@pytest.mark.parametrize(
+    ("size", "model"), [((150, 131), (63, 50)), ((425, 425), (228, 228)), ((64, 63), (63, 63))]
+)
+def test_a_gpu_finds_the_same_peak(size, model):
+    image = picture(*size, 1)
+    template = cut(image, model, 2)
+    expected = match_template(prepare(image), template, exclusion_px=5.0, exhaustive=True)
+    found = match_template(prepare(image.cuda()), template.cuda(), exclusion_px=5.0, exhaustive=True)
+    assert (found.x, found.y) == pytest.approx((expected.x, expected.y), abs=1e-3)
+    assert (found.score, found.second_score) == pytest.approx((expected.score, expected.second_score), abs=1e-5)
+
+
+@needs_cuda
+@pytest.mark.parametrize("zero_mean", [True, False])
+def test_a_gpu_makes_the_surfaces_of_float64(zero_mean):
+    windows = torch.stack([picture(170, 181, i) for i in range(2)]) + 3.0
+    templates = torch.stack([torch.stack([cut(w, (60, 71), i) for i in range(3)]) for w in windows])
+    valid = torch.ones(2, 170, 181, dtype=torch.bool)
+    valid[:, 100:, 140:] = False
+    for mask in (None, valid) if zero_mean else (None,):
+        expected = ncc(windows.double(), templates.double(), zero_mean=zero_mean, search_valid=mask)
+        given = None if mask is None else mask.cuda()
+        found = ncc(windows.cuda(), templates.cuda(), zero_mean=zero_mean, search_valid=given)
+        assert_close(found.cpu().double(), expected, atol=2e-5, rtol=0)
+
+
+@needs_cuda
+@pytest.mark.parametrize("options", [pytest.param(options, id=name) for name, options in OPTIONS.items()])
+def test_a_gpu_finds_the_features_of_the_cpu(options):
+    pictures = scenes()
+    expected = sift(pictures, backend="kornia", **options)
+    found = sift(pictures.cuda(), **options)
+    assert_same_features(download([found.valid, found.xy_px, found.scale_px, found.descriptors]), expected)
+
+
+@needs_cuda
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+def test_a_gpu_fixes_a_flight_as_the_cpu_does_and_its_memory_does_not_grow(method):
+    scene = flight(8)
+    options = MatcherOptions(sift=SiftOptions(backend="kornia"))
+    matchers = [SceneMatcher(scene.site, scene.camera, method, device, options) for device in ("cuda", "cpu")]
+    for frame, prior in zip(scene.frames, scene.priors, strict=True):
+        found, expected = (matcher.locate(frame, prior) for matcher in matchers)
+        assert isinstance(found, Fix)
+        assert isinstance(expected, Fix)
+        assert math.hypot(found.east_m - expected.east_m, found.north_m - expected.north_m) < 0.05
+    held = torch.cuda.memory_allocated()
+    for frame, prior in list(zip(scene.frames, scene.priors, strict=True)) * 3:
+        matchers[0].locate(frame, prior)
+    assert torch.cuda.memory_allocated() <= held

@@ -34,7 +34,7 @@ def frame(index):
     east, north = site.enu_from_pixel(np.array([x + 59.5, y + 59.5]))
     return taken(gray[y : y + 120, x : x + 120], index), Prior(east_m=east, north_m=north, sigma_m=3)
 for method in sys.argv[1:]:
-    matcher = SceneMatcher(site, camera, method)
+    matcher = SceneMatcher(site, camera, method, "cpu")
     navigator = Navigator(matcher, frame(0)[1])
     fixes = 0
     for index in range(6):
@@ -109,7 +109,7 @@ def test_tracking_loads_no_torch(tmp_path):
         "map": folder / "map.tif", "surface": folder / "dsm.tif", "camera": folder / "camera.yaml",
         "frames": folder / "frames", "telemetry": folder / "telemetry.csv", "out": tmp_path / "out",
     }  # fmt: skip
-    words = ["--method=auto", *(f"--{name}={value}" for name, value in given.items())]
+    words = ["--method=auto", "--device=cpu", *(f"--{name}={value}" for name, value in given.items())]
     assert run(program, "track", *words)[-2:] == ["TORCH", "False"]
     assert (tmp_path / "out" / "report.html").exists()
 
