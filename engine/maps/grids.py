@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from engine.errors import MapError
 from engine.geo import LocalFrame
 
 if TYPE_CHECKING:
-    from pyproj import CRS
+    from pyproj import CRS, Transformer
 
 Array = NDArray[np.float64]
 Function = Callable[[Array], Array]
@@ -159,6 +160,13 @@ def wgs84() -> CRS:
     return CRS.from_epsg(4326)
 
 
+@lru_cache(maxsize=16)  # making one takes tens of milliseconds
+def _transformer(source: CRS, target: CRS) -> Transformer:
+    from pyproj import Transformer
+
+    return Transformer.from_crs(source, target, always_xy=True)
+
+
 @dataclass(frozen=True, eq=False)
 class Grid:
     """A raster grid with its georeference.
@@ -182,10 +190,7 @@ class Grid:
 
     def pixels_of(self, other: CRS) -> tuple[Function, Function]:
         """Exact functions (..., 2) to (..., 2): coordinates of another CRS from pixels, and pixels from these."""
-        from pyproj import Transformer
-
-        forward = Transformer.from_crs(self.crs, other, always_xy=True)
-        backward = Transformer.from_crs(other, self.crs, always_xy=True)
+        forward, backward = _transformer(self.crs, other), _transformer(other, self.crs)
         crs_to_pixel = invert_affine(self.pixel_to_crs)
         centre_x = apply_affine(self.pixel_to_crs, self.centre_px)[0]
 
