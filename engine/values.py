@@ -289,7 +289,7 @@ class Fix:
         timings: milliseconds per stage.
         map_xy_px: the camera's nadir in map pixels (x, y).
         stage: last stage within the budget: "coarse" at reduced resolution, "fine" at full, "refined" in all of
-            the pose, "verified" by both methods.
+            the pose, "verified" by both methods; "unconfirmed" if the picture does not confirm the attitude.
         confidence: probability in (0, 1) that the position is correct, see ``docs/integrity.md``; None if the
             method states none, as in the paper's profile.
         map_sigma_m: the georeference's part of ``covariance_m2``, one standard deviation per axis. All fixes on a
@@ -313,6 +313,11 @@ class Fix:
     confidence: float | None = None
     map_sigma_m: float = 0.0
     attitude_covariance_deg2: NDArray[np.float64] | None = None
+
+    @property
+    def rests_on_attitude(self) -> bool:
+        """Whether the position is only as good as the telemetry's attitude, which no picture confirmed."""
+        return self.up_m is None and self.stage in ("coarse", "unconfirmed")
 
     @property
     def attitude_sigma_deg(self) -> tuple[float, ...] | None:

@@ -16,7 +16,6 @@ from engine.matching.evidence import is_beyond_doubt
 from engine.matching.explanation import Explanation, explain_correlation
 from engine.matching.ladder import Rung, Works, climb, is_coarse, is_late, rehearse
 from engine.matching.method import Method
-from engine.matching.oblique import is_ground_below, is_oblique
 from engine.matching.peak_evidence import (
     PeakCandidate,
     candidate_of,
@@ -30,7 +29,7 @@ from engine.matching.second_look import second_look
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.values import Fix, NoFix, Peak, Prior, Reason, Result, Window
+from engine.values import Fix, NoFix, Prior, Reason, Result, Window
 
 MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
@@ -144,7 +143,7 @@ class Ncc(Method):
             return query.refuse(Reason.LOW_SCORE, detail, METHOD, window=window)
         is_window, hypotheses = not (widely or wide or query.prior is None), 1
         if is_window:
-            peak, aligned = self._in_window(correlator, aligned, window)
+            peak = correlator.search(aligned, window, quick_look(correlator, aligned, window))
         else:
             peak, aligned, hypotheses = hypothesis_search.search(correlator, aligned, window, reach)
         if peak is None:
@@ -158,19 +157,6 @@ class Ncc(Method):
         if is_window:
             return null_tested(correlator, found)
         return replace(found, is_tested=not searched and is_beyond_doubt(found.evidence.nats, query.risk))
-
-    def _in_window(self, correlator: Correlator, aligned: Aligned, window: Window) -> tuple[Peak | None, Aligned]:
-        """The peak of one hypothesis; an oblique frame is redrawn over the ground where it was found."""
-        query, pose = correlator.query, aligned.pose
-        peak = correlator.search(aligned, window, quick_look(correlator, aligned, window))
-        if peak is None or pose.grid_attitude is None or not is_oblique(query, pose.grid_attitude):
-            return peak, aligned
-        nadir_px = correlator.nadir_px(peak, aligned)
-        again = None if is_ground_below(query, nadir_px) else correlator.align(pose, aligned.level, nadir_px)
-        if not isinstance(again, Aligned):
-            return peak, aligned
-        second = correlator.search(again, window, quick_look(correlator, again, window))
-        return (peak, aligned) if second is None else (second, again)
 
     def judge(self, query: Query, found: PeakCandidate | NoFix) -> Result:
         """The fix if there is a peak and it is accepted, else a refusal."""

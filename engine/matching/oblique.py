@@ -20,7 +20,6 @@ OBLIQUE_DEG = 25.0
 """Angle of the optical axis off the vertical beyond which the ground no longer looks like a plane."""
 FIELD_DEG = 60.0
 """Ground farther off the vertical is left out: walls hide it, and an error of height or tilt moves it most."""
-_SAME_GROUND_SHARE = 0.02  # of the height; closer places have similar relief
 _MIN_SIDE_PX = 8
 _CELLS = 96  # of the grid that finds the rectangle, along the longer side
 
@@ -28,15 +27,6 @@ _CELLS = 96  # of the grid that finds the rectangle, along the longer side
 def is_oblique(query: Query, attitude: Attitude) -> bool:
     """Whether a frame looks far from the vertical."""
     return -float(query.camera.enu_from_camera(attitude)[2, 2]) < math.cos(math.radians(OBLIQUE_DEG))
-
-
-def is_ground_below(query: Query, nadir_px: Array) -> bool:
-    """Whether the ground at a place (2,) equals that at the prior, as far as it matters from this height."""
-    height_m = query.telemetry.height_agl_m
-    if query.prior_px is None or height_m is None:
-        return False
-    off_m = float(np.linalg.norm(nadir_px - query.prior_px)) * query.site.gsd_m_per_px
-    return off_m < _SAME_GROUND_SHARE * height_m
 
 
 def oblique_patch(

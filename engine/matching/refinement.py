@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.geo import attitude_from_rotation
+from engine.geo import attitude_from_rotation, chi_square_of
 from engine.kernels.dense import (
     DenseFit,
     EnhancedFrame,
@@ -22,7 +22,7 @@ from engine.kernels.dense import (
 )
 from engine.kernels.scores import enhance
 from engine.maps.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
-from engine.matching.acceptance import agree_in_height, are_consistent
+from engine.matching.acceptance import CHANCE, agree_in_height, are_consistent
 from engine.matching.align import shrink
 from engine.matching.covariance import tilt_covariance
 from engine.matching.query import Query
@@ -33,9 +33,9 @@ from engine.values import Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
 
-# If refinement fails on the frame's own level it restarts this many levels above: one if the tilt is known; two if
-# it is not, or if one failed as well.
-_COARSER, _MUCH_COARSER = 1, 2
+_COARSER = (
+    2  # levels above the frame's own on which a refinement restarts if it fails there, or the tilt is unknown
+)
 _TILTS_DEG = (-6.0, -3.0, 0.0, 3.0, 6.0)  # tried first about both axes if the tilt is unknown
 _MIN_CORRELATION = 0.2  # of an accepted pose with a known tilt: true poses over a town in snow reached 0.29
 CONFIRMING_CORRELATION = 0.45
@@ -76,9 +76,9 @@ class Refinement:
         """The fix with its whole pose refined, or a less certain one if refinement does not confirm it.
 
         If the picture hardly confirms the telemetry's attitude, the pose is refined once more as if roll and pitch
-        were hardly known; the result counts if the picture confirms it. If roll and pitch are unknown, the picture
-        must determine them over a surface model, or the fix is refused, because its error is unknown. If the
-        ground is assumed flat, an unconfirmed fix stays as it was.
+        were hardly known; the result counts if the picture confirms it. An attitude that it does not confirm
+        counts only if the position agrees with the prior. If roll and pitch are unknown, the picture must
+        determine them over a surface model; without one the fix stays as it was.
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
         refined = self._through_all(fix)
@@ -91,11 +91,14 @@ class Refinement:
                     raise
         if refined is not None:
             return refined
-        if not query.site.has_surface:
+        if not (has_tilt or query.site.has_surface):
             return fix
-        if has_tilt:
-            return with_unconfirmed_tilt(query, fix)
-        detail = "roll and pitch are unknown, and the picture does not determine them"
+        off = query.prior_chi_square(fix)
+        if has_tilt and (off is None or off <= chi_square_of(CHANCE, 2)):
+            wider = with_unconfirmed_tilt(query, fix) if query.site.has_surface else fix
+            return replace(wider, stage="unconfirmed")
+        known = f"chi-square {off:.0f} from the prior" if has_tilt else "roll and pitch are unknown"
+        detail = f"the picture does not confirm the attitude ({known})"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
     def refine_at_once(self, fix: Fix) -> Fix | None:
@@ -104,7 +107,7 @@ class Refinement:
         return self._refined(fix, prior, self._at_once(prior))
 
     def refine_from_coarser(self, fix: Fix) -> Fix | None:
-        """The same from a level above the frame's own, where a few pixels span more ground."""
+        """The same from a coarser level, where a few pixels span more ground."""
         prior = self._prior(fix)
         return self._refined(fix, prior, self._through_levels(prior, _COARSER))
 
@@ -121,8 +124,8 @@ class Refinement:
         """The fix with its pose refined, from a coarser level if necessary."""
         prior, fit = self._prior(fix), None
         if self._knows_tilt:
-            fit = self._at_once(prior) or self._through_levels(prior, _COARSER)
-        return self._refined(fix, prior, fit or self._through_levels(prior, _MUCH_COARSER))
+            fit = self._at_once(prior)
+        return self._refined(fix, prior, fit or self._through_levels(prior, _COARSER))
 
     def _refined(self, fix: Fix, prior: GaussianPrior, fit: DenseFit | None) -> Fix | None:
         """The fix with its pose refined; None if refinement failed or led elsewhere."""

@@ -187,9 +187,11 @@ class Match:
     def support(self) -> float:
         """What it adds to the log-odds of a place that no track predicted.
 
-        Its own evidence takes every second frame to show a place. After n refusals it is one in n + 2 (Laplace).
+        Its own evidence takes every second frame to show a place. After n refusals it is one in n + 2 (Laplace). A
+        position that rests on the telemetry's attitude is as reliable as any other source's.
         """
-        own = min(stated_nats(self.fix) - math.log1p(self.refusals), CERTAIN)
+        most = RELIABLE if self.fix.rests_on_attitude else CERTAIN
+        own = min(stated_nats(self.fix) - math.log1p(self.refusals), most)
         if self.given is None:
             return own
         here = min(self.given.log_likelihood_ratio(self.fix, self.searched_m2), CERTAIN)
@@ -330,7 +332,8 @@ class Tracks:
 def _gain(track: Track, match: Match, ratio: float, best: float) -> float:
     """What a match that agrees with a track adds to its log-odds.
 
-    A wrong match of repeated structure recurs as long as the frame shows the same ground.
+    A wrong match of repeated structure recurs as long as the frame shows the same ground, and a wrong attitude moves
+    all matches that rest on it alike.
 
     Args:
         track: at the match's frame.
@@ -339,6 +342,8 @@ def _gain(track: Track, match: Match, ratio: float, best: float) -> float:
         best: the same for the best of the tracks that it agrees with.
     """
     share = match.new_share(track)
+    if match.fix.rests_on_attitude and track.fix is not None and track.fix.rests_on_attitude:
+        return ratio - best
     own = (_SAME_GROUND + (1.0 - _SAME_GROUND) * share) * min(stated_nats(match.fix), CERTAIN)
     return own + share * min(best, CERTAIN) + ratio - best
 

@@ -669,5 +669,6 @@ def test_a_place_that_contradicts_its_prior_is_less_certain(ground, camera, fram
     noise = np.random.default_rng(1).normal(0.0, 200.0, frame.image.shape)
     noisy = replace(frame, image=np.clip(0.5 * frame.image + 64.0 + noise, 0, 255).astype(np.uint8))
     near, far = (ground.prior(NADIR, sigma_m=2.0, off_m=off) for off in ((1.0, -1.0), (9.0, -8.0)))
-    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu", MatcherOptions(risk=0.5))
+    by_peak = MatcherOptions(risk=0.5, ncc=NccOptions(refine=False))
+    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu", by_peak)
     assert matcher.locate(noisy, near).confidence > matcher.locate(noisy, far).confidence

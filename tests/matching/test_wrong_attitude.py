@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, OrthoMap, SceneMatcher
+from engine import Fix, OrthoMap, Reason, SceneMatcher
 from engine.matching.refinement import Refinement
 from engine.runtime.scheduler import OutOfTime
 
@@ -51,6 +51,17 @@ def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, matchers, camera, 
     assert fix.attitude is not None
     assert abs(fix.attitude.roll_deg - TRUE["roll_deg"]) < 0.5
     assert abs(fix.attitude.pitch_deg - TRUE["pitch_deg"]) < 0.5
+
+
+@pytest.mark.parametrize("method", ["ncc", "sift", "auto"])
+def test_a_tilt_of_the_wrong_sign_never_displaces_a_fix(ground, matchers, camera, method):
+    """A braking vehicle's 14 degrees of pitch, told as -14: its position would be 75 m off."""
+    frame = replace(ground.frame(camera, NADIR, 150.0, pitch_deg=14.0), pitch_deg=-14.0)
+    answer = matchers[method].locate(frame, ground.prior(NADIR))
+    if isinstance(answer, Fix):
+        assert np.hypot(*(np.array([answer.east_m, answer.north_m]) - ground.enu_from_pixel(NADIR))) < 1.0
+    else:
+        assert answer.reason in (Reason.BAD_POSE, Reason.LOW_SCORE, Reason.AMBIGUOUS)
 
 
 @pytest.mark.parametrize("knows_better", [True, False, None])

@@ -280,6 +280,22 @@ def test_photographs_with_positions_of_their_own_are_fixes_one_by_one():
     assert [prior.sigma_m for prior in navigator._matcher.priors] == [15.0] * 8
 
 
+@pytest.mark.parametrize(("stage", "first"), [("fine", 1), ("coarse", None), ("unconfirmed", None)])
+def test_an_attitude_that_nothing_confirmed_does_not_outweigh_a_start_however_often(stage, first):
+    """Its error moves all matches by 80 m alike: they agree with each other, and not with the start."""
+    fixes = [replace(fix_at(80.0 + 1.4 * k), stage=stage) for k in range(20)]
+    navigator = Navigator(ScriptedMatcher(*fixes), Prior(east_m=0.0, north_m=0.0, sigma_m=10.0))
+    fixed = [isinstance(navigator.update(at(0.2 * k, (7.0, 0.0))), Fix) for k in range(20)]
+    assert fixed == [first is not None and k >= first for k in range(20)]
+
+
+@pytest.mark.parametrize("stage", ["coarse", "unconfirmed"])
+def test_an_attitude_that_nothing_confirmed_is_believed_where_the_start_predicts(stage):
+    fixes = [replace(fix_at(1.4 * k), stage=stage) for k in range(20)]
+    navigator = Navigator(ScriptedMatcher(*fixes), Prior(east_m=3.0, north_m=0.0, sigma_m=10.0))
+    assert all(isinstance(navigator.update(at(0.2 * k, (7.0, 0.0))), Fix) for k in range(20))
+
+
 def test_a_match_that_what_was_flown_contradicts_is_refused():
     places = [(0.0, 0.0), (8.0, 0.0), (16.0, 0.0), (900.0, 0.0), (32.0, 0.0)]
     assert fly(places, 0.9999, seconds=2.0)[0] == [0, 1, 2, 4]
