@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from engine.errors import MapError
 from scenematch.fetch.grid import Grid, reason_of
 from scenematch.fetch.urls import shown
+from scenematch.files.geotiff import tiled_profile
 
 ATTEMPTS = 5
 """Attempts per picture before the fetch fails."""
@@ -22,7 +23,6 @@ FIRST_WAIT_S = 2.0
 """Pause before the second attempt; doubled for each further one."""
 _OPAQUE = 128
 """Least alpha of a valid pixel, as when maps are read."""
-_BLOCK_PX = 256
 _CACHED = re.compile(r"[0-9a-f]{32}")  # names of GDAL's cached files
 _STATUS = re.compile(r"HTTP status code: (\d+), error: (.*?)\.?(?: Add the HTTP|$)")
 _BUSY = re.compile(r"HTTP status code: (429|5\d\d)|timed? ?out|reset by peer|Empty reply", re.IGNORECASE)
@@ -60,11 +60,14 @@ def fetch_pictures(
 
     part = out.with_name(f"{out.name}.part")
     level = {} if grid.overview is None else {"overview_level": grid.overview}
+    (x, y), (step_x, step_y), (width, height) = grid.corner, grid.step, grid.size_px
+    corner = np.array([[step_x, 0.0, x], [0.0, -step_y, y]])
+    profile = tiled_profile((height, width, 3), "uint8", corner, grid.crs)
     try:
         with (
             rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
             rasterio.open(grid.source, **level) as source,
-            rasterio.open(part, "w", **_profile(grid)) as file,
+            rasterio.open(part, "w", **profile) as file,
         ):
             yield from _copied(source, file, grid, lambda k: pause_s * (k > cached), url, say)
             file.update_tags(**{name: str(value) for name, value in tags.items()})
@@ -132,19 +135,6 @@ def _told(reason: str) -> str:
         return shown(text)
     more = ": access denied (the key is missing or wrong, or its terms forbid this)"
     return f"the server answers {code}{more if code in ('401', '403') else ''}"
-
-
-def _profile(grid: Grid) -> dict[str, Any]:
-    from rasterio.crs import CRS
-    from rasterio.transform import Affine
-
-    (x, y), (step_x, step_y), (width, height) = grid.corner, grid.step, grid.size_px
-    return {
-        "driver": "GTiff", "dtype": "uint8", "count": 3, "width": width, "height": height,
-        "crs": CRS.from_wkt(grid.crs.to_wkt()), "transform": Affine(step_x, 0.0, x, 0.0, -step_y, y),
-        "photometric": "RGB", "tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX,
-        "compress": "deflate", "predictor": 2, "BIGTIFF": "IF_SAFER",
-    }  # fmt: skip
 
 
 def kept_pictures(folder: Path) -> list[Path]:
