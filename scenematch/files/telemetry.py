@@ -26,11 +26,9 @@ from scenematch.files.tables import (
     QUARTER_TURN,
     SIGMA,
     CsvRow,
-    cell_text,
-    known_columns,
     read_header,
     read_table,
-    write_table,
+    write_known,
 )
 
 __all__ = [
@@ -205,9 +203,7 @@ def write_telemetry(path: str | Path, rows: Sequence[TelemetryRow]) -> None:
     Raises:
         TelemetryError: the file cannot be written.
     """
-    columns = known_columns(rows, _REQUIRED, tuple(_BOUNDS))
-    table = ([cell_text(getattr(row, name), _DECIMALS.get(name, 4)) for name in columns] for row in rows)
-    write_table(path, columns, table)
+    write_known(path, rows, _REQUIRED, _BOUNDS, _DECIMALS)
 
 
 def ground_amsl_m(rows: Sequence[TelemetryRow]) -> float | None:

@@ -16,10 +16,8 @@ from scenematch.files.tables import (
     HEADING,
     LONGITUDE,
     QUARTER_TURN,
-    cell_text,
-    known_columns,
     read_table,
-    write_table,
+    write_known,
 )
 from scenematch.files.telemetry import TelemetryRow
 
@@ -64,9 +62,7 @@ def write_truth(path: str | Path, rows: Sequence[Truth]) -> None:
     Raises:
         TelemetryError: the file cannot be written.
     """
-    columns = known_columns(rows, _REQUIRED, tuple(_OPTIONAL))
-    table = ([cell_text(getattr(row, name), _DECIMALS.get(name, 4)) for name in columns] for row in rows)
-    write_table(path, columns, table)
+    write_known(path, rows, _REQUIRED, _OPTIONAL, _DECIMALS)
 
 
 def truth_from_telemetry(row: TelemetryRow, lat_deg: float, lon_deg: float, shift_ns: int = 0) -> Truth:
