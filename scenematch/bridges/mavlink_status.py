@@ -42,9 +42,8 @@ class MavlinkStatus:
         """The same in one line."""
         reasons = ", ".join(f"{why} {n}" for why, n in {**self.withheld, **self.refused}.items()) or "nothing"
         heard = "autopilot heard" if self.connected else "no autopilot"
-        slow = (
-            f" (below {MIN_RATE_HZ:g} Hz an estimator may stop using them)" if self.rate_hz < MIN_RATE_HZ else ""
-        )
+        warning = f" (below {MIN_RATE_HZ:g} Hz an estimator may stop using them)"
+        slow = warning if self.rate_hz < MIN_RATE_HZ else ""
         age = "" if self.least_age_ms is None else f", least age {self.least_age_ms:.0f} ms"
         return f"{heard}; sent {self.sent}, {self.rate_hz:.1f} Hz{slow}{age}; not sent: {reasons}"
 

@@ -1,8 +1,7 @@
 """The ROS bridge: feed images and telemetry to the engine; publish poses, fixes and diagnostics.
 
 It does not import ROS: it only accesses the fields of messages, which ros1.py and ros2.py transport. A pose is
-never
-published without its covariance; a refusal is published in the diagnostics only. Stamps are capture times.
+never published without its covariance; a refusal is published in the diagnostics only. Stamps are capture times.
 """
 
 from __future__ import annotations
@@ -219,9 +218,8 @@ class RosBridge:
             self._diagnose(captured_ns, _ERROR, str(error), {})
             return
         with contextlib.suppress(StateError):  # closed in the meantime
-            self._live.submit(
-                frame, captured_ns=min(captured_ns, arrived_ns)
-            )  # a stamp in the future counts as now
+            # A stamp in the future counts as now.
+            self._live.submit(frame, captured_ns=min(captured_ns, arrived_ns))
 
     def _start_live(self) -> Live:
         make, options = self._make_navigator, self._live_options
@@ -271,10 +269,8 @@ class RosBridge:
         """Publish an error if no images arrive; call it once a second."""
         silence_s = time.monotonic() - self._last_image_s
         if silence_s > _MAX_SILENCE_S:
-            self._say(
-                "no picture",
-                f"no picture on {self._image_topic}: does anything publish this topic with this type?",
-            )
+            doubt = "does anything publish this topic with this type?"
+            self._say("no picture", f"no picture on {self._image_topic}: {doubt}")
             self._diagnose(self._node.now_ns(), _ERROR, f"no picture for {silence_s:.0f} s", {})
 
     def _say(self, cause: str, text: str) -> None:
@@ -287,9 +283,8 @@ class RosBridge:
         status = self.status
         counters = {name: str(count) for name, count in asdict(status.counts).items()}
         counters |= {"fixes": str(status.fixes), "unusable": str(status.unusable)}
-        self._node.publish(
-            "diagnostics", diagnostics(self._node.messages, time_ns, level, text, values | counters)
-        )
+        message = diagnostics(self._node.messages, time_ns, level, text, values | counters)
+        self._node.publish("diagnostics", message)
 
 
 def _known(frame: Frame) -> dict[str, str]:

@@ -126,9 +126,8 @@ class RosTelemetry:
             heading_deg = yaw_deg if heading_deg is None else heading_deg
             east_mps, north_mps = self._velocity.at(time_ns) or (None, None)
             along_body = self._odometry.at(time_ns)
-            *_, stated_mps = self._odometry.nearest(time_ns) or (
-                0.0,
-            )  # 0 means not stated: nothing to interpolate
+            # 0 means not stated: nothing to interpolate.
+            *_, stated_mps = self._odometry.nearest(time_ns) or (0.0,)
             slant_m, height_m = scalar(self._range.at(time_ns)), scalar(self._height.at(time_ns))
         above_m = height_m
         if slant_m is not None:  # the beam is fixed to the body, so it tilts with it
