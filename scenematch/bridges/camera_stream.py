@@ -14,7 +14,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Generator
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -51,20 +51,9 @@ _GSTREAMER_HINT = "; read a GStreamer pipeline by 'exec:gst-launch-1.0 -q ... ! 
 _log = logging.getLogger("scenematch")
 
 
-class _Source(Protocol):
-    """An open camera. ``read`` blocks until a picture arrives, and returns None after the last."""
-
-    def read(self) -> tuple[Image, int] | None:
-        """The next picture (H, W, 3) RGB and its time of arrival on ``time.monotonic_ns``."""
-
-    def interrupt(self) -> None:
-        """Make a blocked read return, if possible from another thread."""
-
-    def close(self) -> None:
-        """Release the camera."""
-
-
 class _OpenCvSource:
+    """An open camera or stream."""
+
     def __init__(self, source: str) -> None:
         try:
             if source.isdecimal():
@@ -84,6 +73,7 @@ class _OpenCvSource:
         self._camera.set(cv2.CAP_PROP_BUFFERSIZE, 1)
 
     def read(self) -> tuple[Image, int] | None:
+        """The next picture (H, W, 3) RGB and when it arrived on ``time.monotonic_ns``; blocks; None at the end."""
         if not self._camera.grab():
             return None
         arrived_ns = time.monotonic_ns()
@@ -91,9 +81,10 @@ class _OpenCvSource:
         return (_rgb(image), arrived_ns) if good and image is not None else None
 
     def interrupt(self) -> None:
-        return  # the next picture or the timeout ends the read
+        """Make a blocked read return from another thread: here the next picture or the timeout does."""
 
     def close(self) -> None:
+        """Release the camera."""
         self._camera.release()
 
 
@@ -109,7 +100,7 @@ def _open_stream(source: str) -> Any:
 
 
 class _CommandSource:
-    """Consecutive JPEG pictures from the standard output of a command."""
+    """Consecutive JPEG pictures from the standard output of a command, read like :class:`_OpenCvSource`."""
 
     def __init__(self, command: str) -> None:
         try:
@@ -217,19 +208,19 @@ class CameraStream:
         before, self._last = self._last, image
         return before is not None and np.array_equal(image, before)
 
-    def _open(self) -> _Source:
+    def _open(self) -> _OpenCvSource | _CommandSource:
         if self._name.startswith(EXEC):
             return _CommandSource(self._name.removeprefix(EXEC))
         return _OpenCvSource(self._name)
 
-    def _start(self, source: _Source) -> None:
+    def _start(self, source: _OpenCvSource | _CommandSource) -> None:
         self._source, self._has_started = source, False
         self._thread = threading.Thread(
             target=self._read, args=(source, self._number), name="scenematch-camera", daemon=True
         )
         self._thread.start()
 
-    def _read(self, source: _Source, number: int) -> None:
+    def _read(self, source: _OpenCvSource | _CommandSource, number: int) -> None:
         try:
             while self._number == number and (picture := source.read()) is not None:
                 with self._changed:

@@ -34,7 +34,7 @@ from scenematch.bridges.mavlink_out import (
     heartbeat_message,
     no_position_message,
     notice_message,
-    repeated_receiver_message,
+    receiver_message,
     stamp_on_ground_ns,
     timesync_message,
     withhold_reason,
@@ -204,10 +204,8 @@ class MavlinkBridge:
             self._send(no_position_message(now_ns))
         elif gps_id and gnss is not None and now_ns - gnss.time_ns < _GNSS_STALE_NS:
             stamp_ns = stamp_on_ground_ns(now_ns)
-            unix_ns = self.telemetry.unix_ns(stamp_ns)
-            self._send(
-                repeated_receiver_message(gnss, self.telemetry.vehicle(now_ns), gps_id, (stamp_ns, unix_ns))
-            )
+            times_ns = stamp_ns, self.telemetry.unix_ns(stamp_ns)
+            self._send(receiver_message(gnss, self.telemetry.vehicle(now_ns), gps_id, times_ns))
 
     def _is_trusted(self, answer: Answer, now_s: float) -> bool:
         """Whether a fix continues the track sent to the autopilot or, before the first fix, its GNSS."""
@@ -266,12 +264,12 @@ class MavlinkBridge:
         """Create a navigator; replacing one counts as a reset because the new one acquires the position again."""
         navigator = self._make_navigator(start)
         if self._navigator is not None:
-            self._resets_before += _resets(self._navigator) + 1
+            self._resets_before += self._navigator.reset_count + 1
         self._navigator = navigator
         return navigator
 
     def _compose(self, fix: Fix, captured_ns: int) -> FixReport:
-        resets = self._resets_before + (0 if self._navigator is None else _resets(self._navigator))
+        resets = self._resets_before + (0 if self._navigator is None else self._navigator.reset_count)
         origin, vehicle = self.telemetry.origin, self.telemetry.vehicle(captured_ns)
         if origin is None and self._origin is not None and vehicle.down_m is not None:
             # An autopilot without a position reports a height above sea level of 0.
@@ -386,7 +384,3 @@ class MavlinkBridge:
                 self._counters.dropped += self._decoder.dropped
                 self._decoder.dropped = 0
             self._link, self._peer, self.telemetry.heard_ns = None, None, None
-
-
-def _resets(navigator: Navigator) -> int:
-    return int(getattr(navigator, "reset_count", 0))

@@ -56,31 +56,29 @@ class MavlinkCounters:
         self._withheld: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
         self._least_age_ms: float | None = None
-        self._answered = self._sent = 0
-        self.dropped = self.reconnections = 0
+        self._sent = self.dropped = self.reconnections = 0
 
     def add_sent(self, age_ms: float) -> None:
         """A fix was sent."""
-        self._answered += 1
         self._sent += 1
         self._sent_ns.append(time.monotonic_ns())
         self._least_age_ms = min(age_ms, self._least_age_ms or age_ms)
 
     def add_withheld(self, cause: str) -> None:
         """A fix was not sent."""
-        self._answered += 1
         self._withheld[cause] += 1
 
     def add_refused(self, reason: str) -> None:
         """A frame gave no fix."""
-        self._answered += 1
         self._refused[reason] += 1
 
     def status(self, *, connected: bool, dropped: int) -> MavlinkStatus:
         """The counters so far, including packets that the present link dropped."""
         since_ns = time.monotonic_ns() - round(_RATE_SPAN_S * 1e9)
         rate_hz = sum(sent >= since_ns for sent in list(self._sent_ns)) / _RATE_SPAN_S
+        sent, withheld, refused = self._sent, dict(self._withheld), dict(self._refused)
+        answered = sent + sum(withheld.values()) + sum(refused.values())
         return MavlinkStatus(
-            connected, self._answered, self._sent, dict(self._withheld), dict(self._refused), rate_hz,
+            connected, answered, sent, withheld, refused, rate_hz,
             self._least_age_ms, self.dropped + dropped, self.reconnections,
         )  # fmt: skip

@@ -73,31 +73,22 @@ def _px4_file(options: ParameterOptions) -> str:
 
 
 def _ardupilot(options: ParameterOptions) -> list[Parameter]:
-    lines = [*_EKF3]
-    vision = _gps_input(options) if options.message == "gps_input" else _external_navigation(options)
-    lines += vision
-    if options.takeoff == "gnss":
+    as_receiver, with_receiver = options.message == "gps_input", options.takeoff == "gnss"
+    lines = [*_EKF3, *(_gps_input(options) if as_receiver else _external_navigation(options))]
+    if as_receiver or with_receiver:
         lines += _source_set(1, position=3, velocity=3)
-        if options.message == "gps_input":
-            lines.append(("GPS_AUTO_SWITCH", 4, "the first receiver as long as it has a fix, then the fixes"))
-        else:
-            why = "switch of the transmitter: low set 1, the receiver; middle set 2"
-            lines.append((f"{_RC_SWITCH}_OPTION", 90, why))
-    if options.message != "gps_input":
-        lines += _source_set(2 if options.takeoff == "gnss" else 1, position=6, velocity=0)
-    elif options.takeoff == "none":
-        lines += _source_set(1, position=3, velocity=3)
-    if options.takeoff == "none" and options.message != "gps_input":
+    else:
+        lines += _source_set(1, position=6, velocity=0)
         lines.append(("GPS1_TYPE", 0, "no receiver; GPS_TYPE before 4.6"))
+    if with_receiver and as_receiver:
+        lines.append(("GPS_AUTO_SWITCH", 4, "the first receiver as long as it has a fix, then the fixes"))
+    elif with_receiver:
+        lines.append(("RC7_OPTION", 90, "switch of the transmitter: low set 1, the receiver; middle set 2"))
+        lines += _source_set(2, position=6, velocity=0)
     return [*lines, *_FAILSAFES]
 
 
-_RC_SWITCH = "RC7"
-_EKF3: list[Parameter] = [
-    ("AHRS_EKF_TYPE", 3, "EKF3"),
-    ("EK3_ENABLE", 1, "EKF3"),
-    ("EK2_ENABLE", 0, "EKF3 alone"),
-]
+_EKF3: list[Parameter] = [("AHRS_EKF_TYPE", 3, "EKF3"), ("EK3_ENABLE", 1, "EKF3"), ("EK2_ENABLE", 0, "EKF3 alone")]
 _FAILSAFES: list[Parameter] = [
     ("FS_EKF_ACTION", 1, "LAND 8 s after the last fix; without a position it drifts with the wind"),
     ("FS_EKF_THRESH", 0.8, "variances above it for a second count as a failure, too"),

@@ -25,7 +25,8 @@ from engine.navigation.navigator import Navigator
 from engine.orthomap import OrthoMap
 from engine.values import Fix, Frame, NoFix, Prior
 from scenematch.bridges.ros_in import RESTART_NS, RosTelemetry, RosTopics
-from scenematch.bridges.ros_out import FRAME_ID, RosOptions, diagnostics, is_finite, pose, window_picture
+from scenematch.bridges.ros_out import FRAME_ID, RosOptions, diagnostics, pose, window_picture
+from scenematch.bridges.vehicle import is_finite
 from scenematch.files.ros.messages import ODOMETRY_TYPES, MessageFactory, image_from_message, stamp_ns
 
 _log = logging.getLogger("scenematch")

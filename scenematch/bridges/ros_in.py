@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from dataclasses import dataclass
 from typing import Any
 
 from engine.errors import OptionError
 from engine.geo import enu_from_body, wrap_heading_deg
-from scenematch.bridges.vehicle import ANGLES, RecentValues, VehicleState, scalar
+from scenematch.bridges.vehicle import ANGLES, RecentValues, VehicleState, height_above_ground_m, scalar
 from scenematch.files.ros import bags
 from scenematch.files.ros.messages import (
     ODOMETRY_TYPES,
@@ -129,10 +128,6 @@ class RosTelemetry:
             # 0 means not stated: nothing to interpolate.
             *_, stated_mps = self._odometry.nearest(time_ns) or (0.0,)
             slant_m, height_m = scalar(self._range.at(time_ns)), scalar(self._height.at(time_ns))
-        above_m = height_m
-        if slant_m is not None:  # the beam is fixed to the body, so it tilts with it
-            cos_tilt = math.cos(math.radians(roll_deg or 0.0)) * math.cos(math.radians(pitch_deg or 0.0))
-            above_m = slant_m * cos_tilt
         sigma_mps = None
         if along_body is not None and heading_deg is not None:
             turn = enu_from_body(roll_deg or 0.0, pitch_deg or 0.0, heading_deg)
@@ -145,7 +140,7 @@ class RosTelemetry:
             east_velocity_mps=east_mps,
             north_velocity_mps=north_mps,
             velocity_sigma_mps=sigma_mps,
-            height_agl_m=above_m if above_m is not None and above_m > 0.0 else None,
+            height_agl_m=height_above_ground_m(slant_m, roll_deg, pitch_deg, height_m),
             down_m=None if height_m is None else -height_m,
         )
 
