@@ -210,9 +210,5 @@ def _iso(time: datetime) -> str:
     return f"{time:%Y-%m-%dT%H:%M:%S}.{time.microsecond:06d}Z"
 
 
-WRITERS: dict[str, Callable[[Sequence[PoseRow]], str]] = {
-    "gpx": to_gpx,
-    "geojson": to_geojson,
-    "tum": to_tum,
-}
+WRITERS: dict[str, Callable[[Sequence[PoseRow]], str]] = {"gpx": to_gpx, "geojson": to_geojson, "tum": to_tum}
 """Function that formats a track, by the name of the format."""

@@ -11,12 +11,19 @@ import itertools
 import math
 import re
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Suffixes of image files, in lower or upper case."""
@@ -38,11 +45,9 @@ class FrameSource(ABC):
     def __contains__(self, name: object) -> bool:
         return name in self._known
 
-    @property
+    @cached_property
     def _known(self) -> frozenset[str]:
-        if not hasattr(self, "_names"):
-            self._names = frozenset(self.names)
-        return self._names
+        return frozenset(self.names)
 
     @abstractmethod
     def read(self, name: str) -> NDArray[np.uint8]:
@@ -198,23 +203,37 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     Raises:
         TelemetryError: the file is missing, empty, truncated or not an image.
     """
+    with opened_picture(path, str(path)) as picture:
+        if picture.mode.startswith("I;16"):
+            grey = (np.asarray(picture).astype(np.uint16) >> 8).astype(np.uint8)
+            return np.repeat(grey[:, :, None], 3, axis=2)
+        if picture.mode in ("I", "F"):
+            raise TelemetryError(f"{path}: expected a picture of 8 or 16 bits a channel, got mode {picture.mode}")
+        return np.array(picture.convert("RGB"), dtype=np.uint8)
+
+
+@contextmanager
+def opened_picture(source: str | Path | BinaryIO, name: str, kind: str = "picture") -> Iterator[Image]:
+    """An open picture of Pillow's, whose pixels may be damaged.
+
+    Args:
+        source: the file.
+        name: what it is, for messages.
+        kind: what was expected, for messages.
+
+    Raises:
+        TelemetryError: there is none, or it cannot be opened or, inside the block, decoded.
+    """
     from PIL import Image
 
     try:
-        with Image.open(path) as picture:
-            if picture.mode.startswith("I;16"):
-                grey = (np.asarray(picture).astype(np.uint16) >> 8).astype(np.uint8)
-                return np.repeat(grey[:, :, None], 3, axis=2)
-            if picture.mode in ("I", "F"):
-                raise TelemetryError(
-                    f"{path}: expected a picture of 8 or 16 bits a channel, got mode {picture.mode}"
-                )
-            return np.array(picture.convert("RGB"), dtype=np.uint8)
+        with Image.open(source) as picture:
+            yield picture
     except FileNotFoundError:
-        raise TelemetryError(f"{path}: no such picture") from None
+        raise TelemetryError(f"{name}: no such picture") from None
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise TelemetryError(f"{path}: expected a readable picture: {reason}") from None
+        raise TelemetryError(f"{name}: expected a readable {kind}: {reason}") from None
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

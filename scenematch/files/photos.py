@@ -21,7 +21,7 @@ import numpy as np
 from engine.errors import TelemetryError
 from engine.geo import attitude_from_rotation, enu_from_body, wrap_heading_deg
 from engine.values import Truth
-from scenematch.files.frames import PictureFolder
+from scenematch.files.frames import PictureFolder, opened_picture
 from scenematch.files.telemetry import TelemetryRow, take_off_sigma_m
 
 COMPASS_SIGMA_DEG = 3.0
@@ -77,17 +77,11 @@ def read_photo_tags(path: Path) -> PhotoTags:
     Raises:
         TelemetryError: the picture cannot be opened.
     """
-    from PIL import Image
-
-    try:
-        with Image.open(path) as picture:
-            tags, size_px = picture.getexif(), picture.size
-            gps, exif = tags.get_ifd(_GPS_IFD), tags.get_ifd(_EXIF_IFD)
-            software = str(tags.get(_SOFTWARE, "")).strip("\0 ")
-        with path.open("rb") as file:
-            head = file.read(_XMP_BYTES)
-    except (OSError, SyntaxError, ValueError) as error:
-        raise TelemetryError(f"{path}: expected a readable picture: {str(error).splitlines()[0]}") from None
+    with opened_picture(path, str(path)) as picture, path.open("rb") as file:
+        tags, size_px = picture.getexif(), picture.size
+        gps, exif = tags.get_ifd(_GPS_IFD), tags.get_ifd(_EXIF_IFD)
+        software = str(tags.get(_SOFTWARE, "")).strip("\0 ")
+        head = file.read(_XMP_BYTES)
     xmp = {key.decode(): float(value) for key, value in _XMP_VALUE.findall(head)}
     found = _XMP_DEWARP.search(head)
     numbers = [_finite(part) for part in found.group(1).split(b",")] if found else []

@@ -104,7 +104,7 @@ def take_off_sigma_m(height_m: float) -> float:
 
 
 _TAKE_OFF_M, _TAKE_OFF_SHARE = 5.0, 0.05
-_BOUNDS = {
+BOUNDS = {
     "height_agl_m": POSITIVE,
     "height_sigma_m": POSITIVE_SIGMA,
     "alt_amsl_m": ANY,
@@ -124,7 +124,7 @@ _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(
     ("height_agl_m", "height_sigma_m", "alt_amsl_m", "sigma_m"), 3
 )
 _REQUIRED = ("timestamp_ns", "frame")
-COLUMNS = (*STAMP_COLUMNS, "frame", *_BOUNDS)
+COLUMNS = (*STAMP_COLUMNS, "frame", *BOUNDS)
 """All columns that telemetry.csv may have."""
 _HINT = "; [telemetry_columns] of the settings names those that are ours"
 
@@ -166,7 +166,7 @@ def open_telemetry(
     Raises:
         TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
     """
-    optional = (*STAMP_COLUMNS[1:], *_BOUNDS)
+    optional = (*STAMP_COLUMNS[1:], *BOUNDS)
     csv_rows = list(read_table(path, _REQUIRED, optional, instead=OTHER_STAMPS, names=names, hint=_HINT))
     stamps = read_stamps(csv_rows)
     rows: list[TelemetryRow] = []
@@ -188,7 +188,7 @@ def open_telemetry(
 
 
 def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:
-    values = {name: csv_row.number(name, bounds) for name, bounds in _BOUNDS.items()}
+    values = {name: csv_row.number(name, bounds) for name, bounds in BOUNDS.items()}
     for name, other in (("lat_deg", "lon_deg"), ("lon_deg", "lat_deg")):
         if values[name] is None and values[other] is not None:
             raise csv_row.error(name, f"a value, as {other} has one")
@@ -203,7 +203,7 @@ def write_telemetry(path: str | Path, rows: Sequence[TelemetryRow]) -> None:
     Raises:
         TelemetryError: the file cannot be written.
     """
-    write_known(path, rows, _REQUIRED, _BOUNDS, _DECIMALS)
+    write_known(path, rows, _REQUIRED, BOUNDS, _DECIMALS)
 
 
 def ground_amsl_m(rows: Sequence[TelemetryRow]) -> float | None:
