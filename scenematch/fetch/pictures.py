@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from engine.errors import MapError
 from scenematch.fetch.grid import Grid, reason_of
 from scenematch.fetch.urls import shown
-from scenematch.files.geotiff import tiled_profile
+from scenematch.files.geotiff import replaced, tiled_profile
 
 ATTEMPTS = 5
 """Attempts per picture before the fetch fails."""
@@ -58,24 +57,21 @@ def fetch_pictures(
     import rasterio
     from rasterio.errors import RasterioError
 
-    part = out.with_name(f"{out.name}.part")
     level = {} if grid.overview is None else {"overview_level": grid.overview}
     (x, y), (step_x, step_y), (width, height) = grid.corner, grid.step, grid.size_px
     corner = np.array([[step_x, 0.0, x], [0.0, -step_y, y]])
     profile = tiled_profile((height, width, 3), "uint8", corner, grid.crs)
     try:
         with (
+            replaced(out) as part,
             rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
             rasterio.open(grid.source, **level) as source,
             rasterio.open(part, "w", **profile) as file,
         ):
             yield from _copied(source, file, grid, lambda k: pause_s * (k > cached), url, say)
             file.update_tags(**{name: str(value) for name, value in tags.items()})
-        os.replace(part, out)
     except (RasterioError, OSError) as error:
         raise MapError(f"{out}: cannot be written: {str(error).splitlines()[0]}") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _copied(

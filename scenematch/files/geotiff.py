@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -69,6 +71,17 @@ def write_geotiff(
                 file.update_tags(**{name: str(value) for name, value in tags.items()})
     except (RasterioError, OSError, ValueError) as error:
         raise MapError(f"{path}: cannot be written: {str(error).splitlines()[0]}") from None
+
+
+@contextmanager
+def replaced(out: Path) -> Iterator[Path]:
+    """A file beside ``out`` to write: it takes the place of ``out`` once it is complete, and else is removed."""
+    part = out.with_name(f"{out.name}.part")
+    try:
+        yield part
+        os.replace(part, out)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def tiled_profile(
