@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,6 +28,7 @@ from engine.values import Fix, Frame, NoFix, Prior
 from scenematch.bridges.ros_in import RESTART_NS, RosTelemetry, RosTopics
 from scenematch.bridges.ros_out import FRAME_ID, RosOptions, diagnostics, pose, window_picture
 from scenematch.bridges.vehicle import is_finite
+from scenematch.files.ros.bags import QUANTITIES
 from scenematch.files.ros.messages import ODOMETRY_TYPES, MessageFactory, image_from_message, stamp_ns
 
 _log = logging.getLogger("scenematch")
@@ -155,28 +157,28 @@ class RosBridge:
 
     def handlers(self, topics: RosTopics) -> dict[str, tuple[str, Handler]]:
         """Type and handler of every topic to subscribe to, by name."""
-        telemetry, now_ns = self.telemetry, self._node.now_ns
         self._image_topic = topics.image
         handlers: dict[str, tuple[str, Handler]] = {
             topics.image: (topics.image_type, self.on_image),
-            topics.imu: ("sensor_msgs/msg/Imu", self.on_imu),
-            topics.compass: ("std_msgs/msg/Float64", lambda m: telemetry.compass(m.data, now_ns())),
-            topics.height: ("std_msgs/msg/Float64", lambda m: telemetry.height(m.data, now_ns())),
-            topics.range: ("sensor_msgs/msg/Range", telemetry.range),
-            topics.velocity: ("geometry_msgs/msg/TwistStamped", telemetry.velocity),
+            topics.imu: (QUANTITIES["imu"].types[0], self.on_imu),
             topics.odometry: (ODOMETRY_TYPES[topics.odometry_type], self.on_odometry),
         }
-        return {name: handler for name, handler in handlers.items() if name}
+        for name in ("compass", "height", "range", "velocity"):
+            handlers[getattr(topics, name)] = (QUANTITIES[name].types[0], partial(self._store, name))
+        return {topic: handler for topic, handler in handlers.items() if topic}
+
+    def _store(self, name: str, message: Any) -> None:
+        self.telemetry.add(name, message, self._node.now_ns())
 
     def on_imu(self, message: Any) -> None:
         """Store an attitude, and submit the picture that waited for it."""
-        self.telemetry.imu(message)
+        self._store("imu", message)
         self._held.release(lambda captured_ns: not self.telemetry.waits_for_attitude(captured_ns))
 
     def on_odometry(self, message: Any) -> None:
         """Store the velocity of another odometry; why it cannot be used is reported with every frame."""
         try:
-            self.telemetry.odometry(message, self._node.now_ns())
+            self._store("odometry", message)
         except EngineError as error:
             self._odometry_error = str(error)
             self._say("odometry", f"an odometry cannot be used: {error}")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,32 @@ def is_bag(path: str | Path) -> bool:
     """Whether a path is a bag, by its suffix or, for a folder, by its metadata.yaml."""
     path = Path(path)
     return path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file()
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A quantity of the telemetry.
+
+    Attributes:
+        types: message types that may state it.
+        values: extracts the values; None if a message has none, and for a value that it lacks.
+    """
+
+    types: tuple[str, ...]
+    values: Callable[[Any], tuple[Any, ...] | None]
+
+
+QUANTITIES = {
+    "imu": Quantity(("sensor_msgs/msg/Imu",), attitude_from_message),
+    "compass": Quantity(_FLOAT, lambda message: (message.data,)),
+    "range": Quantity(("sensor_msgs/msg/Range",), lambda message: (range_from_message(message),)),
+    "height": Quantity(_FLOAT, lambda message: (message.data,)),
+    "altitude": Quantity(_FLOAT, lambda message: (message.data,)),
+    "velocity": Quantity(("geometry_msgs/msg/TwistStamped",), lambda m: (m.twist.linear.x, m.twist.linear.y)),
+    "place": Quantity(("sensor_msgs/msg/NavSatFix",), position_from_message),
+    "odometry": Quantity(tuple(ODOMETRY_TYPES.values()), body_velocity_from_message),
+}
+"""The quantities of a bag's and of a live vehicle's telemetry, by name."""
 
 
 class BagFrames(FrameSource):
@@ -189,17 +216,17 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
         TelemetryError: the bag cannot be read, or has no usable series, or no usable velocity on that topic.
     """
     with _opened(path) as reader:
-        has_truth = truth and _topic(reader, _TAKEN["place"][0], (TRUTH,)) is not None
+        has_truth = truth and _topic(reader, QUANTITIES["place"].types, (TRUTH,)) is not None
         suffixes = _TRUTH_SUFFIXES if has_truth else _SUFFIXES
-        found = {name: _topic(reader, _TAKEN[name][0], options) for name, options in suffixes.items()}
+        found = {name: _topic(reader, QUANTITIES[name].types, options) for name, options in suffixes.items()}
         if odometry_topic is not None:
             found["odometry"] = _odometry_topic(path, reader, odometry_topic)
         names = {topic: name for name, topic in found.items() if topic is not None}
         known: dict[str, list[Sample]] = {name: [] for name in names.values()}
-        kinds = {kind for name in known for kind in _TAKEN[name][0]}
+        kinds = {kind for name in known for kind in QUANTITIES[name].types}
         for topic, time_ns, message in _messages(path, reader, set(names), kinds) if names else ():
             try:
-                numbers = _TAKEN[names[topic]][1](message)
+                numbers = QUANTITIES[names[topic]].values(message)
             except TelemetryError as error:
                 raise TelemetryError(f"{path}: {topic}: {error}") from None
             if numbers is not None:
@@ -224,17 +251,6 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
     return make_log(path, series, heights)
 
 
-_TAKEN: dict[str, tuple[tuple[str, ...], Callable[[Any], tuple[float | None, ...] | None]]] = {
-    "imu": (("sensor_msgs/msg/Imu",), attitude_from_message),
-    "compass": (_FLOAT, lambda message: (message.data,)),
-    "range": (("sensor_msgs/msg/Range",), lambda message: (range_from_message(message),)),
-    "height": (_FLOAT, lambda message: (message.data,)),
-    "altitude": (_FLOAT, lambda message: (message.data,)),
-    "velocity": (("geometry_msgs/msg/TwistStamped",), lambda m: (m.twist.linear.x, m.twist.linear.y)),
-    "place": (("sensor_msgs/msg/NavSatFix",), position_from_message),
-    "odometry": (tuple(ODOMETRY_TYPES.values()), body_velocity_from_message),
-}
-"""Message types of each quantity, and the function that extracts its values; None if a message has none."""
 _SUFFIXES = {
     "imu": ("/imu/data", ""),
     "compass": ("/compass_hdg",),
@@ -252,7 +268,7 @@ _TRUTH_SUFFIXES = {
 
 
 def _odometry_topic(path: Path, reader: Any, topic: str) -> str:
-    kinds = _TAKEN["odometry"][0]
+    kinds = QUANTITIES["odometry"].types
     names = _topic_names(reader, kinds)
     if topic not in names:
         raise TelemetryError(f"{path}: expected {' or '.join(kinds)} on {topic}, got {', '.join(names) or 'none'}")
@@ -305,8 +321,9 @@ def _columns(known: dict[str, list[Sample]]) -> Callable[[str, int], tuple[Stamp
     return column
 
 
-def _stamp_ns(message: Any, recorded_ns: int) -> int:
-    return (stamp_ns(message) if hasattr(message, "header") else 0) or recorded_ns
+def stamp_or(message: Any, otherwise_ns: int) -> int:
+    """The stamp of a message's header, or another time if there is none or it is not set."""
+    return (stamp_ns(message) if hasattr(message, "header") else 0) or otherwise_ns
 
 
 def _image_topic(path: Path, reader: Any, topic: str | None) -> str:
@@ -341,7 +358,7 @@ def _messages(
     with _readable(path):
         for connection, recorded_ns, data in reader.messages(wanted):
             message = reader.deserialize(data, connection.msgtype)
-            yield str(connection.topic), _stamp_ns(message, recorded_ns), message
+            yield str(connection.topic), stamp_or(message, recorded_ns), message
 
 
 @contextmanager
