@@ -254,13 +254,6 @@ class MessageFactory:
         count = {"seq": 0} if self.ros1 else {}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id, **count)
 
-    def float64(self, value: float) -> Any:
-        """A std_msgs/Float64."""
-        return self.make("std_msgs/msg/Float64", data=float(value))
-
-    def vector(self, x: float, y: float, z: float) -> Any:
-        """A geometry_msgs/Vector3."""
-        return self.make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
 
     def quaternion(self, roll_deg: float, pitch_deg: float, heading_deg: float) -> Any:
         """A geometry_msgs/Quaternion of an attitude."""
