@@ -220,12 +220,10 @@ class MavlinkTelemetry:
             own_velocity: whether to use the autopilot's velocity if no other camera's odometry states one.
         """
         with self._lock:
-            attitude = self._attitude.at(time_ns)
-            told = self._velocity.at(time_ns) if self._has_velocity and own_velocity else None
-            velocity = told or (None, None, None)
-            roll, pitch, heading = attitude or (None, None, None)
+            roll, pitch, heading = self._attitude.at(time_ns) or (None, None, None)
+            own = self._velocity.at(time_ns) if self._has_velocity and own_velocity else None
             # From another camera's odometry, if there is one: it does not depend on the fixes.
-            east, north, up, _ = self._vision.at(time_ns) or (*velocity, 0.0)
+            east, north, up, *_ = self._vision.at(time_ns) or own or (None, None, None)
             *_, sigma = self._vision.nearest(time_ns) or (0.0,)  # 0 means not stated: nothing to interpolate
             slant_m, *others_m = (scalar(s.at(time_ns)) for s in (self._range, self._clearance, self._relative))
             return VehicleState(

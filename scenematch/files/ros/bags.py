@@ -233,21 +233,23 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
                 known[names[topic]].append((time_ns, numbers))
     if _is_same_mavros(found.get("imu"), found.get("compass")):
         known.pop("compass", None)
-    column = _columns(known)
-    (position_ns, lat_deg), (_, lon_deg) = column("place", 0), column("place", 1)
+
+    def series_of(name: str, index: int = 0) -> TimeSeries | None:
+        return make_series(*_column(known, name, index))
+
     series: dict[str, TimeSeries | None] = {
-        "roll_deg": make_series(*column("imu", 0)),
-        "pitch_deg": make_series(*column("imu", 1)),
-        "heading_deg": make_series(*(column("compass", 0) if "compass" in known else column("imu", 2))),
-        "alt_amsl_m": make_series(*column("altitude", 0)),
-        "east_velocity_mps": make_series(*column("velocity", 0)),
-        "north_velocity_mps": make_series(*column("velocity", 1)),
-        "sigma_m": make_series(*column("place", 2)),
-        **make_position_series(position_ns, lat_deg, lon_deg),
+        "roll_deg": series_of("imu", 0),
+        "pitch_deg": series_of("imu", 1),
+        "heading_deg": series_of("compass") if "compass" in known else series_of("imu", 2),
+        "alt_amsl_m": series_of("altitude"),
+        "east_velocity_mps": series_of("velocity", 0),
+        "north_velocity_mps": series_of("velocity", 1),
+        "sigma_m": series_of("place", 2),
+        **make_position_series(*_column(known, "place", 0), _column(known, "place", 1)[1]),
     }
     if odometry_topic is not None:
         series |= _odometry_series(path, odometry_topic, known["odometry"], series)
-    heights = {"rangefinder": make_series(*column("range", 0)), "take-off": make_series(*column("height", 0))}
+    heights = {"rangefinder": series_of("range"), "take-off": series_of("height")}
     return make_log(path, series, heights)
 
 
@@ -304,21 +306,16 @@ def _odometry_series(
 
 def _is_same_mavros(imu: str | None, compass: str | None) -> bool:
     """Whether both topics are from one MAVROS; its Imu has the same heading, with the time of measurement."""
-    ends = "/imu/data", "/global_position/compass_hdg"
-    if imu is None or compass is None or not (imu.endswith(ends[0]) and compass.endswith(ends[1])):
+    if imu is None or not imu.endswith("/imu/data"):
         return False
-    return imu.removesuffix(ends[0]) == compass.removesuffix(ends[1])
+    return compass == imu.removesuffix("/imu/data") + "/global_position/compass_hdg"
 
 
-def _columns(known: dict[str, list[Sample]]) -> Callable[[str, int], tuple[Stamps, Floats]]:
-    """A function that returns stamps (N,) in nanoseconds and values (N,) of one quantity; NaN where unknown."""
-
-    def column(name: str, index: int) -> tuple[Stamps, Floats]:
-        samples = known.get(name, [])
-        values = [numbers[index] for _, numbers in samples]
-        return np.array([time for time, _ in samples], np.int64), np.array(values, np.float64)
-
-    return column
+def _column(known: Mapping[str, list[Sample]], name: str, index: int = 0) -> tuple[Stamps, Floats]:
+    """Stamps (N,) in nanoseconds and values (N,) of one quantity; NaN where unknown."""
+    samples = known.get(name, [])
+    values = [numbers[index] for _, numbers in samples]
+    return np.array([time_ns for time_ns, _ in samples], np.int64), np.array(values, np.float64)
 
 
 def stamp_or(message: Any, otherwise_ns: int) -> int:

@@ -247,13 +247,13 @@ class MessageFactory:
 
     def header(self, time_ns: int, frame_id: str) -> Any:
         """A std_msgs/Header with a time in nanoseconds and a frame."""
-        time = self.time or (
-            lambda sec, nanosec: self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        )
-        stamp = time(*divmod(time_ns, 1_000_000_000))
+        sec, nanosec = divmod(time_ns, 1_000_000_000)
+        if self.time is not None:
+            stamp = self.time(sec, nanosec)
+        else:
+            stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
         count = {"seq": 0} if self.ros1 else {}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id, **count)
-
 
     def quaternion(self, roll_deg: float, pitch_deg: float, heading_deg: float) -> Any:
         """A geometry_msgs/Quaternion of an attitude."""
