@@ -167,8 +167,10 @@ class CameraStream:
             with self._changed:
                 self._changed.wait_for(lambda: self._newest is not None, left_s)
                 newest, self._newest = self._newest, None
-            if newest is not None and not self._is_repeated(newest[0]):
-                return newest
+            if newest is not None:
+                before, self._last = self._last, newest[0]
+                if before is None or not np.array_equal(newest[0], before):
+                    return newest
         return None
 
     def close(self) -> None:
@@ -203,10 +205,6 @@ class CameraStream:
             return "the stream ended"
         limit_s = _START_S if self._name.startswith(EXEC) and not self._has_started else _STALL_S
         return f"no picture for {limit_s:g} s" if time.monotonic() - self._arrived_s > limit_s else None
-
-    def _is_repeated(self, image: Image) -> bool:
-        before, self._last = self._last, image
-        return before is not None and np.array_equal(image, before)
 
     def _open(self) -> _OpenCvSource | _CommandSource:
         if self._name.startswith(EXEC):

@@ -189,7 +189,7 @@ class MavlinkBridge:
             cause = self._send_fix(answer.result, answer.frame.timestamp_ns or 0, trusted=trusted)
         else:
             cause = answer.result.reason.value
-            self._counters.add_refused(cause)
+            self._counters.refused[cause] += 1
         if cause is None:
             self._tell(self._notices.sent(now_s))
             return
@@ -241,7 +241,7 @@ class MavlinkBridge:
         if cause is None and not self._send(fix_message(report, self._options)):
             cause = "link down"
         if cause is not None:
-            self._counters.add_withheld(cause)
+            self._counters.withheld[cause] += 1
             return cause
         self._guard.has_fix = True
         self._counters.add_sent(report.age_ms)

@@ -49,12 +49,19 @@ class MavlinkStatus:
 
 
 class MavlinkCounters:
-    """The running counters."""
+    """The running counters; those that are not fixes are counted by their users.
+
+    Attributes:
+        withheld: fixes that were not sent, by cause.
+        refused: frames that gave no fix, by reason.
+        dropped: packets that earlier links dropped.
+        reconnections: times that the vehicle was heard again.
+    """
 
     def __init__(self) -> None:
         self._sent_ns: deque[int] = deque(maxlen=256)
-        self._withheld: Counter[str] = Counter()
-        self._refused: Counter[str] = Counter()
+        self.withheld: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
         self._least_age_ms: float | None = None
         self._sent = self.dropped = self.reconnections = 0
 
@@ -64,19 +71,11 @@ class MavlinkCounters:
         self._sent_ns.append(time.monotonic_ns())
         self._least_age_ms = min(age_ms, self._least_age_ms or age_ms)
 
-    def add_withheld(self, cause: str) -> None:
-        """A fix was not sent."""
-        self._withheld[cause] += 1
-
-    def add_refused(self, reason: str) -> None:
-        """A frame gave no fix."""
-        self._refused[reason] += 1
-
     def status(self, *, connected: bool, dropped: int) -> MavlinkStatus:
         """The counters so far, including packets that the present link dropped."""
         since_ns = time.monotonic_ns() - round(_RATE_SPAN_S * 1e9)
         rate_hz = sum(sent >= since_ns for sent in list(self._sent_ns)) / _RATE_SPAN_S
-        sent, withheld, refused = self._sent, dict(self._withheld), dict(self._refused)
+        sent, withheld, refused = self._sent, dict(self.withheld), dict(self.refused)
         answered = sent + sum(withheld.values()) + sum(refused.values())
         return MavlinkStatus(
             connected, answered, sent, withheld, refused, rate_hz,
