@@ -220,6 +220,7 @@ class MavlinkTelemetry:
             own_velocity: whether to use the autopilot's velocity if no other camera's odometry states one.
         """
         with self._lock:
+            held = self._holder.at(time_ns)
             roll, pitch, heading = self._attitude.at(time_ns) or (None, None, None)
             own = self._velocity.at(time_ns) if self._has_velocity and own_velocity else None
             # From another camera's odometry, if there is one: it does not depend on the fixes.
@@ -237,12 +238,8 @@ class MavlinkTelemetry:
                 height_agl_m=height_above_ground_m(slant_m, roll, pitch, *others_m),
                 alt_amsl_m=scalar(self._alt_amsl.at(time_ns)),
                 down_m=self._down_m(time_ns),
-                holder=self._holder_at(time_ns),
+                holder=None if held is None else Attitude(held[0], held[1], wrap_heading_deg(held[2])),
             )
-
-    def _holder_at(self, time_ns: int) -> Attitude | None:
-        held = self._holder.at(time_ns)
-        return None if held is None else Attitude(held[0], held[1], wrap_heading_deg(held[2]))
 
     def _down_m(self, time_ns: int) -> float | None:
         """Distance below the origin; without a position ArduPilot states only the height above home.

@@ -59,11 +59,13 @@ class CsvRow:
         path: the file.
         line: line number in the file, from 1.
         values: stripped text by column; blank where the file lacks the column.
+        header: all columns of the file.
     """
 
     path: Path
     line: int
     values: Mapping[str, str]
+    header: Sequence[str]
 
     def error(self, column: str, expected: str) -> TelemetryError:
         """Create the error of one cell."""
@@ -179,7 +181,7 @@ def read_table(
             for row in reader:
                 if any(cell.strip() for cell in row):
                     _check_length(path, reader.line_num, row, len(header))
-                    yield CsvRow(path, reader.line_num, _cells(reader.line_num, row, places, marks))
+                    yield CsvRow(path, reader.line_num, _cells(reader.line_num, row, places, marks), header)
     except FileNotFoundError:
         raise TelemetryError(f"{path}: no such file") from None
     except UnicodeDecodeError as error:
@@ -190,12 +192,6 @@ def read_table(
         raise TelemetryError(f"{path}: line {reader.line_num}: expected comma-separated text: {error}") from None
     except OSError as error:
         raise TelemetryError(f"{path}: cannot be read: {error.strerror or error}") from None
-
-
-def read_header(path: str | Path) -> list[str]:
-    """The columns of a table that :func:`read_table` has read."""
-    with Path(path).open(encoding="utf-8-sig", newline="") as file:
-        return _names(csv.reader(file, delimiter=_delimiter(file)))
 
 
 def _delimiter(file: TextIO) -> str:

@@ -26,7 +26,6 @@ from scenematch.files.tables import (
     QUARTER_TURN,
     SIGMA,
     CsvRow,
-    read_header,
     read_table,
     write_known,
 )
@@ -182,7 +181,7 @@ def open_telemetry(
     if not rows:
         raise TelemetryError(f"{path}: expected one row per frame, got a header and no rows")
     read = {names.get(ours, ours) for ours in COLUMNS}
-    unread = ", ".join(name for name in read_header(path) if name and name not in read)
+    unread = ", ".join(name for name in csv_rows[0].header if name and name not in read)
     remarks = [stamps.remark, unread and f"{Path(path).name}: columns that are not read: {unread}{_HINT}"]
     return Telemetry(rows, [remark for remark in remarks if remark])
 
