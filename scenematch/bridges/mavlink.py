@@ -178,11 +178,6 @@ class MavlinkBridge:
 
     def deliver(self, answer: Answer) -> None:
         """Send an answer's fix unless it must be withheld, and pass the answer on to ``watch``."""
-        self._count_and_send(answer)
-        if self._watch is not None:
-            self._watch(answer)
-
-    def _count_and_send(self, answer: Answer) -> None:
         now_s = time.monotonic()
         trusted = self._is_trusted(answer, now_s)
         if isinstance(answer.result, Fix):
@@ -192,10 +187,12 @@ class MavlinkBridge:
             self._counters.refused[cause] += 1
         if cause is None:
             self._tell(self._notices.sent(now_s))
-            return
-        self._notices.not_sent(cause)
-        if self._options.firmware == "ardupilot" and not self.telemetry.armed:
-            self._keep_ready_to_arm()
+        else:
+            self._notices.not_sent(cause)
+            if self._options.firmware == "ardupilot" and not self.telemetry.armed:
+                self._keep_ready_to_arm()
+        if self._watch is not None:
+            self._watch(answer)
 
     def _keep_ready_to_arm(self) -> None:
         """Send what ArduPilot requires before arming: a live camera, or a fix from every receiver."""
