@@ -29,7 +29,7 @@ from scenematch.bridges.vehicle import (
     height_above_ground_m,
     scalar,
 )
-from scenematch.bridges.vision_in import has_failed, vision_velocity
+from scenematch.bridges.vision_in import has_failed, is_by_camera, vision_velocity
 
 MAV_AUTOPILOTS = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
 """MAV_AUTOPILOT of each firmware, as its heartbeat states it."""
@@ -265,11 +265,8 @@ class MavlinkTelemetry:
         elif kind == "RANGEFINDER":  # has no stamp
             self._add_range(arrival_ns, message.distance)
         elif kind in ("VISION_SPEED_ESTIMATE", "ODOMETRY"):  # stamped by a clock that no other message uses
-            if has_failed(message, self._bridge_component):
-                self._vision.clear()
-            seen = vision_velocity(message, self._attitude.at(arrival_ns), self._bridge_component)
-            if seen is not None:
-                self._vision.add(arrival_ns, *seen)
+            if is_by_camera(message, self._bridge_component):
+                self._add_vision(message, arrival_ns)
         elif kind in ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"):
             # If it knows no velocity, it still reports one, of zero.
             self._has_velocity = bool(message.flags & _VELOCITY_KNOWN) and not message.flags & _CONSTANT_POSITION
@@ -333,6 +330,12 @@ class MavlinkTelemetry:
         if rotation is not None:
             held = body_behind(rotation, self._gimbal_mount)
             self._holder.add(time_ns, held.roll_deg, held.pitch_deg, held.heading_deg)
+
+    def _add_vision(self, message: Any, arrival_ns: int) -> None:
+        if has_failed(message):
+            self._vision.clear()
+        elif (seen := vision_velocity(message, self._attitude.at(arrival_ns))) is not None:
+            self._vision.add(arrival_ns, *seen)
 
     def _add_range(self, time_ns: int, range_m: float) -> None:
         if range_m > 0.0:
