@@ -17,9 +17,6 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from engine.errors import EngineError, StateError
 from engine.navigation.live import Answer, Counts, Live, LiveOptions
 from engine.navigation.navigator import Navigator
@@ -205,24 +202,16 @@ class RosBridge:
         self._last_ns = captured_ns
 
         def submit() -> None:
-            self._submit(image, captured_ns, now_ns)
+            frame = self.telemetry.vehicle(captured_ns).frame(image, captured_ns)
+            with contextlib.suppress(StateError):  # closed in the meantime
+                # A stamp in the future counts as now.
+                self._live.submit(frame, captured_ns=min(captured_ns, now_ns))
 
         if self.telemetry.waits_for_attitude(captured_ns):
             self._held.hold(captured_ns, submit)
         else:
             self._held.drop()  # an older picture, overtaken by this one
             submit()
-
-    def _submit(self, image: NDArray[np.uint8], captured_ns: int, arrived_ns: int) -> None:
-        try:
-            frame = self.telemetry.vehicle(captured_ns).frame(image, captured_ns)
-        except EngineError as error:
-            self._unusable += 1
-            self._diagnose(captured_ns, _ERROR, str(error), {})
-            return
-        with contextlib.suppress(StateError):  # closed in the meantime
-            # A stamp in the future counts as now.
-            self._live.submit(frame, captured_ns=min(captured_ns, arrived_ns))
 
     def _start_live(self) -> Live:
         make, options = self._make_navigator, self._live_options

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.errors import CalibrationError, EngineError, TelemetryError, require
+from engine.errors import CalibrationError, TelemetryError, require
 from engine.geo import enu_from_body
 from scenematch.files.frames import FrameSource
 from scenematch.files.resampling import (
@@ -379,8 +379,6 @@ def _readable(path: Path) -> Iterator[None]:
     """Convert whatever rosbags raises on a corrupt bag to a TelemetryError of one line."""
     try:
         yield
-    except EngineError:
-        raise
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise TelemetryError(f"{path}: expected a bag that can be read: {reason}") from None
