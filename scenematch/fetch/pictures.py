@@ -142,8 +142,7 @@ def remove_pictures(folder: Path, *, all_of_them: bool) -> None:
     """Remove the cached files if requested, and empty folders."""
     for file in kept_pictures(folder) if all_of_them else ():
         file.unlink()
-    for inner in sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True):
-        if not any(inner.iterdir()):
-            inner.rmdir()
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+    inner_first = sorted(folder.rglob("*"), reverse=True)
+    for path in (*inner_first, folder):
+        if path.is_dir() and not any(path.iterdir()):
+            path.rmdir()

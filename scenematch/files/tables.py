@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from engine.errors import TelemetryError
+from engine.geo import wrap_heading_deg
 from engine.values import MAX_SIGMA_M
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
@@ -96,7 +97,7 @@ class CsvRow:
         return value
 
     def number(self, column: str, bounds: Bounds = ANY) -> float | None:
-        """A finite number within ``bounds``, or None if blank."""
+        """A finite number within ``bounds``, or None if blank; a heading is normalised to [0, 360)."""
         text = self.values[column]
         if not text:
             return None
@@ -104,7 +105,7 @@ class CsvRow:
         value = float(text) if _NUMBER.fullmatch(text) else math.nan
         if not (math.isfinite(value) and bounds.low <= value <= bounds.high):
             raise self.error(column, bounds.text)
-        return value
+        return wrap_heading_deg(value) if bounds is HEADING else value
 
     def required(self, column: str, bounds: Bounds = ANY) -> float:
         """A finite number within ``bounds`` that must not be blank."""

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import TelemetryError
-from engine.geo import wrap_heading_deg
 from engine.values import Prior
 from scenematch.files.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
 from scenematch.files.tables import (
@@ -191,8 +190,7 @@ def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:
     for name, other in (("lat_deg", "lon_deg"), ("lon_deg", "lat_deg")):
         if values[name] is None and values[other] is not None:
             raise csv_row.error(name, f"a value, as {other} has one")
-    if values["heading_deg"] is not None:
-        values["heading_deg"] = wrap_heading_deg(values["heading_deg"])
+
     return TelemetryRow(timestamp_ns=stamp_ns, frame=csv_row.text("frame"), **values)
 
 

@@ -35,8 +35,6 @@ def read_truth(path: str | Path) -> list[Truth]:
     csv_rows = list(read_table(path, _REQUIRED, (*STAMP_COLUMNS[1:], *_OPTIONAL), instead=OTHER_STAMPS))
     for csv_row, stamp_ns in zip(csv_rows, read_stamps(csv_rows).ns, strict=True):
         values = {name: csv_row.number(name, bounds) for name, bounds in _OPTIONAL.items()}
-        if values["heading_deg"] is not None:
-            values["heading_deg"] = wrap_heading_deg(values["heading_deg"])
         lat_deg, lon_deg = (csv_row.required(name, BOUNDS[name]) for name in ("lat_deg", "lon_deg"))
         rows.append(Truth(timestamp_ns=stamp_ns, lat_deg=lat_deg, lon_deg=lon_deg, **values))
     if not rows:
