@@ -190,7 +190,6 @@ def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:
     for name, other in (("lat_deg", "lon_deg"), ("lon_deg", "lat_deg")):
         if values[name] is None and values[other] is not None:
             raise csv_row.error(name, f"a value, as {other} has one")
-
     return TelemetryRow(timestamp_ns=stamp_ns, frame=csv_row.text("frame"), **values)
 
 
