@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import CalibrationError, TelemetryError, require
 from engine.geo import enu_from_body
-from scenematch.files.frames import FrameSource
+from scenematch.files.frames import ForwardFrames
 from scenematch.files.resampling import (
     FlightLog,
     Floats,
@@ -91,8 +91,8 @@ QUANTITIES = {
 """The quantities of a bag's and of a live vehicle's telemetry, by name."""
 
 
-class BagFrames(FrameSource):
-    """The images of one topic of a bag, read forward; going back restarts at the first.
+class BagFrames(ForwardFrames):
+    """The images of one topic of a bag.
 
     Of pictures with the same timestamp the first counts; names are indices among all pictures of the topic.
 
@@ -114,7 +114,7 @@ class BagFrames(FrameSource):
         # Simulators publish a picture again if there is no new one yet.
         fresh = [k for k in range(len(stamps_ns)) if k == 0 or stamps_ns[k] != stamps_ns[k - 1]]
         self.names, self._stamps_ns = [str(index) for index in fresh], [stamps_ns[index] for index in fresh]
-        self._reset()
+        self._restart()
 
     @property
     def description(self) -> str:
@@ -135,31 +135,19 @@ class BagFrames(FrameSource):
                 )
         return list(self._stamps_ns)
 
-    def _reset(self) -> None:
+    def _restart(self) -> None:
         self._stream, self._next = _image_messages(self.path, self.topic), 0
-        self._last: tuple[int, NDArray[np.uint8]] | None = None
 
-    def read(self, name: str) -> NDArray[np.uint8]:
-        """Read one frame as (H, W, 3) RGB uint8; fast for ascending indices."""
-        self.check_name(name)
-        index = int(name)
-        if self._last is None or self._last[0] != index:
-            if index < self._next:
-                self._reset()
-            skipped = index - self._next
-            self._next = index + 1
-            message = next(itertools.islice(self._stream, skipped, None), None)
-            if message is None:
-                raise TelemetryError(
-                    f"{self.path}: {self.topic}: frame {index} has vanished since the bag was opened"
-                )
-            try:
-                image = image_from_message(message)
-            except TelemetryError as error:
-                raise TelemetryError(f"{self.path}: {self.topic}: frame {index}: {error}") from None
-            rgb = np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image
-            self._last = (index, rgb)
-        return self._last[1].copy()
+    def _decode(self, index: int) -> NDArray[np.uint8]:
+        skipped, self._next = index - self._next, index + 1
+        message = next(itertools.islice(self._stream, skipped, None), None)
+        if message is None:
+            raise TelemetryError(f"{self.path}: {self.topic}: frame {index} has vanished since the bag was opened")
+        try:
+            image = image_from_message(message)
+        except TelemetryError as error:
+            raise TelemetryError(f"{self.path}: {self.topic}: frame {index}: {error}") from None
+        return np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image
 
 
 def _image_messages(path: Path, topic: str) -> Iterator[Any]:
