@@ -22,6 +22,14 @@ BAG_KINDS = ("ros1", "ros2-sqlite3", "ros2-mcap")
 class BagMessages(MessageFactory):
     """Messages besides those that a bridge publishes."""
 
+    def float64(self, value: float) -> Any:
+        """A std_msgs/Float64."""
+        return self.make("std_msgs/msg/Float64", data=float(value))
+
+    def vector(self, x: float, y: float, z: float) -> Any:
+        """A geometry_msgs/Vector3."""
+        return self.make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
+
     def camera_info(self, time_ns: int, frame_id: str, camera: Camera) -> Any:
         """A sensor_msgs/CameraInfo; it has no field for the mount."""
         K = camera.matrix

@@ -14,7 +14,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Generator
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -51,20 +51,9 @@ _GSTREAMER_HINT = "; read a GStreamer pipeline by 'exec:gst-launch-1.0 -q ... ! 
 _log = logging.getLogger("scenematch")
 
 
-class _Source(Protocol):
-    """An open camera. ``read`` blocks until a picture arrives, and returns None after the last."""
-
-    def read(self) -> tuple[Image, int] | None:
-        """The next picture (H, W, 3) RGB and its time of arrival on ``time.monotonic_ns``."""
-
-    def interrupt(self) -> None:
-        """Make a blocked read return, if possible from another thread."""
-
-    def close(self) -> None:
-        """Release the camera."""
-
-
 class _OpenCvSource:
+    """An open camera or stream."""
+
     def __init__(self, source: str) -> None:
         try:
             if source.isdecimal():
@@ -84,6 +73,7 @@ class _OpenCvSource:
         self._camera.set(cv2.CAP_PROP_BUFFERSIZE, 1)
 
     def read(self) -> tuple[Image, int] | None:
+        """The next picture (H, W, 3) RGB and when it arrived on ``time.monotonic_ns``; blocks; None at the end."""
         if not self._camera.grab():
             return None
         arrived_ns = time.monotonic_ns()
@@ -91,9 +81,10 @@ class _OpenCvSource:
         return (_rgb(image), arrived_ns) if good and image is not None else None
 
     def interrupt(self) -> None:
-        return  # the next picture or the timeout ends the read
+        """Make a blocked read return from another thread: here the next picture or the timeout does."""
 
     def close(self) -> None:
+        """Release the camera."""
         self._camera.release()
 
 
@@ -109,7 +100,7 @@ def _open_stream(source: str) -> Any:
 
 
 class _CommandSource:
-    """Consecutive JPEG pictures from the standard output of a command."""
+    """Consecutive JPEG pictures from the standard output of a command, read like :class:`_OpenCvSource`."""
 
     def __init__(self, command: str) -> None:
         try:
@@ -176,8 +167,10 @@ class CameraStream:
             with self._changed:
                 self._changed.wait_for(lambda: self._newest is not None, left_s)
                 newest, self._newest = self._newest, None
-            if newest is not None and not self._is_repeated(newest[0]):
-                return newest
+            if newest is not None:
+                before, self._last = self._last, newest[0]
+                if before is None or not np.array_equal(newest[0], before):
+                    return newest
         return None
 
     def close(self) -> None:
@@ -213,23 +206,19 @@ class CameraStream:
         limit_s = _START_S if self._name.startswith(EXEC) and not self._has_started else _STALL_S
         return f"no picture for {limit_s:g} s" if time.monotonic() - self._arrived_s > limit_s else None
 
-    def _is_repeated(self, image: Image) -> bool:
-        before, self._last = self._last, image
-        return before is not None and np.array_equal(image, before)
-
-    def _open(self) -> _Source:
+    def _open(self) -> _OpenCvSource | _CommandSource:
         if self._name.startswith(EXEC):
             return _CommandSource(self._name.removeprefix(EXEC))
         return _OpenCvSource(self._name)
 
-    def _start(self, source: _Source) -> None:
+    def _start(self, source: _OpenCvSource | _CommandSource) -> None:
         self._source, self._has_started = source, False
         self._thread = threading.Thread(
             target=self._read, args=(source, self._number), name="scenematch-camera", daemon=True
         )
         self._thread.start()
 
-    def _read(self, source: _Source, number: int) -> None:
+    def _read(self, source: _OpenCvSource | _CommandSource, number: int) -> None:
         try:
             while self._number == number and (picture := source.read()) is not None:
                 with self._changed:

@@ -59,15 +59,10 @@ class VelocityFromFixes:
         span_s = sample.time_s - samples[0].time_s
         if span_s < _MIN_SPAN_S:
             return None
-        own_mps = _own_velocities(list(samples))
+        known_mps = [known.velocity_mps for known in samples]
+        own_mps = None if None in known_mps else np.array(known_mps)  # (N, 2)
         changed_mps = 0.5 * span_s * (_ACCELERATION_MPS2 if own_mps is None else _DRIFT_MPS2)
         return _velocity(list(samples), own_mps, changed_mps)
-
-
-def _own_velocities(samples: list[_Sample]) -> np.ndarray | None:
-    """(N, 2) velocities reported by the vehicle, or None if one is missing."""
-    known = [sample.velocity_mps for sample in samples]
-    return None if None in known else np.array(known)
 
 
 def _velocity(samples: list[_Sample], own_mps: np.ndarray | None, changed_mps: float) -> GroundVelocity:

@@ -6,7 +6,6 @@ import contextlib
 import ipaddress
 import select
 import socket
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -62,14 +61,12 @@ class Connection:
             OSError: the link cannot be opened now.
             MissingExtraError: a serial port is requested and pyserial is not installed.
         """
-        factories: dict[str, Callable[[str, int], Link]] = {
-            "udpin": lambda host, port: _Udp(host, port, listens=True),
-            "udpout": lambda host, port: _Udp(host, port, listens=False),
-            "tcp": _Tcp,
-            "serial": _Serial,
-        }
         try:
-            return factories[self.kind](self.host, self.number)
+            if self.kind == "tcp":
+                return _Tcp(self.host, self.number)
+            if self.kind == "serial":
+                return _Serial(self.host, self.number)
+            return _Udp(self.host, self.number, listens=self.kind == "udpin")
         except UnicodeError:  # host names are encoded before the lookup
             raise OSError(f"{self.host!r} is not a valid host name") from None
 

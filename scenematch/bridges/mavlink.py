@@ -34,7 +34,7 @@ from scenematch.bridges.mavlink_out import (
     heartbeat_message,
     no_position_message,
     notice_message,
-    repeated_receiver_message,
+    receiver_message,
     stamp_on_ground_ns,
     timesync_message,
     withhold_reason,
@@ -178,24 +178,21 @@ class MavlinkBridge:
 
     def deliver(self, answer: Answer) -> None:
         """Send an answer's fix unless it must be withheld, and pass the answer on to ``watch``."""
-        self._count_and_send(answer)
-        if self._watch is not None:
-            self._watch(answer)
-
-    def _count_and_send(self, answer: Answer) -> None:
         now_s = time.monotonic()
         trusted = self._is_trusted(answer, now_s)
         if isinstance(answer.result, Fix):
             cause = self._send_fix(answer.result, answer.frame.timestamp_ns or 0, trusted=trusted)
         else:
             cause = answer.result.reason.value
-            self._counters.add_refused(cause)
+            self._counters.refused[cause] += 1
         if cause is None:
             self._tell(self._notices.sent(now_s))
-            return
-        self._notices.not_sent(cause)
-        if self._options.firmware == "ardupilot" and not self.telemetry.armed:
-            self._keep_ready_to_arm()
+        else:
+            self._notices.not_sent(cause)
+            if self._options.firmware == "ardupilot" and not self.telemetry.armed:
+                self._keep_ready_to_arm()
+        if self._watch is not None:
+            self._watch(answer)
 
     def _keep_ready_to_arm(self) -> None:
         """Send what ArduPilot requires before arming: a live camera, or a fix from every receiver."""
@@ -204,10 +201,8 @@ class MavlinkBridge:
             self._send(no_position_message(now_ns))
         elif gps_id and gnss is not None and now_ns - gnss.time_ns < _GNSS_STALE_NS:
             stamp_ns = stamp_on_ground_ns(now_ns)
-            unix_ns = self.telemetry.unix_ns(stamp_ns)
-            self._send(
-                repeated_receiver_message(gnss, self.telemetry.vehicle(now_ns), gps_id, (stamp_ns, unix_ns))
-            )
+            times_ns = stamp_ns, self.telemetry.unix_ns(stamp_ns)
+            self._send(receiver_message(gnss, self.telemetry.vehicle(now_ns), gps_id, times_ns))
 
     def _is_trusted(self, answer: Answer, now_s: float) -> bool:
         """Whether a fix continues the track sent to the autopilot or, before the first fix, its GNSS."""
@@ -243,7 +238,7 @@ class MavlinkBridge:
         if cause is None and not self._send(fix_message(report, self._options)):
             cause = "link down"
         if cause is not None:
-            self._counters.add_withheld(cause)
+            self._counters.withheld[cause] += 1
             return cause
         self._guard.has_fix = True
         self._counters.add_sent(report.age_ms)
@@ -266,12 +261,12 @@ class MavlinkBridge:
         """Create a navigator; replacing one counts as a reset because the new one acquires the position again."""
         navigator = self._make_navigator(start)
         if self._navigator is not None:
-            self._resets_before += _resets(self._navigator) + 1
+            self._resets_before += self._navigator.reset_count + 1
         self._navigator = navigator
         return navigator
 
     def _compose(self, fix: Fix, captured_ns: int) -> FixReport:
-        resets = self._resets_before + (0 if self._navigator is None else _resets(self._navigator))
+        resets = self._resets_before + (0 if self._navigator is None else self._navigator.reset_count)
         origin, vehicle = self.telemetry.origin, self.telemetry.vehicle(captured_ns)
         if origin is None and self._origin is not None and vehicle.down_m is not None:
             # An autopilot without a position reports a height above sea level of 0.
@@ -386,7 +381,3 @@ class MavlinkBridge:
                 self._counters.dropped += self._decoder.dropped
                 self._decoder.dropped = 0
             self._link, self._peer, self.telemetry.heard_ns = None, None, None
-
-
-def _resets(navigator: Navigator) -> int:
-    return int(getattr(navigator, "reset_count", 0))

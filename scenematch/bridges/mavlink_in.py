@@ -21,8 +21,15 @@ from engine.geo import wrap_heading_deg
 from engine.values import Attitude
 from scenematch.bridges.gimbal import body_behind, from_device, from_mount
 from scenematch.bridges.packets import BRIDGE_COMPONENT
-from scenematch.bridges.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, scalar
-from scenematch.bridges.vision_in import has_failed, vision_velocity
+from scenematch.bridges.vehicle import (
+    ANGLES,
+    NedOrigin,
+    RecentValues,
+    VehicleState,
+    height_above_ground_m,
+    scalar,
+)
+from scenematch.bridges.vision_in import has_failed, is_by_camera, vision_velocity
 
 MAV_AUTOPILOTS = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
 """MAV_AUTOPILOT of each firmware, as its heartbeat states it."""
@@ -66,7 +73,7 @@ _CLOCK_SAMPLES = 64
 _CLOCK_JUMP_NS = 1_000_000_000  # beyond which the autopilot must have rebooted
 _CLOCK_SLIP_NS = 10_000_000  # more than two round trips explain: the clock was set, since crystals drift less
 _MAX_STALE_STAMPS = 20  # consecutive stamps that far back also mean a reboot
-_UNKNOWN_BELOW_M = -1000.0  # values of ALTITUDE below this are unknown by MAVLink's definition
+
 _UNIX_RANGE_US = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100: outside it the date is unknown
 _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
 # ESTIMATOR_STATUS of PX4 has the same bits as EKF_STATUS_REPORT of ArduPilot.
@@ -171,7 +178,7 @@ class MavlinkTelemetry:
         self._reset()
 
     def _reset(self) -> None:
-        """Know nothing but the last heartbeat."""
+        """Discard everything but the last heartbeat: the autopilot may have rebooted."""
         self._clock, self._stale_stamps = AutopilotClock(), 0
         self._attitude, self._holder = RecentValues(ANGLES), RecentValues(ANGLES)
         self._velocity, self._vision, self._down = RecentValues(), RecentValues(), RecentValues()
@@ -191,7 +198,7 @@ class MavlinkTelemetry:
             self._update(message, arrival_ns)
 
     def reset(self) -> None:
-        """Discard everything but the last heartbeat: the autopilot may have rebooted."""
+        """Discard everything but the last heartbeat."""
         with self._lock:
             self._reset()
 
@@ -213,13 +220,13 @@ class MavlinkTelemetry:
             own_velocity: whether to use the autopilot's velocity if no other camera's odometry states one.
         """
         with self._lock:
-            attitude = self._attitude.at(time_ns)
-            told = self._velocity.at(time_ns) if self._has_velocity and own_velocity else None
-            velocity = told or (None, None, None)
-            roll, pitch, heading = attitude or (None, None, None)
+            held = self._holder.at(time_ns)
+            roll, pitch, heading = self._attitude.at(time_ns) or (None, None, None)
+            own = self._velocity.at(time_ns) if self._has_velocity and own_velocity else None
             # From another camera's odometry, if there is one: it does not depend on the fixes.
-            east, north, up, _ = self._vision.at(time_ns) or (*velocity, 0.0)
+            east, north, up, *_ = self._vision.at(time_ns) or own or (None, None, None)
             *_, sigma = self._vision.nearest(time_ns) or (0.0,)  # 0 means not stated: nothing to interpolate
+            slant_m, *others_m = (scalar(s.at(time_ns)) for s in (self._range, self._clearance, self._relative))
             return VehicleState(
                 roll_deg=roll,
                 pitch_deg=pitch,
@@ -228,15 +235,11 @@ class MavlinkTelemetry:
                 north_velocity_mps=north,
                 up_velocity_mps=up,
                 velocity_sigma_mps=sigma or None,
-                height_agl_m=self._height_agl_m(time_ns, roll or 0.0, pitch or 0.0),
+                height_agl_m=height_above_ground_m(slant_m, roll, pitch, *others_m),
                 alt_amsl_m=scalar(self._alt_amsl.at(time_ns)),
                 down_m=self._down_m(time_ns),
-                holder=self._holder_at(time_ns),
+                holder=None if held is None else Attitude(held[0], held[1], wrap_heading_deg(held[2])),
             )
-
-    def _holder_at(self, time_ns: int) -> Attitude | None:
-        held = self._holder.at(time_ns)
-        return None if held is None else Attitude(held[0], held[1], wrap_heading_deg(held[2]))
 
     def _down_m(self, time_ns: int) -> float | None:
         """Distance below the origin; without a position ArduPilot states only the height above home.
@@ -247,13 +250,6 @@ class MavlinkTelemetry:
         if down_m is not None or relative_m is None:
             return down_m
         return self._home_down_m - relative_m
-
-    def _height_agl_m(self, time_ns: int, roll_deg: float, pitch_deg: float) -> float | None:
-        slant_m = scalar(self._range.at(time_ns))
-        if slant_m is not None:  # the beam is fixed to the body, so it tilts with it
-            slant_m *= math.cos(math.radians(roll_deg)) * math.cos(math.radians(pitch_deg))
-        heights = (slant_m, scalar(self._clearance.at(time_ns)), scalar(self._relative.at(time_ns)))
-        return next((height for height in heights if height is not None and height > 0.0), None)
 
     def _update(self, message: Any, arrival_ns: int) -> None:
         kind = message.get_type()
@@ -269,11 +265,8 @@ class MavlinkTelemetry:
         elif kind == "RANGEFINDER":  # has no stamp
             self._add_range(arrival_ns, message.distance)
         elif kind in ("VISION_SPEED_ESTIMATE", "ODOMETRY"):  # stamped by a clock that no other message uses
-            if has_failed(message, self._bridge_component):
-                self._vision.clear()
-            seen = vision_velocity(message, self._attitude.at(arrival_ns), self._bridge_component)
-            if seen is not None:
-                self._vision.add(arrival_ns, *seen)
+            if is_by_camera(message, self._bridge_component):
+                self._add_vision(message, arrival_ns)
         elif kind in ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"):
             # If it knows no velocity, it still reports one, of zero.
             self._has_velocity = bool(message.flags & _VELOCITY_KNOWN) and not message.flags & _CONSTANT_POSITION
@@ -311,10 +304,10 @@ class MavlinkTelemetry:
             self._down.add(time_ns, message.z)
             self._velocity.add(time_ns, message.vy, message.vx, -message.vz)
         elif kind == "ALTITUDE":
-            known = [v for v in (message.bottom_clearance, message.altitude_terrain) if v > _UNKNOWN_BELOW_M]
-            positive = [v for v in known if v > 0.0]
-            if positive:
-                self._clearance.add(time_ns, positive[0])
+            # A value that the autopilot does not know is far below 0.
+            heights_m = [v for v in (message.bottom_clearance, message.altitude_terrain) if v > 0.0]
+            if heights_m:
+                self._clearance.add(time_ns, heights_m[0])
         elif kind == "DISTANCE_SENSOR":
             valid = message.min_distance < message.current_distance < message.max_distance
             if message.orientation == _DOWN and valid:
@@ -337,6 +330,12 @@ class MavlinkTelemetry:
         if rotation is not None:
             held = body_behind(rotation, self._gimbal_mount)
             self._holder.add(time_ns, held.roll_deg, held.pitch_deg, held.heading_deg)
+
+    def _add_vision(self, message: Any, arrival_ns: int) -> None:
+        if has_failed(message):
+            self._vision.clear()
+        elif (seen := vision_velocity(message, self._attitude.at(arrival_ns))) is not None:
+            self._vision.add(arrival_ns, *seen)
 
     def _add_range(self, time_ns: int, range_m: float) -> None:
         if range_m > 0.0:

@@ -19,7 +19,14 @@ from scenematch.bridges.fix_velocity import GroundVelocity
 from scenematch.bridges.mavlink_in import MAV_AUTOPILOTS, GnssFix
 from scenematch.bridges.packets import AUTOPILOT_COMPONENT
 from scenematch.bridges.parameters import MAX_DELAY_MS
-from scenematch.bridges.vehicle import ANGLE_VARIANCE, MOUNT_VARIANCE, NedOrigin, VehicleState, north_east_m
+from scenematch.bridges.vehicle import (
+    ANGLE_VARIANCE,
+    MOUNT_VARIANCE,
+    NedOrigin,
+    VehicleState,
+    is_finite,
+    north_east_m,
+)
 from scenematch.files.quaternions import quaternion_wxyz
 
 MESSAGES = {
@@ -112,11 +119,10 @@ class FixReport:
 
 def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
     """Why a fix is not sent, or None if it is sent."""
-    vehicle, fix = report.vehicle, report.fix
-    numbers = (fix.lat_deg, fix.lon_deg, *fix.covariance_m2.ravel(), *(fix.attitude_sigma_deg or ()))
-    if not all(map(math.isfinite, numbers)):
+    vehicle = report.vehicle
+    if not is_finite(report.fix):
         return "not finite"
-    if fix.sigma_m > options.max_sigma_m:
+    if report.fix.sigma_m > options.max_sigma_m:
         return "too uncertain"
     if report.age_ms > MAX_DELAY_MS:  # ArduPilot's estimator buffers no longer
         return "too old"
@@ -138,7 +144,10 @@ def fix_message(report: FixReport, options: MavlinkOptions) -> Any:
         return _vision_position_estimate(report, options.firmware)
     if options.kind == "odometry":
         return _odometry(report, options.firmware)
-    return _gps_input(report, options.gps_id) if options.kind == "gps_input" else _global_position_sensor(report)
+    if options.kind == "gps_input":
+        times_ns = report.captured_ns, report.unix_ns
+        return receiver_message(report.fix, report.vehicle, options.gps_id, times_ns, report.velocity)
+    return _global_position_sensor(report)
 
 
 def heartbeat_message() -> Any:
@@ -289,34 +298,24 @@ def _body_velocity(velocity: GroundVelocity, vehicle: VehicleState) -> list[floa
     return [float(v) for v in rotation.T @ enu_mps]
 
 
-def _gps_input(report: FixReport, gps_id: int) -> Any:
-    assert report.velocity is not None  # checked by withhold_reason
-    times_ns = (report.captured_ns, report.unix_ns)
-    return _receiver(gps_id, times_ns, report.fix, report.vehicle, report.velocity)
-
-
-def repeated_receiver_message(gnss: GnssFix, vehicle: VehicleState, gps_id: int, times_ns: tuple[int, int]) -> Any:
-    """GPS_INPUT that repeats the position of the autopilot's own receiver, for a vehicle that stands still.
+def receiver_message(
+    place: Fix | GnssFix,
+    vehicle: VehicleState,
+    gps_id: int,
+    times_ns: tuple[int, int],
+    velocity: GroundVelocity | None = None,
+) -> Any:
+    """GPS_INPUT of a fix, or of the position of the autopilot's own receiver while the vehicle stands still.
 
     ArduPilot arms only if each receiver has a fix, and on the ground a camera sees nothing.
 
     Args:
-        gnss: the receiver's position.
-        vehicle: its height.
+        place: the position.
+        vehicle: its height and vertical velocity.
         gps_id: number of the receiver that the message emulates.
-        times_ns: its timestamps on the monotonic clock and since 1970, older than any fix.
+        times_ns: its timestamps on the monotonic clock and since 1970.
+        velocity: of a fix; the message states none for a receiver's position.
     """
-    return _receiver(gps_id, times_ns, gnss, vehicle, None)
-
-
-def _receiver(
-    gps_id: int,
-    times_ns: tuple[int, int],
-    place: Fix | GnssFix,
-    vehicle: VehicleState,
-    velocity: GroundVelocity | None,
-) -> Any:
-    """GPS_INPUT of a place at a time, on the monotonic clock and since 1970."""
     week, week_ms = divmod(times_ns[1] // 1_000_000 - (_GPS_EPOCH_S - _LEAP_S) * 1000, _WEEK_MS)
     alt_m, up_mps, sigma_m = vehicle.alt_amsl_m, vehicle.up_velocity_mps, place.sigma_m
     dilution = max(_DILUTION_PER_M * sigma_m, _MIN_DILUTION)

@@ -42,46 +42,42 @@ class MavlinkStatus:
         """The same in one line."""
         reasons = ", ".join(f"{why} {n}" for why, n in {**self.withheld, **self.refused}.items()) or "nothing"
         heard = "autopilot heard" if self.connected else "no autopilot"
-        slow = (
-            f" (below {MIN_RATE_HZ:g} Hz an estimator may stop using them)" if self.rate_hz < MIN_RATE_HZ else ""
-        )
+        warning = f" (below {MIN_RATE_HZ:g} Hz an estimator may stop using them)"
+        slow = warning if self.rate_hz < MIN_RATE_HZ else ""
         age = "" if self.least_age_ms is None else f", least age {self.least_age_ms:.0f} ms"
         return f"{heard}; sent {self.sent}, {self.rate_hz:.1f} Hz{slow}{age}; not sent: {reasons}"
 
 
 class MavlinkCounters:
-    """The running counters."""
+    """The running counters; those that are not fixes are counted by their users.
+
+    Attributes:
+        withheld: fixes that were not sent, by cause.
+        refused: frames that gave no fix, by reason.
+        dropped: packets that earlier links dropped.
+        reconnections: times that the vehicle was heard again.
+    """
 
     def __init__(self) -> None:
         self._sent_ns: deque[int] = deque(maxlen=256)
-        self._withheld: Counter[str] = Counter()
-        self._refused: Counter[str] = Counter()
+        self.withheld: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
         self._least_age_ms: float | None = None
-        self._answered = self._sent = 0
-        self.dropped = self.reconnections = 0
+        self._sent = self.dropped = self.reconnections = 0
 
     def add_sent(self, age_ms: float) -> None:
         """A fix was sent."""
-        self._answered += 1
         self._sent += 1
         self._sent_ns.append(time.monotonic_ns())
         self._least_age_ms = min(age_ms, self._least_age_ms or age_ms)
-
-    def add_withheld(self, cause: str) -> None:
-        """A fix was not sent."""
-        self._answered += 1
-        self._withheld[cause] += 1
-
-    def add_refused(self, reason: str) -> None:
-        """A frame gave no fix."""
-        self._answered += 1
-        self._refused[reason] += 1
 
     def status(self, *, connected: bool, dropped: int) -> MavlinkStatus:
         """The counters so far, including packets that the present link dropped."""
         since_ns = time.monotonic_ns() - round(_RATE_SPAN_S * 1e9)
         rate_hz = sum(sent >= since_ns for sent in list(self._sent_ns)) / _RATE_SPAN_S
+        sent, withheld, refused = self._sent, dict(self.withheld), dict(self.refused)
+        answered = sent + sum(withheld.values()) + sum(refused.values())
         return MavlinkStatus(
-            connected, self._answered, self._sent, dict(self._withheld), dict(self._refused), rate_hz,
+            connected, answered, sent, withheld, refused, rate_hz,
             self._least_age_ms, self.dropped + dropped, self.reconnections,
         )  # fmt: skip

@@ -20,7 +20,6 @@ BRIDGE_COMPONENT = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 # A companion computer is another component; `vision_in` leaves out the autopilot's and the bridge's own.
 _FROM_ANY_COMPONENT = (mavlink.MAVLINK_MSG_ID_ODOMETRY, mavlink.MAVLINK_MSG_ID_VISION_SPEED_ESTIMATE)
 _SIGNED, _SIGNATURE_BYTES = 0x01, 13
-_MAX_BUFFER_BYTES = 65536  # of a stream that never completes a packet
 _MAX_FAILED = 64  # false start bytes in a datagram, after which the rest is discarded to keep a flood cheap
 _SIGNING_EPOCH_S = 1420070400  # 1 January 2015, the epoch of signature time stamps
 _MAX_STREAM_AGE = 60 * 100_000  # of a new signed stream's first stamp, in units of 10 us
@@ -124,9 +123,7 @@ class PacketDecoder:
                     messages.append(message)
                 else:
                     self.dropped += 1
-        del self._buffer[: at if self._is_stream else None]
-        if len(self._buffer) > _MAX_BUFFER_BYTES:
-            self._buffer.clear()
+        del self._buffer[: at if self._is_stream else None]  # at most one incomplete packet stays
         return messages
 
     def _start(self, at: int) -> int:

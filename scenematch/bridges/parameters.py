@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from engine.errors import OptionError
+
+if TYPE_CHECKING:
+    from scenematch.bridges.mavlink_out import MavlinkOptions
 
 MAX_DELAY_MS = 250.0
 """Upper bound of ArduPilot's VISO_DELAY_MS."""
@@ -14,56 +17,38 @@ Parameter = tuple[str, float, str]
 """Name, value, purpose."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ParameterOptions:
-    """What a parameter file is for.
+def parameter_file(sent: MavlinkOptions, takeoff: str = "none", delay_ms: int = 100) -> str:
+    """The text of a parameter file.
 
-    Attributes:
-        firmware: ardupilot or px4.
-        message: the message that the bridge sends.
+    Args:
+        sent: what the bridge sends, and to which firmware.
         takeoff: "none" without GNSS, or "gnss": ArduPilot takes off with its receiver and switches over in flight.
-        gps_id: number of the receiver that GPS_INPUT emulates.
         delay_ms: time from capture to arrival at the autopilot.
-        max_sigma_m: upper bound of the sigma of the fixes that are sent.
 
     Raises:
         OptionError: the delay is out of range, or the message does not allow the take-off.
     """
-
-    firmware: str
-    message: str
-    takeoff: str = "none"
-    gps_id: int = 0
-    delay_ms: int = 100
-    max_sigma_m: float = 10.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.delay_ms <= MAX_DELAY_MS:
-            raise OptionError(f"delay_ms: expected 0 to {MAX_DELAY_MS:g}, got {self.delay_ms}")
-        if self.takeoff not in ("none", "gnss"):
-            raise OptionError(f"takeoff: expected none or gnss, got {self.takeoff!r}")
-        if self.takeoff == "gnss" and self.firmware != "ardupilot":
-            raise OptionError(f"takeoff: expected none for {self.firmware}, got {self.takeoff!r}")
-        if self.takeoff == "gnss" and self.message == "gps_input" and self.gps_id == 0:
-            raise OptionError("gps_id: expected 1 or more beside a receiver, got 0")
+    if not 0 <= delay_ms <= MAX_DELAY_MS:
+        raise OptionError(f"delay_ms: expected 0 to {MAX_DELAY_MS:g}, got {delay_ms}")
+    if takeoff not in ("none", "gnss"):
+        raise OptionError(f"takeoff: expected none or gnss, got {takeoff!r}")
+    if takeoff == "gnss" and sent.firmware != "ardupilot":
+        raise OptionError(f"takeoff: expected none for {sent.firmware}, got {takeoff!r}")
+    if takeoff == "gnss" and sent.kind == "gps_input" and sent.gps_id == 0:
+        raise OptionError("gps_id: expected 1 or more beside a receiver, got 0")
+    if sent.firmware == "px4":
+        return _px4_file(sent, delay_ms)
+    text = [f"# ArduPilot 4.5 and later, {sent.kind} by scenematch bridge mavlink; then reboot."]
+    for name, value, why in _ardupilot(sent, takeoff == "gnss", delay_ms):
+        text += [f"# {why}", f"{name},{value:g}"]
+    return "\n".join(text) + "\n"
 
 
-def parameter_file(options: ParameterOptions) -> str:
-    """The text of a parameter file."""
-    if options.firmware == "ardupilot":
-        text = [f"# ArduPilot 4.5 and later, {options.message} by scenematch bridge mavlink; then reboot."]
-        for name, value, why in _ardupilot(options):
-            text += [f"# {why}", f"{name},{value:g}"]
-        return "\n".join(text) + "\n"
-    return _px4_file(options)
-
-
-def _px4_file(options: ParameterOptions) -> str:
+def _px4_file(sent: MavlinkOptions, delay_ms: int) -> str:
     """As QGroundControl writes it."""
-    message, delay_ms = options.message, options.delay_ms
-    position = message == "global_position_sensor"
-    lines = _agp(delay_ms, options.max_sigma_m) if position else _external_vision(delay_ms)
-    text = [f"# PX4 1.15 and later, {message} by scenematch bridge mavlink. Reboot after loading.", "#"]
+    position = sent.kind == "global_position_sensor"
+    lines = _agp(delay_ms, sent.max_sigma_m) if position else _external_vision(delay_ms)
+    text = [f"# PX4 1.15 and later, {sent.kind} by scenematch bridge mavlink. Reboot after loading.", "#"]
     text += [f"# {name}: {why}" for name, _, why in lines]
     text += ["#", "# Vehicle-Id Component-Id Name Value Type"]
     for name, value, _ in lines:
@@ -72,32 +57,23 @@ def _px4_file(options: ParameterOptions) -> str:
     return "\n".join(text) + "\n"
 
 
-def _ardupilot(options: ParameterOptions) -> list[Parameter]:
-    lines = [*_EKF3]
-    vision = _gps_input(options) if options.message == "gps_input" else _external_navigation(options)
-    lines += vision
-    if options.takeoff == "gnss":
+def _ardupilot(sent: MavlinkOptions, with_receiver: bool, delay_ms: int) -> list[Parameter]:
+    as_receiver = sent.kind == "gps_input"
+    lines = [*_EKF3, *(_gps_input(sent.gps_id, delay_ms) if as_receiver else _external_navigation(delay_ms))]
+    if as_receiver or with_receiver:
         lines += _source_set(1, position=3, velocity=3)
-        if options.message == "gps_input":
-            lines.append(("GPS_AUTO_SWITCH", 4, "the first receiver as long as it has a fix, then the fixes"))
-        else:
-            why = "switch of the transmitter: low set 1, the receiver; middle set 2"
-            lines.append((f"{_RC_SWITCH}_OPTION", 90, why))
-    if options.message != "gps_input":
-        lines += _source_set(2 if options.takeoff == "gnss" else 1, position=6, velocity=0)
-    elif options.takeoff == "none":
-        lines += _source_set(1, position=3, velocity=3)
-    if options.takeoff == "none" and options.message != "gps_input":
+    else:
+        lines += _source_set(1, position=6, velocity=0)
         lines.append(("GPS1_TYPE", 0, "no receiver; GPS_TYPE before 4.6"))
+    if with_receiver and as_receiver:
+        lines.append(("GPS_AUTO_SWITCH", 4, "the first receiver as long as it has a fix, then the fixes"))
+    elif with_receiver:
+        lines.append(("RC7_OPTION", 90, "switch of the transmitter: low set 1, the receiver; middle set 2"))
+        lines += _source_set(2, position=6, velocity=0)
     return [*lines, *_FAILSAFES]
 
 
-_RC_SWITCH = "RC7"
-_EKF3: list[Parameter] = [
-    ("AHRS_EKF_TYPE", 3, "EKF3"),
-    ("EK3_ENABLE", 1, "EKF3"),
-    ("EK2_ENABLE", 0, "EKF3 alone"),
-]
+_EKF3: list[Parameter] = [("AHRS_EKF_TYPE", 3, "EKF3"), ("EK3_ENABLE", 1, "EKF3"), ("EK2_ENABLE", 0, "EKF3 alone")]
 _FAILSAFES: list[Parameter] = [
     ("FS_EKF_ACTION", 1, "LAND 8 s after the last fix; without a position it drifts with the wind"),
     ("FS_EKF_THRESH", 0.8, "variances above it for a second count as a failure, too"),
@@ -116,20 +92,19 @@ def _source_set(number: int, *, position: int, velocity: int) -> list[Parameter]
     ]
 
 
-def _external_navigation(options: ParameterOptions) -> list[Parameter]:
+def _external_navigation(delay_ms: int) -> list[Parameter]:
     return [
         ("VISO_TYPE", 1, "vision by MAVLink"),
-        ("VISO_DELAY_MS", options.delay_ms, "from capture to arrival: the least age that the bridge prints"),
+        ("VISO_DELAY_MS", delay_ms, "from capture to arrival: the least age that the bridge prints"),
         ("VISO_POS_M_NSE", 0.2, "floor of the position's sigma"),
     ]
 
 
-def _gps_input(options: ParameterOptions) -> list[Parameter]:
-    name, delay_ms = f"GPS{options.gps_id + 1}", max(options.delay_ms, 1)
-    older = str(options.gps_id + 1) if options.gps_id else ""
+def _gps_input(gps_id: int, delay_ms: int) -> list[Parameter]:
+    name, older = f"GPS{gps_id + 1}", str(gps_id + 1) if gps_id else ""
     return [
         (f"{name}_TYPE", 14, f"GPS_INPUT by MAVLink; GPS_TYPE{older} before 4.6"),
-        (f"{name}_DELAY_MS", delay_ms, f"the least age; 0 would mean 200; GPS_DELAY_MS{older} before 4.6"),
+        (f"{name}_DELAY_MS", max(delay_ms, 1), f"the least age; 0 would mean 200; GPS_DELAY_MS{older} before 4.6"),
     ]
 
 

@@ -1,8 +1,7 @@
 """The ROS bridge: feed images and telemetry to the engine; publish poses, fixes and diagnostics.
 
 It does not import ROS: it only accesses the fields of messages, which ros1.py and ros2.py transport. A pose is
-never
-published without its covariance; a refusal is published in the diagnostics only. Stamps are capture times.
+never published without its covariance; a refusal is published in the diagnostics only. Stamps are capture times.
 """
 
 from __future__ import annotations
@@ -15,10 +14,8 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from engine.errors import EngineError, StateError
 from engine.navigation.live import Answer, Counts, Live, LiveOptions
@@ -26,7 +23,9 @@ from engine.navigation.navigator import Navigator
 from engine.orthomap import OrthoMap
 from engine.values import Fix, Frame, NoFix, Prior
 from scenematch.bridges.ros_in import RESTART_NS, RosTelemetry, RosTopics
-from scenematch.bridges.ros_out import FRAME_ID, RosOptions, diagnostics, is_finite, pose, window_picture
+from scenematch.bridges.ros_out import FRAME_ID, RosOptions, diagnostics, pose, window_picture
+from scenematch.bridges.vehicle import is_finite
+from scenematch.files.ros.bags import QUANTITIES
 from scenematch.files.ros.messages import ODOMETRY_TYPES, MessageFactory, image_from_message, stamp_ns
 
 _log = logging.getLogger("scenematch")
@@ -155,28 +154,28 @@ class RosBridge:
 
     def handlers(self, topics: RosTopics) -> dict[str, tuple[str, Handler]]:
         """Type and handler of every topic to subscribe to, by name."""
-        telemetry, now_ns = self.telemetry, self._node.now_ns
         self._image_topic = topics.image
         handlers: dict[str, tuple[str, Handler]] = {
             topics.image: (topics.image_type, self.on_image),
-            topics.imu: ("sensor_msgs/msg/Imu", self.on_imu),
-            topics.compass: ("std_msgs/msg/Float64", lambda m: telemetry.compass(m.data, now_ns())),
-            topics.height: ("std_msgs/msg/Float64", lambda m: telemetry.height(m.data, now_ns())),
-            topics.range: ("sensor_msgs/msg/Range", telemetry.range),
-            topics.velocity: ("geometry_msgs/msg/TwistStamped", telemetry.velocity),
+            topics.imu: (QUANTITIES["imu"].types[0], self.on_imu),
             topics.odometry: (ODOMETRY_TYPES[topics.odometry_type], self.on_odometry),
         }
-        return {name: handler for name, handler in handlers.items() if name}
+        for name in ("compass", "height", "range", "velocity"):
+            handlers[getattr(topics, name)] = (QUANTITIES[name].types[0], partial(self._store, name))
+        return {topic: handler for topic, handler in handlers.items() if topic}
+
+    def _store(self, name: str, message: Any) -> None:
+        self.telemetry.add(name, message, self._node.now_ns())
 
     def on_imu(self, message: Any) -> None:
         """Store an attitude, and submit the picture that waited for it."""
-        self.telemetry.imu(message)
+        self._store("imu", message)
         self._held.release(lambda captured_ns: not self.telemetry.waits_for_attitude(captured_ns))
 
     def on_odometry(self, message: Any) -> None:
         """Store the velocity of another odometry; why it cannot be used is reported with every frame."""
         try:
-            self.telemetry.odometry(message, self._node.now_ns())
+            self._store("odometry", message)
         except EngineError as error:
             self._odometry_error = str(error)
             self._say("odometry", f"an odometry cannot be used: {error}")
@@ -203,25 +202,16 @@ class RosBridge:
         self._last_ns = captured_ns
 
         def submit() -> None:
-            self._submit(image, captured_ns, now_ns)
+            frame = self.telemetry.vehicle(captured_ns).frame(image, captured_ns)
+            with contextlib.suppress(StateError):  # closed in the meantime
+                # A stamp in the future counts as now.
+                self._live.submit(frame, captured_ns=min(captured_ns, now_ns))
 
         if self.telemetry.waits_for_attitude(captured_ns):
             self._held.hold(captured_ns, submit)
         else:
             self._held.drop()  # an older picture, overtaken by this one
             submit()
-
-    def _submit(self, image: NDArray[np.uint8], captured_ns: int, arrived_ns: int) -> None:
-        try:
-            frame = self.telemetry.vehicle(captured_ns).frame(image, captured_ns)
-        except EngineError as error:
-            self._unusable += 1
-            self._diagnose(captured_ns, _ERROR, str(error), {})
-            return
-        with contextlib.suppress(StateError):  # closed in the meantime
-            self._live.submit(
-                frame, captured_ns=min(captured_ns, arrived_ns)
-            )  # a stamp in the future counts as now
 
     def _start_live(self) -> Live:
         make, options = self._make_navigator, self._live_options
@@ -271,10 +261,8 @@ class RosBridge:
         """Publish an error if no images arrive; call it once a second."""
         silence_s = time.monotonic() - self._last_image_s
         if silence_s > _MAX_SILENCE_S:
-            self._say(
-                "no picture",
-                f"no picture on {self._image_topic}: does anything publish this topic with this type?",
-            )
+            doubt = "does anything publish this topic with this type?"
+            self._say("no picture", f"no picture on {self._image_topic}: {doubt}")
             self._diagnose(self._node.now_ns(), _ERROR, f"no picture for {silence_s:.0f} s", {})
 
     def _say(self, cause: str, text: str) -> None:
@@ -287,9 +275,8 @@ class RosBridge:
         status = self.status
         counters = {name: str(count) for name, count in asdict(status.counts).items()}
         counters |= {"fixes": str(status.fixes), "unusable": str(status.unusable)}
-        self._node.publish(
-            "diagnostics", diagnostics(self._node.messages, time_ns, level, text, values | counters)
-        )
+        message = diagnostics(self._node.messages, time_ns, level, text, values | counters)
+        self._node.publish("diagnostics", message)
 
 
 def _known(frame: Frame) -> dict[str, str]:

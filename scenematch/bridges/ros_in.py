@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from dataclasses import dataclass
 from typing import Any
 
 from engine.errors import OptionError
 from engine.geo import enu_from_body, wrap_heading_deg
-from scenematch.bridges.vehicle import ANGLES, RecentValues, VehicleState, scalar
+from scenematch.bridges.vehicle import ANGLES, RecentValues, VehicleState, height_above_ground_m, scalar
 from scenematch.files.ros import bags
-from scenematch.files.ros.messages import (
-    ODOMETRY_TYPES,
-    attitude_from_message,
-    body_velocity_from_message,
-    range_from_message,
-    stamp_ns,
-)
+from scenematch.files.ros.messages import ODOMETRY_TYPES
 
 __all__ = ["RESTART_NS", "RosTelemetry", "RosTopics"]
 
@@ -74,66 +67,46 @@ class RosTelemetry:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._attitude, self._compass, self._velocity = RecentValues(ANGLES), RecentValues((True,)), RecentValues()
-        self._range, self._height, self._odometry = RecentValues(), RecentValues(), RecentValues()
+        self._recent = {name: RecentValues() for name in ("height", "range", "velocity", "odometry")}
+        self._recent |= {"imu": RecentValues(ANGLES), "compass": RecentValues((True,))}
 
-    def imu(self, message: Any) -> None:
-        """Store the attitude of a sensor_msgs/Imu."""
-        attitude = attitude_from_message(message)
-        if attitude is not None:
-            self._add(self._attitude, stamp_ns(message), *attitude)
+    def add(self, name: str, message: Any, now_ns: int) -> None:
+        """Store what a message says; one without a stamp counts as now.
+
+        Args:
+            name: one of :data:`scenematch.files.ros.bags.QUANTITIES`, as the topics are named.
+            message: of one of its types.
+            now_ns: ROS time.
+
+        Raises:
+            TelemetryError: the velocity of an odometry is not along the body.
+        """
+        values = bags.QUANTITIES[name].values(message)
+        if values is None or None in values:
+            return
+        time_ns, series = bags.stamp_or(message, now_ns), self._recent[name]
+        with self._lock:
+            if series.last_ns is not None and time_ns < series.last_ns - RESTART_NS:
+                series.clear()
+            series.add(time_ns, *values)
 
     def waits_for_attitude(self, time_ns: int) -> bool:
         """Whether the attitude at a ROS time is still expected: attitudes arrive, and the newest is older."""
         with self._lock:
-            last_ns = self._attitude.last_ns
+            last_ns = self._recent["imu"].last_ns
         return last_ns is not None and last_ns < time_ns <= last_ns + _ATTITUDE_COMES_NS
-
-    def compass(self, heading_deg: float, now_ns: int) -> None:
-        """Store a heading that has no stamp."""
-        self._add(self._compass, now_ns, heading_deg)
-
-    def height(self, height_m: float, now_ns: int) -> None:
-        """Store a height above take-off that has no stamp."""
-        self._add(self._height, now_ns, height_m)
-
-    def range(self, message: Any) -> None:
-        """Store the distance of a sensor_msgs/Range."""
-        range_m = range_from_message(message)
-        if range_m is not None:
-            self._add(self._range, stamp_ns(message), range_m)
-
-    def velocity(self, message: Any) -> None:
-        """Store the velocity of a geometry_msgs/TwistStamped in east-north-up."""
-        linear = message.twist.linear
-        self._add(self._velocity, stamp_ns(message), linear.x, linear.y)
-
-    def odometry(self, message: Any, now_ns: int) -> None:
-        """Store the velocity along the body of another odometry; one without a stamp counts as now.
-
-        Raises:
-            TelemetryError: its velocity is not along the body.
-        """
-        velocity = body_velocity_from_message(message)
-        if velocity is not None:
-            self._add(self._odometry, stamp_ns(message) or now_ns, *velocity)
 
     def vehicle(self, time_ns: int) -> VehicleState:
         """The vehicle state at a ROS time; what is not known is None."""
         with self._lock:
-            roll_deg, pitch_deg, yaw_deg = self._attitude.at(time_ns) or (None, None, None)
-            heading_deg = scalar(self._compass.at(time_ns))
-            heading_deg = yaw_deg if heading_deg is None else heading_deg
-            east_mps, north_mps = self._velocity.at(time_ns) or (None, None)
-            along_body = self._odometry.at(time_ns)
-            *_, stated_mps = self._odometry.nearest(time_ns) or (
-                0.0,
-            )  # 0 means not stated: nothing to interpolate
-            slant_m, height_m = scalar(self._range.at(time_ns)), scalar(self._height.at(time_ns))
-        above_m = height_m
-        if slant_m is not None:  # the beam is fixed to the body, so it tilts with it
-            cos_tilt = math.cos(math.radians(roll_deg or 0.0)) * math.cos(math.radians(pitch_deg or 0.0))
-            above_m = slant_m * cos_tilt
+            at = {name: series.at(time_ns) for name, series in self._recent.items()}
+            # 0 means not stated: nothing to interpolate.
+            *_, stated_mps = self._recent["odometry"].nearest(time_ns) or (0.0,)
+        roll_deg, pitch_deg, yaw_deg = at["imu"] or (None, None, None)
+        compass_deg, height_m = scalar(at["compass"]), scalar(at["height"])
+        heading_deg = yaw_deg if compass_deg is None else compass_deg
+        east_mps, north_mps = at["velocity"] or (None, None)
+        along_body = at["odometry"]
         sigma_mps = None
         if along_body is not None and heading_deg is not None:
             turn = enu_from_body(roll_deg or 0.0, pitch_deg or 0.0, heading_deg)
@@ -146,12 +119,6 @@ class RosTelemetry:
             east_velocity_mps=east_mps,
             north_velocity_mps=north_mps,
             velocity_sigma_mps=sigma_mps,
-            height_agl_m=above_m if above_m is not None and above_m > 0.0 else None,
+            height_agl_m=height_above_ground_m(scalar(at["range"]), roll_deg, pitch_deg, height_m),
             down_m=None if height_m is None else -height_m,
         )
-
-    def _add(self, series: RecentValues, time_ns: int, *values: float) -> None:
-        with self._lock:
-            if series.last_ns is not None and time_ns < series.last_ns - RESTART_NS:
-                series.clear()
-            series.add(time_ns, *values)

@@ -46,13 +46,6 @@ class RosOptions:
             raise OptionError(f"firmware: expected one of {', '.join(FIRMWARES)}, got {self.firmware!r}")
 
 
-def is_finite(fix: Fix) -> bool:
-    """Whether the position and covariance of a fix are finite."""
-    angles = fix.attitude_sigma_deg or ()
-    numbers = (fix.lat_deg, fix.lon_deg, fix.east_m, fix.north_m, *fix.covariance_m2.ravel(), *angles)
-    return all(map(math.isfinite, numbers))
-
-
 def pose(
     messages: MessageFactory,
     fix: Fix,

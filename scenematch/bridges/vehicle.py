@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.values import Attitude, Frame
+from engine.values import Attitude, Fix, Frame
 
 __all__ = ["NedOrigin", "VehicleState", "north_east_m"]
 
@@ -136,6 +136,29 @@ class RecentValues:
 def scalar(values: tuple[float, ...] | None) -> float | None:
     """The value of a one-dimensional sample; None stays None."""
     return None if values is None else values[0]
+
+
+def height_above_ground_m(
+    slant_m: float | None, roll_deg: float | None, pitch_deg: float | None, *others_m: float | None
+) -> float | None:
+    """The first height above 0: the rangefinder's, else the others in order.
+
+    Args:
+        slant_m: distance along the rangefinder's beam, which is fixed to the body and tilts with it.
+        roll_deg: of the body; unknown counts as level.
+        pitch_deg: of the body; likewise.
+        others_m: other heights, best first.
+    """
+    if slant_m is not None:
+        slant_m *= math.cos(math.radians(roll_deg or 0.0)) * math.cos(math.radians(pitch_deg or 0.0))
+    return next((height_m for height_m in (slant_m, *others_m) if height_m is not None and height_m > 0.0), None)
+
+
+def is_finite(fix: Fix) -> bool:
+    """Whether the position and covariance of a fix are finite."""
+    angles = fix.attitude_sigma_deg or ()
+    numbers = (fix.lat_deg, fix.lon_deg, fix.east_m, fix.north_m, *fix.covariance_m2.ravel(), *angles)
+    return all(map(math.isfinite, numbers))
 
 
 def north_east_m(lat_deg: float, lon_deg: float, origin: NedOrigin, firmware: str) -> tuple[float, float]:

@@ -18,21 +18,17 @@ _FAILED = -1  # quality
 
 
 def vision_velocity(
-    message: Any, attitude_deg: tuple[float, ...] | None, bridge_component: int
+    message: Any, attitude_deg: tuple[float, ...] | None
 ) -> tuple[float, float, float, float] | None:
     """East, north and up in m/s, and one standard deviation per axis, 0 if it is not stated.
 
     Args:
-        message: VISION_SPEED_ESTIMATE or ODOMETRY.
+        message: VISION_SPEED_ESTIMATE or ODOMETRY of another camera.
         attitude_deg: roll, pitch and heading of the vehicle, used to rotate a velocity along its body.
-        bridge_component: component id of the bridge itself.
 
     Returns:
-        None if the message has no such velocity: it is not from a camera, or is the autopilot's or the bridge's
-            own, in another frame, failed, absurdly large, or of unbounded variance.
+        None if the message has no such velocity: it is in another frame, absurdly large, or of unbounded variance.
     """
-    if not _is_by_camera(message, bridge_component) or has_failed(message, bridge_component):
-        return None
     if message.get_type() == "VISION_SPEED_ESTIMATE":
         velocity, variances = np.array([message.x, message.y, message.z]), message.covariance[0::4]
         turn: Array | None = _ENU_FROM_NED
@@ -47,18 +43,20 @@ def vision_velocity(
     return east, north, up, sigma_mps
 
 
-def has_failed(message: Any, bridge_component: int) -> bool:
-    """Whether another camera's ODOMETRY reports failure, which invalidates its last message."""
-    if message.get_type() != "ODOMETRY" or message.quality != _FAILED:
-        return False
-    return _is_by_camera(message, bridge_component)
+def has_failed(message: Any) -> bool:
+    """Whether an ODOMETRY reports failure, which invalidates the last message of its camera."""
+    return bool(message.get_type() == "ODOMETRY" and message.quality == _FAILED)
 
 
-def _is_by_camera(message: Any, bridge_component: int) -> bool:
+def is_by_camera(message: Any, bridge_component: int) -> bool:
     """Whether it is another camera's odometry: neither the autopilot's nor the bridge's own.
 
     An autopilot also forwards what it receives, including the bridge's fixes, under its own component; a router
     may return them unchanged. The bridge's own ODOMETRY has type VISION.
+
+    Args:
+        message: VISION_SPEED_ESTIMATE or ODOMETRY.
+        bridge_component: component id of the bridge itself.
     """
     if message.get_srcComponent() == AUTOPILOT_COMPONENT:
         return False

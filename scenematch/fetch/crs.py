@@ -32,7 +32,7 @@ def chosen_name(argument: str, asked: str | None, offered: Sequence[str], what: 
 def code_of(name: str) -> str:
     """EPSG:N from any spelling that services use; other codes unchanged."""
     parts = name.strip().split(":")
-    if parts[0].lower() == "urn" and len(parts) >= 4:  # urn:ogc:def:crs:EPSG:6.18:3857, or with the version empty
+    if parts[0].lower() == "urn" and len(parts) > 4:  # urn:ogc:def:crs:EPSG:6.18:3857, or with the version empty
         authority = parts[4]
         return "CRS:84" if parts[-1] == "CRS84" else f"{authority.upper()}:{parts[-1]}"
     if "/def/crs/" in name:  # http://www.opengis.net/def/crs/EPSG/0/3857

@@ -7,7 +7,6 @@ Heights are copied in their own grid without resampling, since the engine reads 
 from __future__ import annotations
 
 import math
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -24,7 +23,7 @@ from engine.maps.rasters import open_source, vertical_datum
 from scenematch.fetch.grid import reason_of
 from scenematch.fetch.place import Bounds
 from scenematch.fetch.urls import PLACEHOLDER, check_url, shown, user_agent
-from scenematch.files.geotiff import write_geotiff
+from scenematch.files.geotiff import replaced, write_geotiff
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -148,6 +147,7 @@ def _opened(file: str) -> Any:
 
 def _joined(datasets: Mapping[str, Any], map_bounds: Bounds, map_crs: CRS, datum: str | None) -> Heights:
     """The part of all datasets, by their names, under a map, on the grid of the first one."""
+    from pyproj.crs import CompoundCRS
     from rasterio.enums import Resampling
     from rasterio.errors import RasterioError
     from rasterio.merge import merge
@@ -167,8 +167,11 @@ def _joined(datasets: Mapping[str, Any], map_bounds: Bounds, map_crs: CRS, datum
     heights = np.where(data[0] == NODATA, np.nan, data[0] * first.scales[0] + first.offsets[0]).astype(np.float32)
     if not np.isfinite(heights).any():
         raise MapError(f"surface: expected heights under the map, got none in {name}")
-    crs = _crs(first) if vertical is None else _compound(horizontal, vertical)
-    return Heights(heights, (box[0], box[3]), step, crs, own if vertical is None else str(vertical.name))
+    corner = box[0], box[3]
+    if vertical is None:
+        return Heights(heights, corner, step, _crs(first), own)
+    compound = CompoundCRS(f"{horizontal.name} + {vertical.name}", [horizontal, vertical])
+    return Heights(heights, corner, step, compound, str(vertical.name))
 
 
 def _crs(dataset: Any) -> CRS:
@@ -204,12 +207,6 @@ def _grid_box(dataset: Any, name: str, crs: CRS, map_bounds: Bounds, map_crs: CR
     x0, y0 = math.floor((west - t.c) / t.a) - _MARGIN_PX, math.floor((north - t.f) / t.e) - _MARGIN_PX
     x1, y1 = math.ceil((east - t.c) / t.a) + _MARGIN_PX, math.ceil((south - t.f) / t.e) + _MARGIN_PX
     return t.c + x0 * t.a, t.f + y1 * t.e, t.c + x1 * t.a, t.f + y0 * t.e
-
-
-def _compound(horizontal: CRS, vertical: CRS) -> CRS:
-    from pyproj.crs import CompoundCRS
-
-    return CompoundCRS(f"{horizontal.name} + {vertical.name}", [horizontal, vertical])
 
 
 def _vertical(name: str, own: str | None, datum: str | None) -> CRS | None:
@@ -249,10 +246,5 @@ def write_heights(heights: Heights, out: Path, tags: Mapping[str, object]) -> No
     """
     (x, y), (right, down) = heights.corner, heights.step
     affine = [[right, 0.0, x + 0.5 * right], [0.0, -down, y - 0.5 * down]]
-    part = out.with_name(f"{out.name}.part")
-    try:
+    with replaced(out) as part:
         write_geotiff(part, np.nan_to_num(heights.heights_m, nan=NODATA), affine, heights.crs, NODATA, tags=tags)
-        os.replace(part, out)
-    except (MapError, OSError):
-        part.unlink(missing_ok=True)
-        raise

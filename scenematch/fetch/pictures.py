@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from engine.errors import MapError
 from scenematch.fetch.grid import Grid, reason_of
 from scenematch.fetch.urls import shown
+from scenematch.files.geotiff import replaced, tiled_profile
 
 ATTEMPTS = 5
 """Attempts per picture before the fetch fails."""
@@ -22,7 +22,6 @@ FIRST_WAIT_S = 2.0
 """Pause before the second attempt; doubled for each further one."""
 _OPAQUE = 128
 """Least alpha of a valid pixel, as when maps are read."""
-_BLOCK_PX = 256
 _CACHED = re.compile(r"[0-9a-f]{32}")  # names of GDAL's cached files
 _STATUS = re.compile(r"HTTP status code: (\d+), error: (.*?)\.?(?: Add the HTTP|$)")
 _BUSY = re.compile(r"HTTP status code: (429|5\d\d)|timed? ?out|reset by peer|Empty reply", re.IGNORECASE)
@@ -58,21 +57,21 @@ def fetch_pictures(
     import rasterio
     from rasterio.errors import RasterioError
 
-    part = out.with_name(f"{out.name}.part")
     level = {} if grid.overview is None else {"overview_level": grid.overview}
+    (x, y), (step_x, step_y), (width, height) = grid.corner, grid.step, grid.size_px
+    corner = np.array([[step_x, 0.0, x], [0.0, -step_y, y]])
+    profile = tiled_profile((height, width, 3), "uint8", corner, grid.crs)
     try:
         with (
+            replaced(out) as part,
             rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
             rasterio.open(grid.source, **level) as source,
-            rasterio.open(part, "w", **_profile(grid)) as file,
+            rasterio.open(part, "w", **profile) as file,
         ):
             yield from _copied(source, file, grid, lambda k: pause_s * (k > cached), url, say)
             file.update_tags(**{name: str(value) for name, value in tags.items()})
-        os.replace(part, out)
     except (RasterioError, OSError) as error:
         raise MapError(f"{out}: cannot be written: {str(error).splitlines()[0]}") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _copied(
@@ -134,19 +133,6 @@ def _told(reason: str) -> str:
     return f"the server answers {code}{more if code in ('401', '403') else ''}"
 
 
-def _profile(grid: Grid) -> dict[str, Any]:
-    from rasterio.crs import CRS
-    from rasterio.transform import Affine
-
-    (x, y), (step_x, step_y), (width, height) = grid.corner, grid.step, grid.size_px
-    return {
-        "driver": "GTiff", "dtype": "uint8", "count": 3, "width": width, "height": height,
-        "crs": CRS.from_wkt(grid.crs.to_wkt()), "transform": Affine(step_x, 0.0, x, 0.0, -step_y, y),
-        "photometric": "RGB", "tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX,
-        "compress": "deflate", "predictor": 2, "BIGTIFF": "IF_SAFER",
-    }  # fmt: skip
-
-
 def kept_pictures(folder: Path) -> list[Path]:
     """Files that an earlier fetch left in a folder."""
     return [file for file in folder.rglob("*") if file.is_file() and _CACHED.fullmatch(file.name)]
@@ -156,8 +142,7 @@ def remove_pictures(folder: Path, *, all_of_them: bool) -> None:
     """Remove the cached files if requested, and empty folders."""
     for file in kept_pictures(folder) if all_of_them else ():
         file.unlink()
-    for inner in sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True):
-        if not any(inner.iterdir()):
-            inner.rmdir()
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+    inner_first = sorted(folder.rglob("*"), reverse=True)
+    for path in (*inner_first, folder):
+        if path.is_dir() and not any(path.iterdir()):
+            path.rmdir()

@@ -20,10 +20,8 @@ _MAX_PX = 1024  # of a piece, if the server allows it
 def plan_wms(root: Xml.Element, url: str, wanted: Wanted, access: Access) -> Grid:
     """A map that the server draws on a grid in pixels of the size asked for."""
     layers = _asked_layers(root, wanted.layer or query_value(url, "layers"))
-    code, place = (
-        chosen_crs(wanted.crs, _offered_crs(root, next(iter(layers.values()))), wanted.place),
-        wanted.place,
-    )
+    place, first_layer = wanted.place, next(iter(layers.values()))
+    code = chosen_crs(wanted.crs, _offered_crs(root, first_layer), place)
     crs = crs_of(code)
     corner, step, size = _grid(place, crs, wanted.gsd_m_per_px)
     across, down = (

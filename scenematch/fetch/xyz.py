@@ -10,7 +10,6 @@ from scenematch.fetch.grid import FINE_ENOUGH, Access, Grid, gdal_xml, part_of
 from scenematch.fetch.place import Wanted
 from scenematch.fetch.urls import PLACEHOLDER, shown
 
-_HALF_WORLD_M = math.pi * 6378137.0
 _MAX_SIDE_PX = 2**31  # of GDAL's rasters
 
 
@@ -19,29 +18,22 @@ def is_template(url: str) -> bool:
     return bool(PLACEHOLDER.search(url))
 
 
-def check_template(url: str) -> None:
-    """Refuse a template that does not identify a tile.
+def plan_xyz(template: str, wanted: Wanted, tile_px: int, access: Access) -> Grid:
+    """The tiles of a template over a place, in Web Mercator.
 
     Raises:
-        OptionError: a placeholder is unknown, or one is missing.
+        OptionError: a placeholder of the template is unknown, or one is missing.
     """
-    if sorted(PLACEHOLDER.findall(url)) not in (["q"], ["x", "y", "z"], ["-y", "x", "z"]):
-        raise OptionError(
-            "source: expected {z}, {x} and {y} (or {-y}), or {q}, in a template of tiles, got "
-            f"{shown(url)!r}"
-        )
-
-
-def plan_xyz(template: str, wanted: Wanted, tile_px: int, access: Access) -> Grid:
-    """The tiles of a template over a place, in Web Mercator."""
-    check_template(template)
+    if sorted(PLACEHOLDER.findall(template)) not in (["q"], ["x", "y", "z"], ["-y", "x", "z"]):
+        expected = "{z}, {x} and {y} (or {-y}), or {q}, in a template of tiles"
+        raise OptionError(f"source: expected {expected}, got {shown(template)!r}")
     crs, place = crs_of("EPSG:3857"), wanted.place
+    half = math.pi * 6378137.0  # of the world's side in metres
     deepest = (_MAX_SIDE_PX // tile_px - 1).bit_length() - 1
-    steps = [2.0 * _HALF_WORLD_M / (tile_px << zoom) for zoom in range(deepest + 1)]
+    steps = [2.0 * half / (tile_px << zoom) for zoom in range(deepest + 1)]
     fine = [z for z, s in enumerate(steps) if place.gsd_m_per_px((s, s), crs) <= wanted.gsd_m_per_px * FINE_ENOUGH]
     zoom = min(fine, default=deepest)
     named = {"z": "${z}", "x": "${x}", "y": "${y}", "-y": "${y}", "q": "${quadkey}"}
-    half = _HALF_WORLD_M
     window = {
         "UpperLeftX": -half, "UpperLeftY": half, "LowerRightX": half, "LowerRightY": -half, "TileLevel": zoom,
         "TileCountX": 1, "TileCountY": 1, "YOrigin": "bottom" if "{-y}" in template else "top",

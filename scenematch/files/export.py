@@ -58,6 +58,10 @@ class PoseRow(TrackRow):
 Segment = list[PoseRow]
 _ANGLES = ("roll_deg", "pitch_deg", "heading_deg", "roll_sigma_deg", "pitch_sigma_deg", "heading_sigma_deg")
 _NOTED = ("sigma_up_m", *_ANGLES)
+_PROPERTIES = (
+    "up_m", "alt_amsl_m", *_ANGLES, "sigma_east_m", "sigma_north_m", "sigma_up_m", "covariance_en_m2",
+    "method", "score",
+)  # fmt: skip
 
 
 def pose_rows(
@@ -106,11 +110,11 @@ def to_gpx(rows: Sequence[PoseRow]) -> str:
 
 
 def _gpx_point(row: PoseRow) -> str:
-    time = _utc(row)
+    time = _utc_text(row)
     # The schema prescribes the order elevation, time, name.
     elements = [
         "" if row.alt_amsl_m is None else f"<ele>{row.alt_amsl_m:.3f}</ele>",
-        "" if time is None else f"<time>{_iso(time)}</time>",
+        "" if time is None else f"<time>{time}</time>",
         f"<name>{escape(row.frame)}</name>",
     ]
     return f'<trkpt lat="{row.lat_deg:.9f}" lon="{_lon_deg(row):.9f}">{"".join(elements)}</trkpt>'
@@ -137,21 +141,8 @@ def _feature(kind: str, coordinates: object, properties: dict[str, object]) -> d
 
 
 def _properties(row: PoseRow) -> dict[str, object]:
-    time = _utc(row)
-    return {
-        "frame": row.frame,
-        "timestamp_ns": row.timestamp_ns,
-        "time": None if time is None else _iso(time),
-        "up_m": row.up_m,
-        "alt_amsl_m": row.alt_amsl_m,
-        **{name: getattr(row, name) for name in _ANGLES},
-        "sigma_east_m": row.sigma_east_m,
-        "sigma_north_m": row.sigma_north_m,
-        "sigma_up_m": row.sigma_up_m,
-        "covariance_en_m2": row.covariance_en_m2,
-        "method": row.method,
-        "score": row.score,
-    }
+    times = {"timestamp_ns": row.timestamp_ns, "time": _utc_text(row)}
+    return {"frame": row.frame} | times | {name: getattr(row, name) for name in _PROPERTIES}
 
 
 def to_tum(rows: Sequence[PoseRow]) -> str:
@@ -200,19 +191,13 @@ def _lon_deg(row: PoseRow) -> float:
     return row.lon_deg if -180.0 <= row.lon_deg < 180.0 else (row.lon_deg + 180.0) % 360.0 - 180.0
 
 
-def _utc(row: PoseRow) -> datetime | None:
+def _utc_text(row: PoseRow) -> str | None:
+    """The time of day in microseconds; None if the stamp does not state one."""
     if row.timestamp_ns is None or row.timestamp_ns < UTC_FROM_NS:
         return None
-    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=row.timestamp_ns // 1000)
-
-
-def _iso(time: datetime) -> str:
+    time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=row.timestamp_ns // 1000)
     return f"{time:%Y-%m-%dT%H:%M:%S}.{time.microsecond:06d}Z"
 
 
-WRITERS: dict[str, Callable[[Sequence[PoseRow]], str]] = {
-    "gpx": to_gpx,
-    "geojson": to_geojson,
-    "tum": to_tum,
-}
+WRITERS: dict[str, Callable[[Sequence[PoseRow]], str]] = {"gpx": to_gpx, "geojson": to_geojson, "tum": to_tum}
 """Function that formats a track, by the name of the format."""

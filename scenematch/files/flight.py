@@ -142,10 +142,8 @@ def open_flight(
         CalibrationError: the first image has another size than the calibration.
     """
     source = BagFrames(Path(frames), image_topic) if is_bag(frames) else open_frames(frames)
-    if telemetry is None and isinstance(source, BagFrames):
-        telemetry = frames
     if telemetry is None:
-        telemetry = subtitles_beside(frames)
+        telemetry = frames if isinstance(source, BagFrames) else subtitles_beside(frames)
     height_sources: list[str] = []
     remarks: list[str] = []
     of_gimbal = telemetry is None or Path(telemetry).suffix.lower() == ".srt"

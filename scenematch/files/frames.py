@@ -11,12 +11,19 @@ import itertools
 import math
 import re
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Suffixes of image files, in lower or upper case."""
@@ -38,11 +45,9 @@ class FrameSource(ABC):
     def __contains__(self, name: object) -> bool:
         return name in self._known
 
-    @property
+    @cached_property
     def _known(self) -> frozenset[str]:
-        if not hasattr(self, "_names"):
-            self._names = frozenset(self.names)
-        return self._names
+        return frozenset(self.names)
 
     @abstractmethod
     def read(self, name: str) -> NDArray[np.uint8]:
@@ -90,7 +95,32 @@ class SinglePicture(PictureFolder):
         self.path, self.names = path.parent, [path.name]
 
 
-class VideoFile(FrameSource):
+class ForwardFrames(FrameSource):
+    """Frames that are decoded forward and named by their index; going back restarts at the first."""
+
+    _next = 0  # index of the frame that the decoder returns next
+    _last: tuple[int, NDArray[np.uint8]] | None = None
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """Read one frame as (H, W, 3) RGB uint8; fast for ascending indices."""
+        self.check_name(name)
+        index = int(name)
+        if self._last is None or self._last[0] != index:
+            if index < self._next:
+                self._restart()
+            self._last = index, self._decode(index)
+        return self._last[1].copy()
+
+    @abstractmethod
+    def _restart(self) -> None:
+        """Begin again with the first frame."""
+
+    @abstractmethod
+    def _decode(self, index: int) -> NDArray[np.uint8]:
+        """The frame at an index of ``_next`` or more, as (H, W, 3) RGB uint8; advances ``_next`` past it."""
+
+
+class VideoFile(ForwardFrames):
     """The frames of a video, decoded forward.
 
     An index is reached by decoding, not by seeking: containers seek to the nearest key frame or round a time
@@ -101,13 +131,13 @@ class VideoFile(FrameSource):
         import cv2
 
         self.path = path
-        self._reset()
+        self._restart()
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         if count < 1:  # the stream does not state its length
             while self._capture.grab():
                 self._next += 1
             count = self._next
-            self._reset()
+            self._restart()
         if count < 1:
             raise TelemetryError(f"{path}: expected a video, got a file without frames")
         self.names = [str(index) for index in range(count)]
@@ -125,37 +155,28 @@ class VideoFile(FrameSource):
         """
         import cv2
 
-        self._reset()
+        self._restart()
         stamps_ns: list[int] = []
         while len(stamps_ns) < len(self.names) and self._capture.grab():
             stamps_ns.append(round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
         rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
-        self._reset()
+        self._restart()
         if len(stamps_ns) > 1 and all(a < b for a, b in itertools.pairwise(stamps_ns)):
             return stamps_ns
         if not (math.isfinite(rate_hz) and rate_hz > 0.0):
             raise TelemetryError(f"{self.path}: expected a video with time stamps or a frame rate, got neither")
         return [round(i * 1e9 / rate_hz) for i in range(len(stamps_ns))]
 
-    def _reset(self) -> None:
+    def _restart(self) -> None:
         import cv2
 
-        self._capture = cv2.VideoCapture(str(self.path))
-        self._next = 0  # index of the frame that the decoder returns next
-        self._last: tuple[int, NDArray[np.uint8]] | None = None
+        self._capture, self._next = cv2.VideoCapture(str(self.path)), 0
         if not self._capture.isOpened():
             raise TelemetryError(f"{self.path}: expected a picture folder or a video, got a file that is neither")
 
-    def read(self, name: str) -> NDArray[np.uint8]:
-        """Read one frame as (H, W, 3) RGB uint8; fast for ascending indices."""
+    def _decode(self, index: int) -> NDArray[np.uint8]:
         import cv2
 
-        self.check_name(name)
-        index = int(name)
-        if self._last is not None and self._last[0] == index:
-            return self._last[1].copy()
-        if index < self._next:
-            self._reset()
         while self._next < index and self._capture.grab():
             self._next += 1
         success, image = self._capture.read() if self._next == index else (False, None)
@@ -165,9 +186,7 @@ class VideoFile(FrameSource):
                 f"got no more than {self._next}"
             )
         self._next += 1
-        rgb = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        self._last = (index, rgb)
-        return rgb.copy()
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def open_frames(path: str | Path) -> FrameSource:
@@ -198,23 +217,37 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     Raises:
         TelemetryError: the file is missing, empty, truncated or not an image.
     """
+    with opened_picture(path, str(path)) as picture:
+        if picture.mode.startswith("I;16"):
+            grey = (np.asarray(picture).astype(np.uint16) >> 8).astype(np.uint8)
+            return np.repeat(grey[:, :, None], 3, axis=2)
+        if picture.mode in ("I", "F"):
+            raise TelemetryError(f"{path}: expected a picture of 8 or 16 bits a channel, got mode {picture.mode}")
+        return np.array(picture.convert("RGB"), dtype=np.uint8)
+
+
+@contextmanager
+def opened_picture(source: str | Path | BinaryIO, name: str, kind: str = "picture") -> Iterator[Image]:
+    """An open picture of Pillow's, whose pixels may be damaged.
+
+    Args:
+        source: the file.
+        name: what it is, for messages.
+        kind: what was expected, for messages.
+
+    Raises:
+        TelemetryError: there is none, or it cannot be opened or, inside the block, decoded.
+    """
     from PIL import Image
 
     try:
-        with Image.open(path) as picture:
-            if picture.mode.startswith("I;16"):
-                grey = (np.asarray(picture).astype(np.uint16) >> 8).astype(np.uint8)
-                return np.repeat(grey[:, :, None], 3, axis=2)
-            if picture.mode in ("I", "F"):
-                raise TelemetryError(
-                    f"{path}: expected a picture of 8 or 16 bits a channel, got mode {picture.mode}"
-                )
-            return np.array(picture.convert("RGB"), dtype=np.uint8)
+        with Image.open(source) as picture:
+            yield picture
     except FileNotFoundError:
-        raise TelemetryError(f"{path}: no such picture") from None
+        raise TelemetryError(f"{name}: no such picture") from None
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise TelemetryError(f"{path}: expected a readable picture: {reason}") from None
+        raise TelemetryError(f"{name}: expected a readable {kind}: {reason}") from None
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +48,9 @@ def write_geotiff(
         OptionError: the affine transform is not finite, or is singular.
         MapError: the EPSG code is unknown, or the file cannot be written.
     """
+    import rasterio
+    from rasterio.errors import RasterioError
+
     array, affine = np.asarray(array), np.asarray(pixel_to_crs, dtype=np.float64)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or 0 in array.shape:
         raise ShapeError(f"array: expected (H, W) or (H, W, 3) with at least one pixel, got {array.shape}")
@@ -57,43 +62,51 @@ def write_geotiff(
         raise OptionError(f"pixel_to_crs: expected a finite, invertible affine transform, got {affine.tolist()}")
     corner = affine.copy()
     corner[:, 2] -= 0.5 * (affine[:, 0] + affine[:, 1])
-    _write(Path(path), array if array.ndim == 3 else array[:, :, None], corner, crs, nodata, tags or {})
-
-
-def _write(
-    path: Path,
-    bands: NDArray[Any],
-    corner: NDArray[np.float64],
-    crs: int | CRS,
-    nodata: float | None,
-    tags: Mapping[str, object],
-) -> None:
-    import rasterio
-    from rasterio.errors import RasterioError
-    from rasterio.transform import Affine
-
-    profile: dict[str, Any] = {
-        "driver": "GTiff",
-        "height": bands.shape[0],
-        "width": bands.shape[1],
-        "count": bands.shape[2],
-        "dtype": bands.dtype.name,
-        "transform": Affine(*corner.ravel().tolist()),
-        "nodata": nodata,
-        "tiled": True,
-        "blockxsize": 256,
-        "blockysize": 256,
-        "compress": "deflate",
-        "predictor": 3 if bands.dtype.kind == "f" else 2,
-        "BIGTIFF": "IF_SAFER",
-    }
-    if bands.shape[2] == 3:
-        profile["photometric"] = "RGB"
+    bands = array if array.ndim == 3 else array[:, :, None]
     try:
-        known = rasterio.CRS.from_epsg(crs) if isinstance(crs, int) else rasterio.CRS.from_wkt(crs.to_wkt())
-        with rasterio.open(path, "w", crs=known, **profile) as file:
+        profile = tiled_profile(bands.shape, bands.dtype.name, corner, crs)
+        with rasterio.open(path, "w", nodata=nodata, **profile) as file:
             file.write(np.moveaxis(bands, 2, 0))
             if tags:
                 file.update_tags(**{name: str(value) for name, value in tags.items()})
     except (RasterioError, OSError, ValueError) as error:
         raise MapError(f"{path}: cannot be written: {str(error).splitlines()[0]}") from None
+
+
+@contextmanager
+def replaced(out: Path) -> Iterator[Path]:
+    """A file beside ``out`` to write: it takes the place of ``out`` once it is complete, and else is removed."""
+    part = out.with_name(f"{out.name}.part")
+    try:
+        yield part
+        os.replace(part, out)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def tiled_profile(
+    shape: tuple[int, ...], dtype: str, pixel_corner_to_crs: NDArray[np.float64], crs: int | CRS
+) -> dict[str, Any]:
+    """What rasterio needs to create a tiled, losslessly compressed GeoTIFF.
+
+    Args:
+        shape: rows, columns and bands.
+        dtype: of the pixels.
+        pixel_corner_to_crs: (2, 3) affine transform from (x, y, 1), with pixel corners at integers.
+        crs: EPSG code of the CRS, or the CRS.
+
+    Raises:
+        CRSError: rasterio's, a ValueError: the EPSG code is unknown.
+    """
+    import rasterio
+    from rasterio.transform import Affine
+
+    height, width, count = shape
+    profile = {
+        "driver": "GTiff", "width": width, "height": height, "count": count, "dtype": dtype,
+        "crs": rasterio.CRS.from_epsg(crs) if isinstance(crs, int) else rasterio.CRS.from_wkt(crs.to_wkt()),
+        "transform": Affine(*pixel_corner_to_crs.ravel().tolist()),
+        "tiled": True, "blockxsize": 256, "blockysize": 256, "BIGTIFF": "IF_SAFER",
+        "compress": "deflate", "predictor": 3 if dtype.startswith("float") else 2,
+    }  # fmt: skip
+    return profile | {"photometric": "RGB"} if count == 3 else profile

@@ -21,7 +21,7 @@ import numpy as np
 from engine.errors import TelemetryError
 from engine.geo import attitude_from_rotation, enu_from_body, wrap_heading_deg
 from engine.values import Truth
-from scenematch.files.frames import PictureFolder
+from scenematch.files.frames import PictureFolder, opened_picture
 from scenematch.files.telemetry import TelemetryRow, take_off_sigma_m
 
 COMPASS_SIGMA_DEG = 3.0
@@ -77,17 +77,11 @@ def read_photo_tags(path: Path) -> PhotoTags:
     Raises:
         TelemetryError: the picture cannot be opened.
     """
-    from PIL import Image
-
-    try:
-        with Image.open(path) as picture:
-            tags, size_px = picture.getexif(), picture.size
-            gps, exif = tags.get_ifd(_GPS_IFD), tags.get_ifd(_EXIF_IFD)
-            software = str(tags.get(_SOFTWARE, "")).strip("\0 ")
-        with path.open("rb") as file:
-            head = file.read(_XMP_BYTES)
-    except (OSError, SyntaxError, ValueError) as error:
-        raise TelemetryError(f"{path}: expected a readable picture: {str(error).splitlines()[0]}") from None
+    with opened_picture(path, str(path)) as picture, path.open("rb") as file:
+        tags, size_px = picture.getexif(), picture.size
+        gps, exif = tags.get_ifd(_GPS_IFD), tags.get_ifd(_EXIF_IFD)
+        software = str(tags.get(_SOFTWARE, "")).strip("\0 ")
+        head = file.read(_XMP_BYTES)
     xmp = {key.decode(): float(value) for key, value in _XMP_VALUE.findall(head)}
     found = _XMP_DEWARP.search(head)
     numbers = [_finite(part) for part in found.group(1).split(b",")] if found else []
@@ -175,7 +169,7 @@ def _exif_row(tags: PhotoTags) -> TelemetryRow | None:
         return None
     height_m = tags.xmp.get("RelativeAltitude", 0.0)
     height_known = height_m > 0.0
-    attitude = {} if tags.was_turned else _gimbal_attitude(tags.xmp) or _flight_heading(tags)
+    attitude = {} if tags.was_turned else gimbal_columns(tags.xmp, _GIMBAL) or _flight_heading(tags)
     return TelemetryRow(
         timestamp_ns=stamp_ns,
         frame=tags.path.name,
@@ -211,7 +205,7 @@ def _finite(value: Any) -> float | None:
 def _position(gps: Mapping[int, Any]) -> dict[str, float | None]:
     lat_deg, lon_deg = _degrees(gps.get(2), gps.get(1) == "S"), _degrees(gps.get(4), gps.get(3) == "W")
     # Receivers without a fix write zeros.
-    if lat_deg is None or lon_deg is None or (lat_deg == 0.0 and lon_deg == 0.0):
+    if lat_deg is None or lon_deg is None or lat_deg == lon_deg == 0.0:
         return {}
     if abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0:
         return {}
@@ -235,7 +229,7 @@ def _altitude_m(gps: Mapping[int, Any]) -> float | None:
     return -altitude_m if altitude_m is not None and below_sea else altitude_m
 
 
-def _flight_heading(tags: PhotoTags) -> dict[str, float | None]:
+def _flight_heading(tags: PhotoTags) -> dict[str, float]:
     """The vehicle's heading, or the receiver's direction if relative to true north."""
     heading_deg = _finite(tags.xmp.get("FlightYawDegree"))
     if heading_deg is None and tags.gps.get(16) == "T":
@@ -245,28 +239,20 @@ def _flight_heading(tags: PhotoTags) -> dict[str, float | None]:
     return {"heading_deg": wrap_heading_deg(heading_deg), "heading_sigma_deg": COMPASS_SIGMA_DEG}
 
 
-def _gimbal_attitude(xmp: Mapping[str, float]) -> dict[str, float | None] | None:
-    try:
-        roll_deg, pitch_deg, yaw_deg = (xmp[name] for name in _GIMBAL)
-    except KeyError:
-        return None
-    return gimbal_columns(roll_deg, pitch_deg, yaw_deg)
-
-
-def gimbal_columns(roll_deg: float, pitch_deg: float, yaw_deg: float) -> dict[str, float | None] | None:
-    """Telemetry columns from a gimbal's angles; all None if they are zero, as models without a gimbal write.
+def gimbal_columns(values: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
+    """Telemetry columns from a gimbal's angles; none if one is missing or all are zero, as without a gimbal.
 
     Args:
-        roll_deg: of the gimbal.
-        pitch_deg: of the gimbal, -90 looks straight down.
-        yaw_deg: of the gimbal, clockwise from true north.
+        values: numbers by name.
+        names: of the gimbal's roll, its pitch, where -90 looks straight down, and its yaw from true north.
     """
-    if roll_deg == pitch_deg == yaw_deg == 0.0:
-        return None
-    body_roll_deg, body_pitch_deg, heading_deg = nadir_attitude(roll_deg, pitch_deg, yaw_deg)
+    angles_deg = [values[name] for name in names if name in values]
+    if len(angles_deg) < 3 or not any(angles_deg):
+        return {}
+    roll_deg, pitch_deg, heading_deg = nadir_attitude(*angles_deg)
     return {
-        "roll_deg": body_roll_deg,
-        "pitch_deg": body_pitch_deg,
+        "roll_deg": roll_deg,
+        "pitch_deg": pitch_deg,
         "heading_deg": heading_deg,
         "heading_sigma_deg": COMPASS_SIGMA_DEG,
         "tilt_sigma_deg": GIMBAL_SIGMA_DEG,

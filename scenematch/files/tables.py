@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from engine.errors import TelemetryError
+from engine.geo import wrap_heading_deg
 from engine.values import MAX_SIGMA_M
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
@@ -59,11 +60,13 @@ class CsvRow:
         path: the file.
         line: line number in the file, from 1.
         values: stripped text by column; blank where the file lacks the column.
+        header: all columns of the file.
     """
 
     path: Path
     line: int
     values: Mapping[str, str]
+    header: Sequence[str]
 
     def error(self, column: str, expected: str) -> TelemetryError:
         """Create the error of one cell."""
@@ -94,7 +97,7 @@ class CsvRow:
         return value
 
     def number(self, column: str, bounds: Bounds = ANY) -> float | None:
-        """A finite number within ``bounds``, or None if blank."""
+        """A finite number within ``bounds``, or None if blank; a heading is normalised to [0, 360)."""
         text = self.values[column]
         if not text:
             return None
@@ -102,7 +105,7 @@ class CsvRow:
         value = float(text) if _NUMBER.fullmatch(text) else math.nan
         if not (math.isfinite(value) and bounds.low <= value <= bounds.high):
             raise self.error(column, bounds.text)
-        return value
+        return wrap_heading_deg(value) if bounds is HEADING else value
 
     def required(self, column: str, bounds: Bounds = ANY) -> float:
         """A finite number within ``bounds`` that must not be blank."""
@@ -166,11 +169,20 @@ def read_table(
         with path.open(encoding="utf-8-sig", newline="") as file:
             delimiter = _delimiter(file)
             reader = csv.reader(file, delimiter=delimiter)
-            columns = _Header(path, _names(reader), names).columns(required, optional, instead, hint)
+            header = _names(reader)
+            if not any(header):
+                expected = f"a header with {', '.join(required)}"
+                raise TelemetryError(f"{path}: expected {expected}, got an empty first line")
+            places = {column: _place(path, header, column, names) for column in (*required, *optional)}
+            for column in required:
+                if all(places[name] is None for name in (column, *instead.get(column, ()))):
+                    its = f"its columns are {quoted(','.join(header))}{hint}"
+                    raise TelemetryError(f"{path}: line 1: lacks the column {column}; {its}")
             marks = None if delimiter == "," else _Marks(path)
             for row in reader:
                 if any(cell.strip() for cell in row):
-                    yield _cells(path, reader.line_num, row, columns, marks)
+                    _check_length(path, reader.line_num, row, len(header))
+                    yield CsvRow(path, reader.line_num, _cells(reader.line_num, row, places, marks), header)
     except FileNotFoundError:
         raise TelemetryError(f"{path}: no such file") from None
     except UnicodeDecodeError as error:
@@ -181,12 +193,6 @@ def read_table(
         raise TelemetryError(f"{path}: line {reader.line_num}: expected comma-separated text: {error}") from None
     except OSError as error:
         raise TelemetryError(f"{path}: cannot be read: {error.strerror or error}") from None
-
-
-def read_header(path: str | Path) -> list[str]:
-    """The columns of a table that :func:`read_table` has read."""
-    with Path(path).open(encoding="utf-8-sig", newline="") as file:
-        return _names(csv.reader(file, delimiter=_delimiter(file)))
 
 
 def _delimiter(file: TextIO) -> str:
@@ -202,48 +208,18 @@ def _names(reader: Iterator[list[str]]) -> list[str]:
     return [name.strip() for name in (names[0].split(",") if len(names) == 1 else names)]
 
 
-@dataclass(frozen=True, slots=True)
-class _Columns:
-    count: int
-    index: Mapping[str, int | None]
-
-
-@dataclass(frozen=True, slots=True)
-class _Header:
-    path: Path
-    found: Sequence[str]
-    names: Mapping[str, str]
-
-    def columns(
-        self,
-        required: Sequence[str],
-        optional: Sequence[str],
-        instead: Mapping[str, Sequence[str]],
-        hint: str,
-    ) -> _Columns:
-        """The positions of the columns in a row."""
-        if not any(self.found):
-            raise TelemetryError(
-                f"{self.path}: expected a header with {', '.join(required)}, got an empty first line"
-            )
-        index = {column: self._place(column) for column in (*required, *optional)}
-        for column in required:
-            if all(index[name] is None for name in (column, *instead.get(column, ()))):
-                its = f"its columns are {quoted(','.join(self.found))}{hint}"
-                raise TelemetryError(f"{self.path}: line 1: lacks the column {column}; {its}")
-        return _Columns(len(self.found), index)
-
-    def _place(self, column: str) -> int | None:
-        name = self.names.get(column, column)
-        count = self.found.count(name)
-        if count > 1:
-            raise TelemetryError(f"{self.path}: line 1, {name}: expected the column once, got it {count} times")
-        if not count and column in self.names:
-            raise TelemetryError(
-                f"{self.path}: line 1: lacks the column {name}, which the settings name as {column}; "
-                f"its columns are {quoted(','.join(self.found))}"
-            )
-        return self.found.index(name) if count else None
+def _place(path: Path, header: Sequence[str], column: str, names: Mapping[str, str]) -> int | None:
+    """The position of a column in a row; None if the file lacks it."""
+    name = names.get(column, column)
+    count = header.count(name)
+    if count > 1:
+        raise TelemetryError(f"{path}: line 1, {name}: expected the column once, got it {count} times")
+    if not count and column in names:
+        raise TelemetryError(
+            f"{path}: line 1: lacks the column {name}, which the settings name as {column}; "
+            f"its columns are {quoted(','.join(header))}"
+        )
+    return header.index(name) if count else None
 
 
 @dataclass(slots=True)
@@ -267,21 +243,17 @@ class _Marks:
         return cell.replace(",", ".")
 
 
-def _cells(path: Path, line: int, row: list[str], columns: _Columns, marks: _Marks | None) -> CsvRow:
-    # Spreadsheets append commas to lines; a cell with content must have a column.
-    if len(row) < columns.count or any(cell.strip() for cell in row[columns.count :]):
-        raise TelemetryError(
-            f"{path}: line {line}: expected {columns.count} cells as in the header, got {len(row)}"
-        )
-    values = {name: "" if i is None else row[i].strip() for name, i in columns.index.items()}
-    if marks is not None:
-        values = {name: marks.pointed(line, cell) for name, cell in values.items()}
-    return CsvRow(path, line, values)
+def _cells(
+    line: int, row: Sequence[str], places: Mapping[str, int | None], marks: _Marks | None
+) -> dict[str, str]:
+    cells = {name: "" if i is None else row[i].strip() for name, i in places.items()}
+    return cells if marks is None else {name: marks.pointed(line, cell) for name, cell in cells.items()}
 
 
-def known_columns(rows: Sequence[Any], required: Sequence[str], optional: Sequence[str]) -> list[str]:
-    """The required columns, and the optional ones with a value in at least one row."""
-    return [*required, *(name for name in optional if any(getattr(row, name) is not None for row in rows))]
+def _check_length(path: Path, line: int, row: Sequence[str], count: int) -> None:
+    """Spreadsheets append commas to lines; a cell with content must have a column."""
+    if len(row) < count or any(cell.strip() for cell in row[count:]):
+        raise TelemetryError(f"{path}: line {line}: expected {count} cells as in the header, got {len(row)}")
 
 
 def cell_text(value: object, decimals: int) -> str:
@@ -293,6 +265,31 @@ def cell_text(value: object, decimals: int) -> str:
     if isinstance(value, float):
         return f"{round(value, decimals) + 0.0:.{decimals}f}"
     return str(value)
+
+
+def write_known(
+    path: str | Path,
+    rows: Sequence[Any],
+    required: Sequence[str],
+    optional: Iterable[str],
+    decimals: Mapping[str, int],
+) -> None:
+    """Write the required columns, and the optional ones that any row has.
+
+    Args:
+        path: the file.
+        rows: with an attribute for each column; None is unknown.
+        required: columns to write.
+        optional: columns to write if at least one row has a value.
+        decimals: of a number, by column; 4 for others.
+
+    Raises:
+        TelemetryError: the file cannot be written.
+    """
+    known = [name for name in optional if any(getattr(row, name) is not None for row in rows)]
+    columns = [*required, *known]
+    table = ([cell_text(getattr(row, name), decimals.get(name, 4)) for name in columns] for row in rows)
+    write_table(path, columns, table)
 
 
 def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import TelemetryError
-from engine.geo import wrap_heading_deg
 from engine.values import Prior
 from scenematch.files.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
 from scenematch.files.tables import (
@@ -26,11 +25,8 @@ from scenematch.files.tables import (
     QUARTER_TURN,
     SIGMA,
     CsvRow,
-    cell_text,
-    known_columns,
-    read_header,
     read_table,
-    write_table,
+    write_known,
 )
 
 __all__ = [
@@ -106,7 +102,7 @@ def take_off_sigma_m(height_m: float) -> float:
 
 
 _TAKE_OFF_M, _TAKE_OFF_SHARE = 5.0, 0.05
-_BOUNDS = {
+BOUNDS = {
     "height_agl_m": POSITIVE,
     "height_sigma_m": POSITIVE_SIGMA,
     "alt_amsl_m": ANY,
@@ -126,7 +122,7 @@ _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(
     ("height_agl_m", "height_sigma_m", "alt_amsl_m", "sigma_m"), 3
 )
 _REQUIRED = ("timestamp_ns", "frame")
-COLUMNS = (*STAMP_COLUMNS, "frame", *_BOUNDS)
+COLUMNS = (*STAMP_COLUMNS, "frame", *BOUNDS)
 """All columns that telemetry.csv may have."""
 _HINT = "; [telemetry_columns] of the settings names those that are ours"
 
@@ -168,7 +164,7 @@ def open_telemetry(
     Raises:
         TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
     """
-    optional = (*STAMP_COLUMNS[1:], *_BOUNDS)
+    optional = (*STAMP_COLUMNS[1:], *BOUNDS)
     csv_rows = list(read_table(path, _REQUIRED, optional, instead=OTHER_STAMPS, names=names, hint=_HINT))
     stamps = read_stamps(csv_rows)
     rows: list[TelemetryRow] = []
@@ -184,18 +180,16 @@ def open_telemetry(
     if not rows:
         raise TelemetryError(f"{path}: expected one row per frame, got a header and no rows")
     read = {names.get(ours, ours) for ours in COLUMNS}
-    unread = ", ".join(name for name in read_header(path) if name and name not in read)
+    unread = ", ".join(name for name in csv_rows[0].header if name and name not in read)
     remarks = [stamps.remark, unread and f"{Path(path).name}: columns that are not read: {unread}{_HINT}"]
     return Telemetry(rows, [remark for remark in remarks if remark])
 
 
 def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:
-    values = {name: csv_row.number(name, bounds) for name, bounds in _BOUNDS.items()}
+    values = {name: csv_row.number(name, bounds) for name, bounds in BOUNDS.items()}
     for name, other in (("lat_deg", "lon_deg"), ("lon_deg", "lat_deg")):
         if values[name] is None and values[other] is not None:
             raise csv_row.error(name, f"a value, as {other} has one")
-    if values["heading_deg"] is not None:
-        values["heading_deg"] = wrap_heading_deg(values["heading_deg"])
     return TelemetryRow(timestamp_ns=stamp_ns, frame=csv_row.text("frame"), **values)
 
 
@@ -205,9 +199,7 @@ def write_telemetry(path: str | Path, rows: Sequence[TelemetryRow]) -> None:
     Raises:
         TelemetryError: the file cannot be written.
     """
-    columns = known_columns(rows, _REQUIRED, tuple(_BOUNDS))
-    table = ([cell_text(getattr(row, name), _DECIMALS.get(name, 4)) for name in columns] for row in rows)
-    write_table(path, columns, table)
+    write_known(path, rows, _REQUIRED, BOUNDS, _DECIMALS)
 
 
 def ground_amsl_m(rows: Sequence[TelemetryRow]) -> float | None:

@@ -10,18 +10,8 @@ from engine.errors import TelemetryError
 from engine.geo import wrap_difference_deg, wrap_heading_deg
 from engine.values import Truth
 from scenematch.files.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
-from scenematch.files.tables import (
-    ANY,
-    HALF_TURN,
-    HEADING,
-    LONGITUDE,
-    QUARTER_TURN,
-    cell_text,
-    known_columns,
-    read_table,
-    write_table,
-)
-from scenematch.files.telemetry import TelemetryRow
+from scenematch.files.tables import ANY, read_table, write_known
+from scenematch.files.telemetry import BOUNDS, TelemetryRow
 
 __all__ = ["Truth", "interpolate_truth", "read_truth", "write_truth"]
 
@@ -30,12 +20,8 @@ MAX_TRUTH_GAP_NS = 5_000_000_000
 
 _REQUIRED = ("timestamp_ns", "lat_deg", "lon_deg")
 _OPTIONAL = {
-    "alt_amsl_m": ANY,
-    "height_agl_m": ANY,
-    "roll_deg": HALF_TURN,
-    "pitch_deg": QUARTER_TURN,
-    "heading_deg": HEADING,
-}
+    name: BOUNDS[name] for name in ("alt_amsl_m", "height_agl_m", "roll_deg", "pitch_deg", "heading_deg")
+} | {"height_agl_m": ANY}
 _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg"), 5)
 
 
@@ -49,9 +35,7 @@ def read_truth(path: str | Path) -> list[Truth]:
     csv_rows = list(read_table(path, _REQUIRED, (*STAMP_COLUMNS[1:], *_OPTIONAL), instead=OTHER_STAMPS))
     for csv_row, stamp_ns in zip(csv_rows, read_stamps(csv_rows).ns, strict=True):
         values = {name: csv_row.number(name, bounds) for name, bounds in _OPTIONAL.items()}
-        if values["heading_deg"] is not None:
-            values["heading_deg"] = wrap_heading_deg(values["heading_deg"])
-        lat_deg, lon_deg = csv_row.required("lat_deg", QUARTER_TURN), csv_row.required("lon_deg", LONGITUDE)
+        lat_deg, lon_deg = (csv_row.required(name, BOUNDS[name]) for name in ("lat_deg", "lon_deg"))
         rows.append(Truth(timestamp_ns=stamp_ns, lat_deg=lat_deg, lon_deg=lon_deg, **values))
     if not rows:
         raise TelemetryError(f"{path}: expected rows of truth, got a header and no rows")
@@ -64,9 +48,7 @@ def write_truth(path: str | Path, rows: Sequence[Truth]) -> None:
     Raises:
         TelemetryError: the file cannot be written.
     """
-    columns = known_columns(rows, _REQUIRED, tuple(_OPTIONAL))
-    table = ([cell_text(getattr(row, name), _DECIMALS.get(name, 4)) for name in columns] for row in rows)
-    write_table(path, columns, table)
+    write_known(path, rows, _REQUIRED, _OPTIONAL, _DECIMALS)
 
 
 def truth_from_telemetry(row: TelemetryRow, lat_deg: float, lon_deg: float, shift_ns: int = 0) -> Truth:

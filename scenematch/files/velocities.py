@@ -10,10 +10,8 @@ from numpy.typing import ArrayLike
 
 from engine.options import AssumedErrors
 
-_MIN_SIGMA_MPS, _MAX_SIGMA_MPS = (
-    0.1,
-    5.0,
-)  # odometry often states too small covariances; beyond the maximum it is lost
+# Odometry often states too small covariances; beyond the maximum it is lost.
+_MIN_SIGMA_MPS, _MAX_SIGMA_MPS = 0.1, 5.0
 _MAX_SPEED_MPS = 150.0
 
 

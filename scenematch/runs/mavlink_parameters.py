@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import require
-from scenematch.bridges.parameters import ParameterOptions, parameter_file
+from scenematch.bridges.parameters import parameter_file
 from scenematch.runs.folders import StrPath, check_file
 from scenematch.runs.last_fix import measured_delay_ms
 from scenematch.runs.mavlink_bridge import MavlinkSettings
@@ -57,11 +57,7 @@ def write_parameter_file(
     require("pymavlink", "mavlink")
     out, outgoing, settings = Path(out), link.outgoing(), settings or ParameterSettings()
     written = _delay(settings.delay_ms)
-    options = ParameterOptions(
-        firmware=link.firmware, message=outgoing.kind, takeoff=settings.takeoff, gps_id=link.gps_id,
-        delay_ms=written.delay_ms, max_sigma_m=link.max_sigma_m,
-    )  # fmt: skip
-    text = parameter_file(options)
+    text = parameter_file(outgoing, settings.takeoff, written.delay_ms)
     check_file(out, force)
     out.write_text(text, encoding="utf-8")
     return written

@@ -55,7 +55,7 @@ from scenematch.bridges.packets import (
     read_key,
     signing_time,
 )
-from scenematch.bridges.parameters import ParameterOptions, parameter_file
+from scenematch.bridges.parameters import parameter_file
 from scenematch.bridges.pictures import replay
 from scenematch.bridges.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
 from scenematch.cli.app import run as main
@@ -686,9 +686,9 @@ def test_nothing_listens_off_loopback_unless_told(host):
 # ---------------------------------------------------------------------------------------------- parameters
 
 
-def parameters(**options):
+def parameters(message, gps_id=0, **options):
     """Values by name of a parameter file of ArduPilot."""
-    text = parameter_file(ParameterOptions(firmware="ardupilot", **options))
+    text = parameter_file(MavlinkOptions(message=message, gps_id=gps_id), **options)
     return dict(line.split(",") for line in text.splitlines() if not line.startswith("#"))
 
 
@@ -696,14 +696,14 @@ def test_parameter_files():
     values = parameters(message="vision_position_estimate", delay_ms=120)
     assert (values["VISO_TYPE"], values["VISO_DELAY_MS"], values["EK3_SRC1_POSXY"]) == ("1", "120", "6")
     assert values["GPS1_TYPE"] == "0"
-    text = parameter_file(ParameterOptions(firmware="px4", message="global_position_sensor", delay_ms=120))
+    text = parameter_file(MavlinkOptions(firmware="px4", message="global_position_sensor"), delay_ms=120)
     rows = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
     assert all(len(row) == 5 and row[:2] == ["1", "1"] and len(row[2]) <= 16 for row in rows)
     assert ["1", "1", "EKF2_AGP0_CTRL", "1", "6"] in rows
     assert ["1", "1", "EKF2_AGP0_DELAY", "120", "9"] in rows
-    assert "EKF2_EV_CTRL\t1\t6" in parameter_file(ParameterOptions(firmware="px4", message="odometry"))
+    assert "EKF2_EV_CTRL\t1\t6" in parameter_file(MavlinkOptions(firmware="px4", message="odometry"))
     with pytest.raises(OptionError, match="250"):
-        ParameterOptions(firmware="ardupilot", message="vision_position_estimate", delay_ms=251)
+        parameter_file(MavlinkOptions(message="vision_position_estimate"), delay_ms=251)
 
 
 def test_a_take_off_with_gnss_leaves_the_receiver_in_the_first_source_set_and_a_switch():
@@ -712,7 +712,7 @@ def test_a_take_off_with_gnss_leaves_the_receiver_in_the_first_source_set_and_a_
     assert "GPS1_TYPE" not in values
     assert {"FS_EKF_ACTION", "FS_EKF_THRESH"} <= set(values)
     with pytest.raises(OptionError, match="takeoff: expected none for px4"):
-        ParameterOptions(firmware="px4", message="odometry", takeoff="gnss")
+        parameter_file(MavlinkOptions(firmware="px4", message="odometry"), takeoff="gnss")
 
 
 def test_gps_input_stands_beside_a_receiver_as_the_second():
@@ -722,7 +722,7 @@ def test_gps_input_stands_beside_a_receiver_as_the_second():
     assert parameters(message="gps_input", delay_ms=0)["GPS1_DELAY_MS"] == "1"  # 0 would mean 200
     assert fix_message(sending(), MavlinkOptions(message="gps_input", gps_id=1)).gps_id == 1
     with pytest.raises(OptionError, match="gps_id: expected 1 or more beside a receiver"):
-        ParameterOptions(firmware="ardupilot", message="gps_input", takeoff="gnss")
+        parameter_file(MavlinkOptions(message="gps_input"), takeoff="gnss")
     with pytest.raises(OptionError, match="gps_id: expected with gps_input only"):
         MavlinkOptions(gps_id=1)
 

@@ -271,36 +271,36 @@ def test_telemetry_is_that_of_the_capture(maker):
     heard, step_ns = RosTelemetry(), 100_000_000
     for k in range(6):
         time_ns = NOW_NS + k * step_ns
-        heard.imu(maker.imu(time_ns, "", 2.0 * k, -k, 350.0 + 5.0 * k))
-        heard.height(100.0 + k, time_ns)
-        heard.velocity(maker.velocity(time_ns, "", k, -2.0 * k))
+        heard.add("imu", maker.imu(time_ns, "", 2.0 * k, -k, 350.0 + 5.0 * k), 0)
+        heard.add("height", maker.float64(100.0 + k), time_ns)
+        heard.add("velocity", maker.velocity(time_ns, "", k, -2.0 * k), 0)
     now = heard.vehicle(NOW_NS + 250_000_000)
     assert (now.roll_deg, now.pitch_deg) == pytest.approx((5.0, -2.5))
     assert now.heading_deg == pytest.approx(2.5)
     assert (now.height_agl_m, now.down_m) == pytest.approx((102.5, -102.5))
     assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx((2.5, -5.0))
-    heard.compass(20.0, NOW_NS + 250_000_000)
+    heard.add("compass", maker.float64(20.0), NOW_NS + 250_000_000)
     assert heard.vehicle(NOW_NS + 250_000_000).heading_deg == pytest.approx(20.0)
     assert heard.vehicle(NOW_NS + 3_000_000_000) == VehicleState()
 
 
 def test_the_beam_leans_with_the_body(maker):
     heard = RosTelemetry()
-    heard.imu(maker.imu(NOW_NS, "", 20.0, 30.0, 10.0))
-    heard.height(33.0, NOW_NS)
-    heard.range(a_range(maker, 40.0))
+    heard.add("imu", maker.imu(NOW_NS, "", 20.0, 30.0, 10.0), 0)
+    heard.add("height", maker.float64(33.0), NOW_NS)
+    heard.add("range", a_range(maker, 40.0), 0)
     _, _, down = body_axes(20.0, 30.0, 10.0)
     now = heard.vehicle(NOW_NS)
     assert now.height_agl_m == pytest.approx(-40.0 * down[2], abs=1e-5)
     assert now.down_m == -33.0
 
 
-def test_a_time_that_goes_back_begins_again():
+def test_a_time_that_goes_back_begins_again(maker):
     heard = RosTelemetry()
-    heard.height(100.0, NOW_NS)
-    heard.height(50.0, NOW_NS - 500_000_000)  # late, and of no use
+    heard.add("height", maker.float64(100.0), NOW_NS)
+    heard.add("height", maker.float64(50.0), NOW_NS - 500_000_000)  # late, and of no use
     assert heard.vehicle(NOW_NS).height_agl_m == 100.0
-    heard.height(70.0, NOW_NS - 60_000_000_000)
+    heard.add("height", maker.float64(70.0), NOW_NS - 60_000_000_000)
     assert heard.vehicle(NOW_NS - 60_000_000_000).height_agl_m == 70.0
     assert heard.vehicle(NOW_NS).height_agl_m is None
 
@@ -314,9 +314,9 @@ def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, chi
         angles = (roll_deg, pitch_deg, heading_deg)
         message = wired(ros, odometry_message(maker, NOW_NS, angles, enu_mps, yaw_deg=yaw_deg, child=child))
         heard = RosTelemetry()
-        heard.odometry(message, 0)
+        heard.add("odometry", message, 0)
         assert heard.vehicle(NOW_NS).east_velocity_mps is None  # towards nobody knows where
-        heard.imu(maker.imu(NOW_NS, "", *angles))
+        heard.add("imu", maker.imu(NOW_NS, "", *angles), 0)
         now = heard.vehicle(NOW_NS)
         assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx(enu_mps[:2], abs=1e-9)
         assert now.velocity_sigma_mps is None  # zeros state nothing
@@ -341,8 +341,8 @@ def test_an_odometrys_covariance_is_that_of_the_velocity(ros, maker, variances, 
     else:
         assert stated == pytest.approx((10.0, 0.0, 0.0, sigma_mps), abs=1e-9)
         heard = RosTelemetry()
-        heard.odometry(message, 0)
-        heard.imu(maker.imu(NOW_NS, "", 0.0, 0.0, 90.0))
+        heard.add("odometry", message, 0)
+        heard.add("imu", maker.imu(NOW_NS, "", 0.0, 0.0, 90.0), 0)
         frame = heard.vehicle(NOW_NS).frame(np.zeros((4, 6), np.uint8), NOW_NS)
         assert frame.velocity_sigma_mps == (pytest.approx(sigma_mps) if sigma_mps else None)
 
@@ -351,10 +351,10 @@ def test_a_velocity_takes_the_place_of_an_odometry_that_is_silent(maker):
     heard = RosTelemetry()
     for after_ms in (0, 500, 1000, 1500):
         time_ns = NOW_NS + after_ms * 1_000_000
-        heard.imu(maker.imu(time_ns, "", 0.0, 0.0, 90.0))
-        heard.velocity(maker.velocity(time_ns, "", 3.0, 4.0))
+        heard.add("imu", maker.imu(time_ns, "", 0.0, 0.0, 90.0), 0)
+        heard.add("velocity", maker.velocity(time_ns, "", 3.0, 4.0), 0)
         if after_ms <= 500:
-            heard.odometry(odometry_message(maker, time_ns, (0.0, 0.0, 90.0), (1.0, 0.0, 0.0)), 0)
+            heard.add("odometry", odometry_message(maker, time_ns, (0.0, 0.0, 90.0), (1.0, 0.0, 0.0)), 0)
     known = [heard.vehicle(NOW_NS + after_ms * 1_000_000) for after_ms in (500, 900, 1100, 1500)]
     velocities = [(now.east_velocity_mps, now.north_velocity_mps) for now in known]
     assert velocities == [pytest.approx(v, abs=1e-9) for v in ((1.0, 0.0), (1.0, 0.0), (3.0, 4.0), (3.0, 4.0))]
@@ -363,9 +363,9 @@ def test_a_velocity_takes_the_place_of_an_odometry_that_is_silent(maker):
 def test_an_accuracy_that_one_odometry_states_and_the_next_does_not_is_not_mixed(maker):
     heard, step_ns = RosTelemetry(), 100_000_000
     for time_ns, variances in ((NOW_NS, (0.04, 0.04, 0.04)), (NOW_NS + step_ns, None)):
-        heard.imu(maker.imu(time_ns, "", 0.0, 0.0, 90.0))
+        heard.add("imu", maker.imu(time_ns, "", 0.0, 0.0, 90.0), 0)
         message = odometry_message(maker, time_ns, (0.0, 0.0, 90.0), (1.0, 0.0, 0.0), variances=variances)
-        heard.odometry(message, 0)
+        heard.add("odometry", message, 0)
     stated_mps = math.hypot(0.2, math.radians(1.0))
     assert heard.vehicle(NOW_NS + step_ns // 4).velocity_sigma_mps == pytest.approx(stated_mps)
     assert heard.vehicle(NOW_NS + 3 * step_ns // 4).velocity_sigma_mps is None
@@ -379,8 +379,10 @@ def test_an_odometry_that_says_nothing(maker):
     message.pose.pose.orientation.w = 5.0  # no turn, which a twist along the pose's frame needs
     assert body_velocity_from_message(message) is None
     heard = RosTelemetry()
-    heard.imu(maker.imu(NOW_NS, "", *angles))
-    heard.odometry(odometry_message(maker, 0, angles, (1.0, 2.0, 3.0)), NOW_NS)  # without a stamp it is of now
+    heard.add("imu", maker.imu(NOW_NS, "", *angles), 0)
+    heard.add(
+        "odometry", odometry_message(maker, 0, angles, (1.0, 2.0, 3.0)), NOW_NS
+    )  # without a stamp it is of now
     assert heard.vehicle(NOW_NS).north_velocity_mps == pytest.approx(2.0)
     assert heard.vehicle(NOW_NS + 600_000_000).north_velocity_mps is None
 
@@ -395,8 +397,8 @@ def test_a_twist_by_itself_is_turned_as_an_odometrys(ros, maker, frame, variance
     for angles in random_angles(10):
         enu_mps, heard = rng.normal(0.0, 8.0, 3), RosTelemetry()
         message = twist_message(maker, NOW_NS, angles, enu_mps, frame=frame, variances=variances)
-        heard.odometry(wired(ros, message), 0)
-        heard.imu(maker.imu(NOW_NS, "", *angles))
+        heard.add("odometry", wired(ros, message), 0)
+        heard.add("imu", maker.imu(NOW_NS, "", *angles), 0)
         now = heard.vehicle(NOW_NS)
         assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx(enu_mps[:2], abs=1e-9)
         turned_mps = math.radians(1.0) * np.linalg.norm(enu_mps)  # the heading is off by a degree
@@ -581,7 +583,7 @@ def an_image(maker, time_ns, shape=(4, 6)):
 def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, sim_site):
     node, captured_ns = StandIn(maker), NOW_NS - 50_000_000
     with bridge_of(node, sim_site) as (bridge, seen):
-        bridge.telemetry.imu(maker.imu(captured_ns, "", 1.0, 2.0, 3.0))
+        bridge.telemetry.add("imu", maker.imu(captured_ns, "", 1.0, 2.0, 3.0), 0)
         bridge.on_image(an_image(maker, captured_ns))
         node.wait_for("window", 1)
     for output, kind in OUTPUTS.items():

@@ -136,6 +136,7 @@ def test_only_a_coordinate_system_for_the_place_is_chosen():
     assert chosen_crs(None, ["EPSG:2154", "EPSG:31256", "EPSG:4326"], vienna) == "EPSG:31256"
     assert chosen_crs(None, ["EPSG:2154", "EPSG:999999", "EPSG:4326"], vienna) == "EPSG:4326"
     assert chosen_crs("EPSG:2154", ["EPSG:2154"], vienna) == "EPSG:2154"  # as asked
+    assert chosen_crs(None, ["urn:ogc:def:crs", "EPSG:31256"], vienna) == "EPSG:31256"  # one that names none
     with pytest.raises(OptionError, match=r"crs: expected one for 48.2,16.4 .*, got EPSG:2154"):
         chosen_crs(None, ["EPSG:2154"], vienna)
     assert (

@@ -17,6 +17,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from bench.inputs.bags import BagMessages
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import LocalFrame
@@ -25,7 +26,6 @@ from scenematch.bridges.ros import RosTopics
 from scenematch.bridges.vehicle import NedOrigin, north_east_m
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.quaternions import quaternion_xyzw
-from scenematch.files.ros.messages import MessageFactory
 from tests.support.paths import ROOT
 
 STACK, ROS2 = ROOT / "examples" / "paper-stack", ROOT / "examples" / "ros2"
@@ -231,7 +231,7 @@ def test_the_truths_attitude_is_turned_from_north_west_to_east_north(truth_scrip
 
 def test_positions_in_a_bag_are_compared_with_its_truth(tmp_path, capsys, monkeypatch):
     types = get_typestore(Stores.ROS1_NOETIC)
-    maker = MessageFactory(types.types.__getitem__, True)
+    maker = BagMessages(types.types.__getitem__, True)
     frame = LocalFrame(48.0, 15.0)
     with Writer(tmp_path / "flight.bag") as writer:
 

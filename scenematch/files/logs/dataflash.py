@@ -21,29 +21,13 @@ from scenematch.files.resampling import FlightLog, TimeSeries, make_log, make_po
 
 _HEAD, _FMT = b"\xa3\x95", 0x80  # the first two bytes of each message; the type that defines the others
 _MAX_US = 1e13  # a third of a year: a larger stamp is corrupt
-_FIELD_TYPES = {  # numpy dtype and divisor by format character
-    "a": ("V64", 1.0),
-    "b": ("<i1", 1.0),
-    "B": ("<u1", 1.0),
-    "g": ("<f2", 1.0),
-    "h": ("<i2", 1.0),
-    "H": ("<u2", 1.0),
-    "i": ("<i4", 1.0),
-    "I": ("<u4", 1.0),
-    "f": ("<f4", 1.0),
-    "n": ("S4", 1.0),
-    "N": ("S16", 1.0),
-    "Z": ("S64", 1.0),
-    "c": ("<i2", 100.0),
-    "C": ("<u2", 100.0),
-    "e": ("<i4", 100.0),
-    "E": ("<u4", 100.0),
-    "L": ("<i4", 1e7),
-    "d": ("<f8", 1.0),
-    "M": ("<u1", 1.0),
-    "q": ("<i8", 1.0),
-    "Q": ("<u8", 1.0),
-}
+_DTYPES = {  # by format character
+    "b": "<i1", "h": "<i2", "i": "<i4", "q": "<i8", "g": "<f2", "f": "<f4", "d": "<f8",
+    "B": "<u1", "H": "<u2", "I": "<u4", "Q": "<u8", "M": "<u1",
+    "c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "L": "<i4",
+    "n": "S4", "N": "S16", "Z": "S64", "a": "V64",
+}  # fmt: skip
+_DIVISORS = dict.fromkeys("cCeE", 100.0) | {"L": 1e7}  # of the characters that stand for a scaled number
 _FIELDS = {
     "ATT": ("Roll", "Pitch", "Yaw"),
     "POS": ("Lat", "Lng", "Alt", "RelHomeAlt"),
@@ -132,9 +116,7 @@ class _Format:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        return np.dtype(
-            [(name, _FIELD_TYPES[kind][0]) for name, kind in zip(self.columns, self.kinds, strict=True)]
-        )
+        return np.dtype([(name, _DTYPES[kind]) for name, kind in zip(self.columns, self.kinds, strict=True)])
 
 
 def _parse_format(body: bytes) -> _Format | None:
@@ -142,13 +124,10 @@ def _parse_format(body: bytes) -> _Format | None:
     _, length, *texts = struct.unpack("<BB4s16s64s", body)
     name, kinds, columns = (text.split(b"\0")[0].decode("ascii", "replace") for text in texts)
     defined = _Format(name, length, kinds, tuple(columns.split(",")) if columns else ())
-    if (
-        len(defined.columns) != len(kinds)
-        or len(set(defined.columns)) != len(kinds)
-        or not set(kinds) <= set(_FIELD_TYPES)
-    ):
+    names = set(defined.columns)
+    if not len(defined.columns) == len(names) == len(kinds) or "" in names or not set(kinds) <= set(_DTYPES):
         return None
-    return defined if "" not in defined.columns and defined.dtype.itemsize + 3 == length else None
+    return defined if defined.dtype.itemsize + 3 == length else None
 
 
 def _columns(known: _Format, rows: list[bytes]) -> Columns:
@@ -157,7 +136,7 @@ def _columns(known: _Format, rows: list[bytes]) -> Columns:
     columns = {field: np.full(len(table), np.nan) for field in ("TimeUS", *_FIELDS[known.name])}
     for field, kind in zip(known.columns, known.kinds, strict=True):
         if field in columns and table[field].dtype.kind in "iuf":
-            columns[field] = table[field].astype(np.float64) / _FIELD_TYPES[kind][1]
+            columns[field] = table[field].astype(np.float64) / _DIVISORS.get(kind, 1.0)
     keep = np.isfinite(columns["TimeUS"]) & (np.abs(columns["TimeUS"]) < _MAX_US)
     for field in ("I", "C", "Instance"):  # older logs have no instances
         if field in columns:

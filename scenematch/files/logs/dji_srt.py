@@ -12,6 +12,7 @@ Convention:
 from __future__ import annotations
 
 import itertools
+import math
 import re
 import statistics
 from pathlib import Path
@@ -52,17 +53,18 @@ def read_srt(path: Path) -> FlightLog:
     cues = [_values(text[match.end() : end]) for match, end in zip(starts, ends, strict=True)]
     stamps_ns = [_time_ns(match) for match in starts]
 
-    def series(name: str) -> TimeSeries | None:
-        return make_series(stamps_ns, [cue.get(name, float("nan")) for cue in cues])
+    def numbers(name: str) -> list[float]:
+        return [cue.get(name, math.nan) for cue in cues]
 
-    nan = [float("nan")] * len(cues)
-    lat_deg = [cue.get("latitude", none) for cue, none in zip(cues, nan, strict=True)]
-    lon_deg = [cue.get("longitude", none) for cue, none in zip(cues, nan, strict=True)]
+    def series(name: str) -> TimeSeries | None:
+        return make_series(stamps_ns, numbers(name))
+
+    positions = make_position_series(stamps_ns, numbers("latitude"), numbers("longitude"))
     angles = {name: series(name) for name in _GIMBAL_COLUMNS}
-    known = angles | {"alt_amsl_m": series("abs_alt")} | make_position_series(stamps_ns, lat_deg, lon_deg)
-    numbers = _frame_numbers(stamps_ns, [cue.get("framecnt") for cue in cues])
-    captures_ns = stamps_ns if numbers is None else []
-    return make_log(path, known, {"take-off": series("rel_alt")}, captures_ns, frame_numbers=numbers)
+    known = angles | {"alt_amsl_m": series("abs_alt")} | positions
+    frame_numbers = _frame_numbers(stamps_ns, [cue.get("framecnt") for cue in cues])
+    captures_ns = stamps_ns if frame_numbers is None else []
+    return make_log(path, known, {"take-off": series("rel_alt")}, captures_ns, frame_numbers=frame_numbers)
 
 
 def _frame_numbers(stamps_ns: list[int], counts: list[float | None]) -> TimeSeries | None:
@@ -92,7 +94,4 @@ def _values(cue: str) -> dict[str, float]:
         values["longitude"], values["latitude"] = float(gps.group(1)), float(gps.group(2))
     if "rel_alt" not in values and (height := _HEIGHT.search(cue)):
         values["rel_alt"] = float(height.group(1) or height.group(2))
-    if all(name in values for name in _ANGLES):
-        columns = gimbal_columns(*(values[name] for name in _ANGLES)) or {}
-        values |= {name: value for name, value in columns.items() if value is not None}
-    return values
+    return values | gimbal_columns(values, _ANGLES)

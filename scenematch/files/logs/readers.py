@@ -48,9 +48,8 @@ class LogClock:
             raise OptionError(f"offset_s: expected finite seconds, got {self.offset_s}")
 
 
-_SHARE_OF_ALL = (
-    0.9  # of a video's frames: if fewer are numbered without a gap, they were extracted at another rate
-)
+# Of a video's frames: if fewer are numbered without a gap, they were extracted at another rate.
+_SHARE_OF_ALL = 0.9
 AS_LOGGED = LogClock()
 """The frames' own stamps, without offset."""
 

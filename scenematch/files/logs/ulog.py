@@ -163,10 +163,9 @@ def _heights(topics: Mapping[str, Columns]) -> dict[str, TimeSeries | None]:
         sensor = topics["distance_sensor"]
         distance_m = sensor["current_distance"]
         in_range = (distance_m >= sensor["min_distance"]) & (distance_m <= sensor["max_distance"])
-        valid_range = (
-            in_range & (sensor["orientation"] == _DOWN) & (sensor.get("signal_quality", np.int8(-1)) != 0)
-        )
-        heights["rangefinder"] = make_series(_stamps_ns(sensor), distance_m, valid_range)
+        is_good = sensor.get("signal_quality", np.int8(-1)) != 0
+        valid = in_range & is_good & (sensor["orientation"] == _DOWN)
+        heights["rangefinder"] = make_series(_stamps_ns(sensor), distance_m, valid)
     local = topics.get("vehicle_local_position", {})
     if "dist_bottom" in local:
         valid = local["dist_bottom_valid"]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.errors import CalibrationError, EngineError, TelemetryError, require
+from engine.errors import CalibrationError, TelemetryError, require
 from engine.geo import enu_from_body
-from scenematch.files.frames import FrameSource
+from scenematch.files.frames import ForwardFrames
 from scenematch.files.resampling import (
     FlightLog,
     Floats,
@@ -64,8 +65,34 @@ def is_bag(path: str | Path) -> bool:
     return path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file()
 
 
-class BagFrames(FrameSource):
-    """The images of one topic of a bag, read forward; going back restarts at the first.
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A quantity of the telemetry.
+
+    Attributes:
+        types: message types that may state it.
+        values: extracts the values; None if a message has none, and for a value that it lacks.
+    """
+
+    types: tuple[str, ...]
+    values: Callable[[Any], tuple[Any, ...] | None]
+
+
+QUANTITIES = {
+    "imu": Quantity(("sensor_msgs/msg/Imu",), attitude_from_message),
+    "compass": Quantity(_FLOAT, lambda message: (message.data,)),
+    "range": Quantity(("sensor_msgs/msg/Range",), lambda message: (range_from_message(message),)),
+    "height": Quantity(_FLOAT, lambda message: (message.data,)),
+    "altitude": Quantity(_FLOAT, lambda message: (message.data,)),
+    "velocity": Quantity(("geometry_msgs/msg/TwistStamped",), lambda m: (m.twist.linear.x, m.twist.linear.y)),
+    "place": Quantity(("sensor_msgs/msg/NavSatFix",), position_from_message),
+    "odometry": Quantity(tuple(ODOMETRY_TYPES.values()), body_velocity_from_message),
+}
+"""The quantities of a bag's and of a live vehicle's telemetry, by name."""
+
+
+class BagFrames(ForwardFrames):
+    """The images of one topic of a bag.
 
     Of pictures with the same timestamp the first counts; names are indices among all pictures of the topic.
 
@@ -87,7 +114,7 @@ class BagFrames(FrameSource):
         # Simulators publish a picture again if there is no new one yet.
         fresh = [k for k in range(len(stamps_ns)) if k == 0 or stamps_ns[k] != stamps_ns[k - 1]]
         self.names, self._stamps_ns = [str(index) for index in fresh], [stamps_ns[index] for index in fresh]
-        self._reset()
+        self._restart()
 
     @property
     def description(self) -> str:
@@ -108,31 +135,19 @@ class BagFrames(FrameSource):
                 )
         return list(self._stamps_ns)
 
-    def _reset(self) -> None:
+    def _restart(self) -> None:
         self._stream, self._next = _image_messages(self.path, self.topic), 0
-        self._last: tuple[int, NDArray[np.uint8]] | None = None
 
-    def read(self, name: str) -> NDArray[np.uint8]:
-        """Read one frame as (H, W, 3) RGB uint8; fast for ascending indices."""
-        self.check_name(name)
-        index = int(name)
-        if self._last is None or self._last[0] != index:
-            if index < self._next:
-                self._reset()
-            skipped = index - self._next
-            self._next = index + 1
-            message = next(itertools.islice(self._stream, skipped, None), None)
-            if message is None:
-                raise TelemetryError(
-                    f"{self.path}: {self.topic}: frame {index} has vanished since the bag was opened"
-                )
-            try:
-                image = image_from_message(message)
-            except TelemetryError as error:
-                raise TelemetryError(f"{self.path}: {self.topic}: frame {index}: {error}") from None
-            rgb = np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image
-            self._last = (index, rgb)
-        return self._last[1].copy()
+    def _decode(self, index: int) -> NDArray[np.uint8]:
+        skipped, self._next = index - self._next, index + 1
+        message = next(itertools.islice(self._stream, skipped, None), None)
+        if message is None:
+            raise TelemetryError(f"{self.path}: {self.topic}: frame {index} has vanished since the bag was opened")
+        try:
+            image = image_from_message(message)
+        except TelemetryError as error:
+            raise TelemetryError(f"{self.path}: {self.topic}: frame {index}: {error}") from None
+        return np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image
 
 
 def _image_messages(path: Path, topic: str) -> Iterator[Any]:
@@ -189,52 +204,43 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
         TelemetryError: the bag cannot be read, or has no usable series, or no usable velocity on that topic.
     """
     with _opened(path) as reader:
-        has_truth = truth and _topic(reader, _TAKEN["place"][0], (TRUTH,)) is not None
+        has_truth = truth and _topic(reader, QUANTITIES["place"].types, (TRUTH,)) is not None
         suffixes = _TRUTH_SUFFIXES if has_truth else _SUFFIXES
-        found = {name: _topic(reader, _TAKEN[name][0], options) for name, options in suffixes.items()}
+        found = {name: _topic(reader, QUANTITIES[name].types, options) for name, options in suffixes.items()}
         if odometry_topic is not None:
             found["odometry"] = _odometry_topic(path, reader, odometry_topic)
         names = {topic: name for name, topic in found.items() if topic is not None}
         known: dict[str, list[Sample]] = {name: [] for name in names.values()}
-        kinds = {kind for name in known for kind in _TAKEN[name][0]}
+        kinds = {kind for name in known for kind in QUANTITIES[name].types}
         for topic, time_ns, message in _messages(path, reader, set(names), kinds) if names else ():
             try:
-                numbers = _TAKEN[names[topic]][1](message)
+                numbers = QUANTITIES[names[topic]].values(message)
             except TelemetryError as error:
                 raise TelemetryError(f"{path}: {topic}: {error}") from None
             if numbers is not None:
                 known[names[topic]].append((time_ns, numbers))
     if _is_same_mavros(found.get("imu"), found.get("compass")):
         known.pop("compass", None)
-    column = _columns(known)
-    (position_ns, lat_deg), (_, lon_deg) = column("place", 0), column("place", 1)
+
+    def series_of(name: str, index: int = 0) -> TimeSeries | None:
+        return make_series(*_column(known, name, index))
+
     series: dict[str, TimeSeries | None] = {
-        "roll_deg": make_series(*column("imu", 0)),
-        "pitch_deg": make_series(*column("imu", 1)),
-        "heading_deg": make_series(*(column("compass", 0) if "compass" in known else column("imu", 2))),
-        "alt_amsl_m": make_series(*column("altitude", 0)),
-        "east_velocity_mps": make_series(*column("velocity", 0)),
-        "north_velocity_mps": make_series(*column("velocity", 1)),
-        "sigma_m": make_series(*column("place", 2)),
-        **make_position_series(position_ns, lat_deg, lon_deg),
+        "roll_deg": series_of("imu", 0),
+        "pitch_deg": series_of("imu", 1),
+        "heading_deg": series_of("compass") if "compass" in known else series_of("imu", 2),
+        "alt_amsl_m": series_of("altitude"),
+        "east_velocity_mps": series_of("velocity", 0),
+        "north_velocity_mps": series_of("velocity", 1),
+        "sigma_m": series_of("place", 2),
+        **make_position_series(*_column(known, "place", 0), _column(known, "place", 1)[1]),
     }
     if odometry_topic is not None:
         series |= _odometry_series(path, odometry_topic, known["odometry"], series)
-    heights = {"rangefinder": make_series(*column("range", 0)), "take-off": make_series(*column("height", 0))}
+    heights = {"rangefinder": series_of("range"), "take-off": series_of("height")}
     return make_log(path, series, heights)
 
 
-_TAKEN: dict[str, tuple[tuple[str, ...], Callable[[Any], tuple[float | None, ...] | None]]] = {
-    "imu": (("sensor_msgs/msg/Imu",), attitude_from_message),
-    "compass": (_FLOAT, lambda message: (message.data,)),
-    "range": (("sensor_msgs/msg/Range",), lambda message: (range_from_message(message),)),
-    "height": (_FLOAT, lambda message: (message.data,)),
-    "altitude": (_FLOAT, lambda message: (message.data,)),
-    "velocity": (("geometry_msgs/msg/TwistStamped",), lambda m: (m.twist.linear.x, m.twist.linear.y)),
-    "place": (("sensor_msgs/msg/NavSatFix",), position_from_message),
-    "odometry": (tuple(ODOMETRY_TYPES.values()), body_velocity_from_message),
-}
-"""Message types of each quantity, and the function that extracts its values; None if a message has none."""
 _SUFFIXES = {
     "imu": ("/imu/data", ""),
     "compass": ("/compass_hdg",),
@@ -252,7 +258,7 @@ _TRUTH_SUFFIXES = {
 
 
 def _odometry_topic(path: Path, reader: Any, topic: str) -> str:
-    kinds = _TAKEN["odometry"][0]
+    kinds = QUANTITIES["odometry"].types
     names = _topic_names(reader, kinds)
     if topic not in names:
         raise TelemetryError(f"{path}: expected {' or '.join(kinds)} on {topic}, got {', '.join(names) or 'none'}")
@@ -288,25 +294,21 @@ def _odometry_series(
 
 def _is_same_mavros(imu: str | None, compass: str | None) -> bool:
     """Whether both topics are from one MAVROS; its Imu has the same heading, with the time of measurement."""
-    ends = "/imu/data", "/global_position/compass_hdg"
-    if imu is None or compass is None or not (imu.endswith(ends[0]) and compass.endswith(ends[1])):
+    if imu is None or not imu.endswith("/imu/data"):
         return False
-    return imu.removesuffix(ends[0]) == compass.removesuffix(ends[1])
+    return compass == imu.removesuffix("/imu/data") + "/global_position/compass_hdg"
 
 
-def _columns(known: dict[str, list[Sample]]) -> Callable[[str, int], tuple[Stamps, Floats]]:
-    """A function that returns stamps (N,) in nanoseconds and values (N,) of one quantity; NaN where unknown."""
-
-    def column(name: str, index: int) -> tuple[Stamps, Floats]:
-        samples = known.get(name, [])
-        values = [numbers[index] for _, numbers in samples]
-        return np.array([time for time, _ in samples], np.int64), np.array(values, np.float64)
-
-    return column
+def _column(known: Mapping[str, list[Sample]], name: str, index: int = 0) -> tuple[Stamps, Floats]:
+    """Stamps (N,) in nanoseconds and values (N,) of one quantity; NaN where unknown."""
+    samples = known.get(name, [])
+    values = [numbers[index] for _, numbers in samples]
+    return np.array([time_ns for time_ns, _ in samples], np.int64), np.array(values, np.float64)
 
 
-def _stamp_ns(message: Any, recorded_ns: int) -> int:
-    return (stamp_ns(message) if hasattr(message, "header") else 0) or recorded_ns
+def stamp_or(message: Any, otherwise_ns: int) -> int:
+    """The stamp of a message's header, or another time if there is none or it is not set."""
+    return (stamp_ns(message) if hasattr(message, "header") else 0) or otherwise_ns
 
 
 def _image_topic(path: Path, reader: Any, topic: str | None) -> str:
@@ -341,7 +343,7 @@ def _messages(
     with _readable(path):
         for connection, recorded_ns, data in reader.messages(wanted):
             message = reader.deserialize(data, connection.msgtype)
-            yield str(connection.topic), _stamp_ns(message, recorded_ns), message
+            yield str(connection.topic), stamp_or(message, recorded_ns), message
 
 
 @contextmanager
@@ -365,8 +367,6 @@ def _readable(path: Path) -> Iterator[None]:
     """Convert whatever rosbags raises on a corrupt bag to a TelemetryError of one line."""
     try:
         yield
-    except EngineError:
-        raise
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise TelemetryError(f"{path}: expected a bag that can be read: {reason}") from None

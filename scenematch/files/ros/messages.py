@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from engine.camera import DISTORTION_MODELS, Camera
 from engine.errors import CalibrationError, TelemetryError
 from engine.geo import Array, attitude_from_rotation
+from scenematch.files.frames import opened_picture
 from scenematch.files.quaternions import quaternion_xyzw, rotation_of
 from scenematch.files.velocities import velocity_sigma_mps
 
@@ -69,7 +70,8 @@ def image_from_message(message: Any) -> NDArray[np.uint8]:
         TelemetryError: the encoding is not in :data:`ENCODINGS`, or there are too few bytes or no valid image.
     """
     if not hasattr(message, "encoding"):
-        return _decode(bytes(memoryview(message.data)))
+        with opened_picture(io.BytesIO(memoryview(message.data)), "image", "compressed picture") as picture:
+            return np.array(picture if picture.mode == "L" else picture.convert("RGB"), np.uint8)
     encoding = message.encoding
     if encoding in BAYER:
         return _demosaiced(_pixels(message, 1), BAYER[encoding])
@@ -112,17 +114,6 @@ def _of_8_bits(levels: NDArray[np.uint16]) -> NDArray[np.uint8]:
     """(H, W) of a picture whose levels fill 10, 12, 14 or 16 bits."""
     white = max(float(np.percentile(levels, _WHITE_PERCENTILE)), 1.0)
     return np.asarray(np.clip(levels.astype(np.float32) * (255.0 / white), 0.0, 255.0), np.uint8)
-
-
-def _decode(data: bytes) -> NDArray[np.uint8]:
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(data)) as picture:
-            return np.array(picture if picture.mode == "L" else picture.convert("RGB"), np.uint8)
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise TelemetryError(f"image: expected a readable compressed picture: {reason}") from None
 
 
 def camera_from_message(message: Any) -> Camera:
@@ -175,7 +166,11 @@ def body_velocity_from_message(message: Any) -> tuple[float, float, float, float
     velocity = np.array([linear.x, linear.y, linear.z], np.float64)
     sigma_mps = velocity_sigma_mps(velocity, variances, turned=True)
     if not hasattr(message, "child_frame_id"):
-        _check_body_frame(message.header.frame_id)
+        # A velocity in a world of unknown north, or along a sensor's axes, cannot be rotated.
+        frame_id = message.header.frame_id
+        if frame_id.rpartition("/")[2] != BODY_FRAME:
+            expected = f"a velocity along {BODY_FRAME} (forward-left-up)"
+            raise TelemetryError(f"frame_id: expected {expected}, got one along {frame_id!r}")
     elif message.child_frame_id and message.child_frame_id == message.header.frame_id:
         rotation = _rotation(message.pose.pose.orientation)
         if rotation is None:
@@ -196,21 +191,11 @@ def _twist(message: Any) -> tuple[Any, list[float]]:
     return message.twist.twist.linear, [0.0] * 3 if unknown else covariance[0:15:7].tolist()
 
 
-def _check_body_frame(frame_id: str) -> None:
-    """A velocity in a world of unknown north, or along a sensor's axes, cannot be rotated."""
-    if frame_id.rpartition("/")[2] != BODY_FRAME:
-        raise TelemetryError(
-            f"frame_id: expected a velocity along {BODY_FRAME} (forward-left-up), got one along {frame_id!r}"
-        )
-
-
 def _rotation(q: Any) -> Array | None:
     """(3, 3) of a geometry_msgs/Quaternion, from the body (forward-left-up) to the world; None if invalid."""
     x, y, z, w = (float(v) for v in (q.x, q.y, q.z, q.w))
     square = x * x + y * y + z * z + w * w
-    if not abs(square - 1.0) < _NORM_TOLERANCE:
-        return None
-    return rotation_of(w, x, y, z)
+    return rotation_of(w, x, y, z) if abs(square - 1.0) < _NORM_TOLERANCE else None
 
 
 def range_from_message(message: Any) -> float | None:
@@ -262,20 +247,13 @@ class MessageFactory:
 
     def header(self, time_ns: int, frame_id: str) -> Any:
         """A std_msgs/Header with a time in nanoseconds and a frame."""
-        time = self.time or (
-            lambda sec, nanosec: self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        )
-        stamp = time(*divmod(time_ns, 1_000_000_000))
+        sec, nanosec = divmod(time_ns, 1_000_000_000)
+        if self.time is not None:
+            stamp = self.time(sec, nanosec)
+        else:
+            stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
         count = {"seq": 0} if self.ros1 else {}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id, **count)
-
-    def float64(self, value: float) -> Any:
-        """A std_msgs/Float64."""
-        return self.make("std_msgs/msg/Float64", data=float(value))
-
-    def vector(self, x: float, y: float, z: float) -> Any:
-        """A geometry_msgs/Vector3."""
-        return self.make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
 
     def quaternion(self, roll_deg: float, pitch_deg: float, heading_deg: float) -> Any:
         """A geometry_msgs/Quaternion of an attitude."""
