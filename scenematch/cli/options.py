@@ -35,39 +35,7 @@ def flag(name: str, text: str, panel: str | None = None) -> Any:
     return typer.Option(name, help=text, rich_help_panel=panel)
 
 
-MapOption = Annotated[Path, option("--map", "FILE", "GeoTIFF, or a picture with a world file.", MAP)]
 SurfaceOption = Annotated[Path | None, option("--surface", "FILE", "Surface model, a GeoTIFF of heights.", MAP)]
-FramesOption = Annotated[
-    Path, option("--frames", "DIR|VIDEO|BAG", "Folder of pictures, a video, or a ROS bag.", INPUT)
-]
-CameraOption = Annotated[
-    Path | None, option("--camera", "FILE", "Calibration file (default: from the bag, the topic or EXIF).", INPUT)
-]
-HfovOption = Annotated[
-    float | None, option("--hfov-deg", "DEG", "Horizontal field of view, instead of --camera.", INPUT)
-]
-MountOption = Annotated[
-    str | None,
-    option(
-        "--mount",
-        "NAME",
-        "nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.",
-        INPUT,
-    ),
-]
-TelemetryOption = Annotated[
-    Path | None,
-    option(
-        "--telemetry",
-        "FILE",
-        "telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the video's .SRT, or EXIF).",
-        INPUT,
-    ),
-]
-TruthOption = Annotated[
-    Path | None,
-    option("--truth", "FILE", "truth.csv, a log or photographs (default: truth.csv beside the telemetry).", INPUT),
-]
 CorrectOption = Annotated[
     list[str] | None,
     option(
@@ -115,7 +83,7 @@ RerunOption = Annotated[
 class MapOptions:
     """The map."""
 
-    map: MapOption
+    map: Annotated[Path, option("--map", "FILE", "GeoTIFF, or a picture with a world file.", MAP)]
     surface: SurfaceOption = None
 
     def map_input(self, settings: Settings) -> MapInput:
@@ -130,9 +98,22 @@ class MapOptions:
 class CameraOptions:
     """The camera."""
 
-    camera: CameraOption = None
-    hfov_deg: HfovOption = None
-    mount: MountOption = None
+    camera: Annotated[
+        Path | None,
+        option("--camera", "FILE", "Calibration file (default: from the bag, the topic or EXIF).", INPUT),
+    ] = None
+    hfov_deg: Annotated[
+        float | None, option("--hfov-deg", "DEG", "Horizontal field of view, instead of --camera.", INPUT)
+    ] = None
+    mount: Annotated[
+        str | None,
+        option(
+            "--mount",
+            "NAME",
+            "nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.",
+            INPUT,
+        ),
+    ] = None
 
     def camera_input(self, settings: Settings) -> CameraInput:
         """The camera combined with its settings."""
@@ -146,9 +127,24 @@ class CameraOptions:
 class FlightOptions(CameraOptions, MapOptions):
     """The files of a flight."""
 
-    frames: FramesOption
-    telemetry: TelemetryOption = None
-    truth: TruthOption = None
+    frames: Annotated[
+        Path, option("--frames", "DIR|VIDEO|BAG", "Folder of pictures, a video, or a ROS bag.", INPUT)
+    ]
+    telemetry: Annotated[
+        Path | None,
+        option(
+            "--telemetry",
+            "FILE",
+            "telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the video's .SRT, or EXIF).",
+            INPUT,
+        ),
+    ] = None
+    truth: Annotated[
+        Path | None,
+        option(
+            "--truth", "FILE", "truth.csv, a log or photographs (default: truth.csv beside the telemetry).", INPUT
+        ),
+    ] = None
 
     def files(self, settings: Settings, correct: Sequence[str] | None = None) -> FlightFiles:
         """The files combined with their settings."""

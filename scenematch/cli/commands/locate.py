@@ -75,30 +75,16 @@ def locate(
 
 
 def _fix_facts(fix: Fix, as_json: bool) -> dict[str, Any]:
-    facts = {
-        "status": "fix",
-        "lat_deg": fix.lat_deg,
-        "lon_deg": fix.lon_deg,
-        "east_m": fix.east_m,
-        "north_m": fix.north_m,
-        "up_m": fix.up_m,
-        "sigma_m": fix.sigma_m,
-        "score": fix.score,
-        "method": fix.method,
-        "map_xy_px": list(fix.map_xy_px),
-    }
+    places = ("lat_deg", "lon_deg", "east_m", "north_m", "up_m", "sigma_m")
+    names = (*places, "score", "method", "map_xy_px")
+    facts = {"status": "fix"} | {name: getattr(fix, name) for name in names}
     if as_json:
         facts["covariance_m2"] = fix.covariance_m2.tolist()
         facts["attitude"] = None if fix.attitude is None else asdict(fix.attitude)
-        facts["attitude_sigma_deg"] = None if fix.attitude_sigma_deg is None else list(fix.attitude_sigma_deg)
+        facts["attitude_sigma_deg"] = fix.attitude_sigma_deg
     return facts
 
 
 def _no_fix_facts(refusal: NoFix) -> dict[str, Any]:
-    return {
-        "status": "no_fix",
-        "reason": refusal.reason.value,
-        "detail": refusal.detail,
-        "score": refusal.score,
-        "method": refusal.method,
-    }
+    facts = {"status": "no_fix", "reason": refusal.reason.value, "detail": refusal.detail}
+    return facts | {"score": refusal.score, "method": refusal.method}
