@@ -31,5 +31,5 @@ def demo(
         tables.print_paper_table(results, seed)
     console.say(f"report: {out.resolve()}")
     console.next_step(
-        "check --map MAP --frames FRAMES", as_json=as_json, hint=f"open {out}/ncc-scenematch/report.html"
+        "check --map MAP --frames FRAMES", as_json=as_json, hint=f"open {out}/ncc-engine/report.html"
     )
