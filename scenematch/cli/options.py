@@ -211,13 +211,10 @@ def use_threads(count: int = 1) -> None:
 
 def table(settings: Settings, name: str, **given: Any) -> Any:
     """A table of the settings; an error in one of them names it as ``--settings`` does."""
-    from importlib import import_module
+    from scenematch.runs.settings import TABLES, table_class
 
-    from scenematch.runs.settings import TABLES
-
-    module, kind, hidden = TABLES[name]
-    names = [each.name for each in fields(getattr(import_module(module), kind))]
-    name_settings(name, [each for each in names if each not in hidden])
+    names = [each.name for each in fields(table_class(name))]
+    name_settings(name, [each for each in names if each not in TABLES[name][2]])
     return settings.table(name, **given)
 
 

@@ -12,7 +12,6 @@ from engine.orthomap import OrthoMap
 from scenematch.files.corrections import Corrections
 from scenematch.files.settings import nested, options_from_mapping
 from scenematch.files.track import TrackRow, read_track
-from scenematch.report.metrics import Ground
 from scenematch.report.page_frames import shows_frames
 from scenematch.runs.cameras import CameraInput
 from scenematch.runs.folders import StrPath
@@ -66,10 +65,8 @@ def redraw(
     rows = read_track(folder / TRACK)
     record = read_record(folder / SUMMARY)
     path = record.truth if truth is None else truth
-    start_ns = rows[0].timestamp_ns if rows else None
-    truth_rows = None if path is None else open_run_truth(Path(path), start_ns, progress)
+    truth_rows = open_run_truth(path, rows, progress)
     site = open_recorded_map(record, progress)
-    ground = Ground(record.ground_m, record.ground_amsl_m)
     frames = _report_frames(record, rows, site)
     if frames.flight is None and shows_frames(folder / PAGE):
         if keep_frames:
@@ -80,7 +77,7 @@ def redraw(
         progress.message(f"{folder / PAGE} loses the frames that it shows: {frames.why_missing}")
     if path is not None:
         record = replace(record, truth=str(Path(path).resolve()))
-    return write_results(folder, rows, truth_rows, site, ground, record, frames, progress=progress)
+    return write_results(folder, rows, truth_rows, site, record, frames, progress=progress)
 
 
 def open_recorded_map(record: RunRecord, progress: Progress = SILENT) -> OrthoMap:

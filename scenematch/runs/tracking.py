@@ -94,7 +94,7 @@ def track(
     share = _fixed_share(rows)
     if diagnosis and settings.profile == "engine" and share < _CHECKED_SHARE:
         record = replace(record, diagnosis=_diagnosis(files, settings, inputs, share, progress))
-    return write_results(out, rows, inputs.truth, site, ground, record, shown, report=report, progress=progress)
+    return write_results(out, rows, inputs.truth, site, record, shown, report=report, progress=progress)
 
 
 def _fixed_share(rows: Sequence[TrackRow]) -> float:
