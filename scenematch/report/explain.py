@@ -166,7 +166,7 @@ def match_again(
     Returns:
         The window and the explanation, or None if the window is unknown or the frame cannot be matched.
     """
-    window = _window(row, note)
+    window = run_window(row, note)
     if window is None:
         return None
     matched = _as_matched(frame, row, note, matcher.site)
@@ -226,7 +226,8 @@ class _Drawer:
         return replace(_slider_image(crop, caption, alt), overlay="".join(marks))
 
 
-def _window(row: TrackRow, note: FrameNote) -> Window | None:
+def run_window(row: TrackRow, note: FrameNote) -> Window | None:
+    """The window that the run searched for a frame; None if unknown."""
     corner, size = (note.window_x0_px, note.window_y0_px), (row.window_width_px, row.window_height_px)
     if corner[0] is None or corner[1] is None or size[0] is None or size[1] is None:
         return None

@@ -62,6 +62,12 @@ class TrackErrors:
         return np.asarray(np.hypot(self.error_en_m[:, 0], self.error_en_m[:, 1]), dtype=np.float64)
 
     @property
+    def sigma_m(self) -> Array:
+        """(N,) stated standard deviation along the longer axis of the covariance."""
+        a, b, c = self.covariance_en_m2[:, 0, 0], self.covariance_en_m2[:, 0, 1], self.covariance_en_m2[:, 1, 1]
+        return np.asarray(np.sqrt((a + c) / 2.0 + np.hypot((a - c) / 2.0, b)), dtype=np.float64)
+
+    @property
     def normalised_squared_errors(self) -> Array:
         """(N,) normalised squared error e^T C^-1 e; its mean (NEES) is 2 if the covariance is consistent."""
         c = self.covariance_en_m2 + _FLOOR_M2 * np.eye(2)

@@ -96,10 +96,9 @@ def _write_page(path: Path, track: FinishedTrack, frames: ReportFrames) -> None:
         return write_page(path, track, why_not=f"No frames are shown: {frames.why_missing}")
     if track.notes is None or [note.frame for note in track.notes] != [row.frame for row in track.rows]:
         return write_page(path, track, why_not=f"No frames are shown: the run left no {NOTES} of its windows.")
-    errors = track.plot_data().errors
-    chosen = choose_frames(track.rows, errors)
+    chosen = choose_frames(track.rows, track.errors)
     try:
-        shown = explain_frames(frames.flight, frames.matcher, track.rows, track.notes, chosen, errors)
+        shown = explain_frames(frames.flight, frames.matcher, track.rows, track.notes, chosen, track.errors)
     except EngineError as error:
         return write_page(path, track, why_not=f"No frames are shown: {error}")
     return write_page(path, track, shown)
