@@ -7,8 +7,8 @@ import numpy as np
 from engine.geo import Array
 from scenematch.report.charts import ChartArea
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.metrics import truth_per_row
-from scenematch.report.page_charts import Chart, column
+from scenematch.report.metrics import column, truth_per_row
+from scenematch.report.page_charts import Chart
 
 _ANGLES = {"roll_deg": "Roll", "pitch_deg": "Pitch", "heading_deg": "Heading"}
 _AXES = ("east", "north")

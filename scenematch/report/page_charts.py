@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from engine.geo import Array
 from scenematch.report.charts import ChartArea, dots
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.metrics import FALSE_SIGMAS
+from scenematch.report.metrics import FALSE_SIGMAS, column
 
 Chart = tuple[str, str]
 """Caption and SVG."""
@@ -31,12 +29,6 @@ def draw_charts(track: FinishedTrack) -> list[Chart]:
     if np.isfinite(latency_ms).any():
         charts += [_latency(track, latency_ms, budget_ms), _histogram(latency_ms, budget_ms)]
     return charts
-
-
-def column(records: Sequence[object], name: str) -> Array:
-    """(N,) one attribute of each record; NaN if it or the record is None."""
-    values = (getattr(record, name, None) for record in records)
-    return np.array([np.nan if value is None else value for value in values], np.float64)
 
 
 def _error(track: FinishedTrack) -> Chart:

@@ -12,8 +12,8 @@ from engine.errors import OptionError
 from engine.geo import Array
 from scenematch.report.charts import ChartArea, Limits, dots, line
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.metrics import FALSE_SIGMAS, figures_in_words
-from scenematch.report.page_charts import Chart, column
+from scenematch.report.metrics import FALSE_SIGMAS, column, figures_in_words
+from scenematch.report.page_charts import Chart
 from scenematch.report.page_map import TrackMap, connected, draw_map, map_of_tracks
 from scenematch.report.page_parts import charts_with_axis, fill_page, map_with_legend, section, table
 from scenematch.report.verdict import metres, verdict_of
