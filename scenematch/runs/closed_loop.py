@@ -119,7 +119,10 @@ def fly_closed_loop(
         seconds = 60.0 * loop.minutes
         count = int(seconds * flight.options.frame_rate_hz)
         frames = progress.track(_fly(flight, seconds, view), count, "flying")
-        _write_folder(out, frames, flight, town, camera, site)
+        lat, lon = map(float, site.frame.geodetic_from_enu(*flight.flown.start_m[:2]))
+        write_folder(
+            out, town, camera, frames, _truth_rows(flight, town, site), lat, lon
+        )  # written while it flies
     record = _record(out, world, loop, site, town, str(matcher.device))
     return _write_results(out, flight, record, progress)
 
@@ -166,24 +169,14 @@ def plan_closed_loop(
     return ClosedLoop(route, view, matcher, seed=seed, fault=loop.planned_fault())
 
 
-def _fly(flight: ClosedLoop, seconds: float, view: LiveView | None) -> Iterator[Frame]:
-    """The frames of a flight in progress, each shown once it is answered."""
+def _fly(flight: ClosedLoop, seconds: float, view: LiveView | None) -> Iterator[tuple[str, Frame]]:
+    """The names and frames of a flight in progress, each shown once it is answered."""
     latency_ms = 1e3 * flight.options.latency_s
     for k, frame in enumerate(flight.fly(seconds)):
         if view is not None:
             answer = flight.flown.answers[-1]
             view.show(k, picture_name(k), frame, answer.result, answer.state, latency_ms)
-        yield frame
-
-
-def _write_folder(
-    out: Path, frames: Iterator[Frame], flight: ClosedLoop, town: Town, camera: Camera, site: OrthoMap
-) -> None:
-    """Fly, and write the folder meanwhile: pictures, telemetry from the filter, truth, camera and map."""
-    start = flight.flown.start_m
-    lat, lon = site.frame.geodetic_from_enu(start[0], start[1])
-    named = ((picture_name(k), frame) for k, frame in enumerate(frames))
-    write_folder(out, town, camera, named, _truth_rows(flight, town, site), float(lat), float(lon))
+        yield picture_name(k), frame
 
 
 def _truth_rows(flight: ClosedLoop, town: Town, site: OrthoMap) -> Iterator[Truth]:
