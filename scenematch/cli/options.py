@@ -13,6 +13,7 @@ import typer
 
 from scenematch.cli import console
 from scenematch.cli.argument_names import name_settings
+from scenematch.files.settings import field_descriptions
 
 if TYPE_CHECKING:
     from scenematch.runs.cameras import CameraInput
@@ -25,24 +26,27 @@ INPUT, MAP, OUTPUT, EXPERT = "Input", "Map", "Output", "Expert"
 """Panels of the help."""
 
 
-def option(name: str, metavar: str, text: str, panel: str | None = None, **limits: Any) -> Any:
-    """An option with a value, in a panel of the help; ``limits`` such as ``min`` are typer's."""
+def option(name: str, metavar: str, panel: str | None = None, text: str | None = None, **limits: Any) -> Any:
+    """An option with a value, in a panel of the help; ``limits`` such as ``min`` are typer's.
+
+    Without a text the help is the description in the docstring, see :func:`with_options`.
+    """
     return typer.Option(name, metavar=metavar, help=text, rich_help_panel=panel, **limits)
 
 
-def flag(name: str, text: str, panel: str | None = None) -> Any:
-    """An option without a value."""
+def flag(name: str, panel: str | None = None, text: str | None = None) -> Any:
+    """An option without a value; the help as of :func:`option`."""
     return typer.Option(name, help=text, rich_help_panel=panel)
 
 
-SurfaceOption = Annotated[Path | None, option("--surface", "FILE", "Surface model, a GeoTIFF of heights.", MAP)]
+SurfaceOption = Annotated[Path | None, option("--surface", "FILE", MAP, "Surface model, a GeoTIFF of heights.")]
 CorrectOption = Annotated[
     list[str] | None,
     option(
         "--correct",
         "NAME=VALUE",
-        "Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.",
         INPUT,
+        "Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.",
     ),
 ]
 StartOption = Annotated[
@@ -50,40 +54,44 @@ StartOption = Annotated[
     option(
         "--start",
         "LAT,LON[,SIGMA_M]",
-        "Where the flight begins (default: the telemetry's first position, or anywhere on the map).",
         INPUT,
+        "Where the flight begins (default: the telemetry's first position, or anywhere on the map).",
     ),
 ]
 MethodOption = Annotated[
     str | None,
-    option("--method", "auto|ncc|sift|learned", "auto: ncc and sift, each checking the other (default)."),
+    option("--method", "auto|ncc|sift|learned", text="auto: ncc and sift, each checking the other (default)."),
 ]
 DeviceOption = Annotated[
-    str | None, option("--device", "auto|cpu|cuda", "Device to compute on (default: auto).", EXPERT)
+    str | None, option("--device", "auto|cpu|cuda", EXPERT, "Device to compute on (default: auto).")
 ]
 SettingsOption = Annotated[
     list[str] | None,
-    option("--settings", "FILE|NAME=VALUE", "Settings as `doctor --settings` lists them; repeatable.", EXPERT),
+    option("--settings", "FILE|NAME=VALUE", EXPERT, "Settings as `doctor --settings` lists them; repeatable."),
 ]
-OutOption = Annotated[Path, option("--out", "DIR", "Output folder to create.", OUTPUT)]
-ForceOption = Annotated[bool, flag("--force", "Replace existing results.", OUTPUT)]
-JsonOption = Annotated[bool, flag("--json", "Results as JSON on standard output.", OUTPUT)]
+OutOption = Annotated[Path, option("--out", "DIR", OUTPUT, "Output folder to create.")]
+ForceOption = Annotated[bool, flag("--force", OUTPUT, "Replace existing results.")]
+JsonOption = Annotated[bool, flag("--json", OUTPUT, "Results as JSON on standard output.")]
 RerunOption = Annotated[
     list[str] | None,
     option(
         "--rerun",
         "FILE.rrd|HOST:PORT",
-        "Record the live view to a file, or show it in a running rerun viewer; repeat for both.",
         OUTPUT,
+        "Record the live view to a file, or show it in a running rerun viewer; repeat for both.",
     ),
 ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions:
-    """The map."""
+    """The map.
 
-    map: Annotated[Path, option("--map", "FILE", "GeoTIFF, or a picture with a world file.", MAP)]
+    Attributes:
+        map: GeoTIFF, or a picture with a world file.
+    """
+
+    map: Annotated[Path, option("--map", "FILE", MAP)]
     surface: SurfaceOption = None
 
     def map_input(self, settings: Settings) -> MapInput:
@@ -96,24 +104,17 @@ class MapOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOptions:
-    """The camera."""
+    """The camera.
 
-    camera: Annotated[
-        Path | None,
-        option("--camera", "FILE", "Calibration file (default: from the bag, the topic or EXIF).", INPUT),
-    ] = None
-    hfov_deg: Annotated[
-        float | None, option("--hfov-deg", "DEG", "Horizontal field of view, instead of --camera.", INPUT)
-    ] = None
-    mount: Annotated[
-        str | None,
-        option(
-            "--mount",
-            "NAME",
-            "nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.",
-            INPUT,
-        ),
-    ] = None
+    Attributes:
+        camera: Calibration file (default: from the bag, the topic or EXIF).
+        hfov_deg: Horizontal field of view, instead of --camera.
+        mount: nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.
+    """
+
+    camera: Annotated[Path | None, option("--camera", "FILE", INPUT)] = None
+    hfov_deg: Annotated[float | None, option("--hfov-deg", "DEG", INPUT)] = None
+    mount: Annotated[str | None, option("--mount", "NAME", INPUT)] = None
 
     def camera_input(self, settings: Settings) -> CameraInput:
         """The camera combined with its settings."""
@@ -125,26 +126,17 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FlightOptions(CameraOptions, MapOptions):
-    """The files of a flight."""
+    """The files of a flight.
 
-    frames: Annotated[
-        Path, option("--frames", "DIR|VIDEO|BAG", "Folder of pictures, a video, or a ROS bag.", INPUT)
-    ]
-    telemetry: Annotated[
-        Path | None,
-        option(
-            "--telemetry",
-            "FILE",
-            "telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the video's .SRT, or EXIF).",
-            INPUT,
-        ),
-    ] = None
-    truth: Annotated[
-        Path | None,
-        option(
-            "--truth", "FILE", "truth.csv, a log or photographs (default: truth.csv beside the telemetry).", INPUT
-        ),
-    ] = None
+    Attributes:
+        frames: Folder of pictures, a video, or a ROS bag.
+        telemetry: telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the video's .SRT, or EXIF).
+        truth: truth.csv, a log or photographs (default: truth.csv beside the telemetry).
+    """
+
+    frames: Annotated[Path, option("--frames", "DIR|VIDEO|BAG", INPUT)]
+    telemetry: Annotated[Path | None, option("--telemetry", "FILE", INPUT)] = None
+    truth: Annotated[Path | None, option("--truth", "FILE", INPUT)] = None
 
     def files(self, settings: Settings, correct: Sequence[str] | None = None) -> FlightFiles:
         """The files combined with their settings."""
@@ -163,8 +155,13 @@ class FlightOptions(CameraOptions, MapOptions):
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace a command's parameters of the types above by their fields, one option each."""
+    """Replace a command's parameters of the types above by their fields, one option each.
+
+    Options without a help text take it from the docstring: from "Options" of the command, which its own help then
+    leaves out, or from "Attributes" of the type.
+    """
     hints = get_type_hints(command, include_extras=True)
+    about, _, _ = (inspect.getdoc(command) or "").partition("Options:\n")
     groups: dict[str, type[Any]] = {
         name: kind for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)
     }
@@ -172,10 +169,13 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     for name, parameter in inspect.signature(command).parameters.items():
         kind, keyword = groups.get(name), inspect.Parameter.KEYWORD_ONLY
         if kind is None:
+            _describe(name, hints[name], command, "Options")
             parameters.append(parameter.replace(kind=keyword, annotation=hints[name]))
             continue
         types = get_type_hints(kind, include_extras=True)
         for each in fields(kind):
+            for owner in kind.__mro__:
+                _describe(each.name, types[each.name], owner, "Attributes")
             default = inspect.Parameter.empty if each.default is MISSING else each.default
             parameters.append(inspect.Parameter(each.name, keyword, default=default, annotation=types[each.name]))
 
@@ -187,9 +187,17 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         }
         command(**given, **made)
 
+    call.__doc__ = about.rstrip()
     call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     call.__annotations__ = {each.name: each.annotation for each in parameters}
     return call
+
+
+def _describe(name: str, hint: Any, owner: Any, heading: str) -> None:
+    """Give an option that has no help text yet its description in a section of a docstring."""
+    for option_or_argument in getattr(hint, "__metadata__", ()):
+        if option_or_argument.help is None:
+            option_or_argument.help = field_descriptions(owner, heading).get(name)
 
 
 def read_settings(texts: Sequence[str] | None) -> Settings:

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 @with_options
 def locate(
-    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="One picture.")],
+    image: Annotated[Path, typer.Argument(metavar="IMAGE")],
     site: MapOptions,
     lens: CameraOptions,
-    height_agl_m: Annotated[float | None, option("--height-agl", "M", "Metres above the ground.")] = None,
-    heading_deg: Annotated[float | None, option("--heading", "DEG", "Degrees clockwise from true north.")] = None,
-    roll_deg: Annotated[float | None, option("--roll", "DEG", "Degrees, right side down.")] = None,
-    pitch_deg: Annotated[float | None, option("--pitch", "DEG", "Degrees, nose up.")] = None,
+    height_agl_m: Annotated[float | None, option("--height-agl", "M")] = None,
+    heading_deg: Annotated[float | None, option("--heading", "DEG")] = None,
+    roll_deg: Annotated[float | None, option("--roll", "DEG")] = None,
+    pitch_deg: Annotated[float | None, option("--pitch", "DEG")] = None,
     start: StartOption = None,
     method: MethodOption = None,
     device: DeviceOption = None,
@@ -44,6 +44,13 @@ def locate(
     """Find one picture on the map.
 
     Prints the fix and exits with 0, or prints why there is none and exits with 1.
+
+    Options:
+        image: One picture.
+        height_agl_m: Metres above the ground.
+        heading_deg: Degrees clockwise from true north.
+        roll_deg: Degrees, right side down.
+        pitch_deg: Degrees, nose up.
     """
     from engine.values import Fix
     from scenematch.runs.single_image import locate_image

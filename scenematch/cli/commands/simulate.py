@@ -28,20 +28,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions:
-    """What is flown over."""
+    """What is flown over.
 
-    seed: Annotated[int, option("--seed", "N", "Number of the generated town and flight.", min=0)] = 1
-    condition: Annotated[
-        str | None, option("--condition", "NAME", "Light, season and weather in the frames (default: noon).")
-    ] = None
-    relief_m: Annotated[float, option("--relief-m", "H", "Height of the town's hills.")] = 0.0
-    map: Annotated[Path | None, option("--map", "FILE", "Fly over this map instead of a generated town.", MAP)] = (
-        None
-    )
+    Attributes:
+        seed: Number of the generated town and flight.
+        condition: Light, season and weather in the frames (default: noon).
+        relief_m: Height of the town's hills.
+        map: Fly over this map instead of a generated town.
+        camera_pitch_deg: Pitch of the camera: -90 straight down, -45 oblique.
+    """
+
+    seed: Annotated[int, option("--seed", "N", min=0)] = 1
+    condition: Annotated[str | None, option("--condition", "NAME")] = None
+    relief_m: Annotated[float, option("--relief-m", "H")] = 0.0
+    map: Annotated[Path | None, option("--map", "FILE", MAP)] = None
     surface: SurfaceOption = None
-    camera_pitch_deg: Annotated[
-        float, option("--camera-pitch-deg", "P", "Pitch of the camera: -90 straight down, -45 oblique.")
-    ] = -90.0
+    camera_pitch_deg: Annotated[float, option("--camera-pitch-deg", "P")] = -90.0
 
     def world(self) -> WorldSettings:
         """The options in the form that the run takes."""
@@ -52,26 +54,27 @@ class WorldOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class LoopOptions:
-    """How the loop is closed, if it is."""
+    """How the loop is closed, if it is.
 
-    closed_loop: Annotated[bool, flag("--closed-loop", "Steer by the engine's fixes, with GPS off.")] = False
-    minutes: Annotated[
-        float | None, option("--minutes", "M", "With --closed-loop: minutes to fly (default: 5).")
-    ] = None
-    method: Annotated[
-        str | None, option("--method", "auto|ncc|sift", "With --closed-loop: matching method (default: auto).")
-    ] = None
-    fault: Annotated[
-        str | None, option("--fault", "none|killed|shifted|frozen", "With --closed-loop: fault to inject.")
-    ] = None
+    Attributes:
+        closed_loop: Steer by the engine's fixes, with GPS off.
+        minutes: With --closed-loop: minutes to fly (default: 5).
+        method: With --closed-loop: matching method (default: auto).
+        fault: With --closed-loop: fault to inject.
+    """
+
+    closed_loop: Annotated[bool, flag("--closed-loop")] = False
+    minutes: Annotated[float | None, option("--minutes", "M")] = None
+    method: Annotated[str | None, option("--method", "auto|ncc|sift")] = None
+    fault: Annotated[str | None, option("--fault", "none|killed|shifted|frozen")] = None
 
 
 @with_options
 def simulate(
-    out: Annotated[Path, option("--out", "DIR", "Flight folder, created by this run.", OUTPUT)],
+    out: Annotated[Path, option("--out", "DIR", OUTPUT)],
     town: WorldOptions,
     loop: LoopOptions,
-    frames: Annotated[int | None, option("--frames", "N", "Fly only the first N frames.", min=1)] = None,
+    frames: Annotated[int | None, option("--frames", "N", min=1)] = None,
     rerun: RerunOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -80,6 +83,10 @@ def simulate(
 
     Writes a flight folder that track can read. With --closed-loop the vehicle steers by the engine's fixes, and
     the folder also holds the track, the estimate, figures and a summary.
+
+    Options:
+        out: Flight folder, created by this run.
+        frames: Fly only the first N frames.
     """
     from scenematch.runs.inputs import FOLDER_LAYOUT
 
