@@ -86,15 +86,11 @@ def audit(
     from scenematch.runs.map_input import MapInput
 
     given = read_settings(settings)
+    site = MapInput(map_path, surface=surface, **table(given, "input").of(MapInput))
     files = AuditFiles(
-        map=MapInput(map_path, surface=surface, **table(given, "input").of(MapInput)),
-        camera=camera,
-        route=route,
-        other=other,
-        height_agl_m=height_agl_m,
-        around=around,
+        map=site, camera=camera, route=route, other=other, height_agl_m=height_agl_m, around=around,
         corridor_m=corridor_m,
-    )
+    )  # fmt: skip
     result = audit_map(files, out, table(given, "audit"), force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json(result.summary)
