@@ -68,11 +68,6 @@ class Condition:
         """The air between camera and ground, None if perfectly clear."""
         return None if math.isinf(self.visibility_m) else Atmosphere(self.visibility_m, self.air_rgb)
 
-    @property
-    def changes_ground(self) -> bool:
-        """Whether the season changes the drawn colours."""
-        return bool(self.snow or self.leaves < 1.0 or self.turned or self.dry)
-
     def sensor(self, sensor: Sensor) -> Sensor:
         """The camera's sensor on this day."""
         return sensor if self.noise == 1.0 else replace(sensor, noise_sd=self.noise * sensor.noise_sd)
@@ -158,7 +153,7 @@ def apply_season(
     Returns:
         (H, W, 3) uint8 colours and (H, W) heights.
     """
-    if not condition.changes_ground:
+    if not (condition.snow or condition.leaves < 1.0 or condition.turned or condition.dry):
         return albedo, height_m
     ground = np.zeros_like(height_m) if ground_m is None else ground_m
     rgb, height, kind = albedo.astype(np.float32), height_m.copy(), material.copy()
