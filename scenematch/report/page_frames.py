@@ -42,10 +42,7 @@ def _choice(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
     """Describe which frames are shown."""
     if len(shown) == len(track.rows):
         return f"All {len(shown)} frames."
-    kinds = {
-        "beyond three sigmas": np.flatnonzero(track.errors.beyond),
-        "refused": np.flatnonzero(~track.fixed),
-    }
+    kinds = {"beyond three sigmas": np.flatnonzero(track.errors.beyond), "refused": np.flatnonzero(~track.fixed)}
     there = {item.index for item in shown}
     parts = [
         f"{'' if there.issuperset(found) else f'{len(there.intersection(found))} of '}{len(found)} {kind}"

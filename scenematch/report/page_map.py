@@ -51,10 +51,7 @@ class TrackMap:
     @property
     def extent_m(self) -> tuple[float, float]:
         """Width and height on the ground in metres."""
-        return (
-            self.window.width_px * self.site.gsd_m_per_px,
-            self.window.height_px * self.site.gsd_m_per_px,
-        )
+        return (self.window.width_px * self.site.gsd_m_per_px, self.window.height_px * self.site.gsd_m_per_px)
 
     def drawing_xy(self, en_m: Array) -> Array:
         """East and north (..., 2) in metres as x and y (..., 2) of the drawing."""

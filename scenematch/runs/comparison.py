@@ -22,10 +22,7 @@ DEFAULT_RUNS = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")
 
 
 def parse_runs(
-    texts: Sequence[str] = (),
-    *,
-    settings: Sequence[StrPath] = (),
-    **overrides: Any,
+    texts: Sequence[str] = (), *, settings: Sequence[StrPath] = (), **overrides: Any
 ) -> dict[str, TrackSettings]:
     """Settings by run name; each run is given as METHOD, METHOD/PROFILE or a settings file.
 

@@ -15,14 +15,7 @@ from engine.geo import LocalFrame
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.values import MAX_SIGMA_M
 from scenematch.fetch.grid import FINE_ENOUGH, Access, Grid
-from scenematch.fetch.heights import (
-    GLO30,
-    GLO30_SLOPE_SIGMA_DEG,
-    Heights,
-    files_for,
-    read_part,
-    write_heights,
-)
+from scenematch.fetch.heights import GLO30, GLO30_SLOPE_SIGMA_DEG, Heights, files_for, read_part, write_heights
 from scenematch.fetch.pictures import fetch_pictures, kept_pictures, remove_pictures
 from scenematch.fetch.place import Bounds, Place, Wanted
 from scenematch.fetch.servers import plan

@@ -29,10 +29,7 @@ _HEAD = """\
 
 
 @with_options
-def doctor(
-    settings: Annotated[bool, flag("--settings", OUTPUT)] = False,
-    as_json: JsonOption = False,
-) -> None:
+def doctor(settings: Annotated[bool, flag("--settings", OUTPUT)] = False, as_json: JsonOption = False) -> None:
     """Show versions, devices and missing packages.
 
     --settings prints the file that other commands take as --settings FILE: every setting with unit and default.
