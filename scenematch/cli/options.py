@@ -1,8 +1,22 @@
-"""Options that several commands share, the objects they build, and how to print them for the next command."""
+"""Options that several commands share, the objects they build, and how to print them for the next command.
+
+Options:
+    surface: Surface model, a GeoTIFF of heights.
+    correct: Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.
+    start: Where the flight begins (default: the telemetry's first position, or anywhere on the map).
+    method: auto: ncc and sift, each checking the other (default).
+    device: Device to compute on (default: auto).
+    settings: Settings as `doctor --settings` lists them; repeatable.
+    out: Output folder to create.
+    force: Replace existing results.
+    as_json: Results as JSON on standard output.
+    rerun: Record the live view to a file, or show it in a running rerun viewer; repeat for both.
+"""
 
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
@@ -24,63 +38,32 @@ if TYPE_CHECKING:
 
 INPUT, MAP, OUTPUT, EXPERT = "Input", "Map", "Output", "Expert"
 """Panels of the help."""
+_SHARED = field_descriptions(sys.modules[__name__], "Options")
 
 
-def option(name: str, metavar: str, panel: str | None = None, text: str | None = None, **limits: Any) -> Any:
+def option(name: str, metavar: str, panel: str | None = None, **limits: Any) -> Any:
     """An option with a value, in a panel of the help; ``limits`` such as ``min`` are typer's.
 
-    Without a text the help is the description in the docstring, see :func:`with_options`.
+    Its help is its description in a docstring, see :func:`with_options`.
     """
-    return typer.Option(name, metavar=metavar, help=text, rich_help_panel=panel, **limits)
+    return typer.Option(name, metavar=metavar, rich_help_panel=panel, **limits)
 
 
-def flag(name: str, panel: str | None = None, text: str | None = None) -> Any:
-    """An option without a value; the help as of :func:`option`."""
-    return typer.Option(name, help=text, rich_help_panel=panel)
+def flag(name: str, panel: str | None = None) -> Any:
+    """An option without a value."""
+    return typer.Option(name, rich_help_panel=panel)
 
 
-SurfaceOption = Annotated[Path | None, option("--surface", "FILE", MAP, "Surface model, a GeoTIFF of heights.")]
-CorrectOption = Annotated[
-    list[str] | None,
-    option(
-        "--correct",
-        "NAME=VALUE",
-        INPUT,
-        "Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.",
-    ),
-]
-StartOption = Annotated[
-    str | None,
-    option(
-        "--start",
-        "LAT,LON[,SIGMA_M]",
-        INPUT,
-        "Where the flight begins (default: the telemetry's first position, or anywhere on the map).",
-    ),
-]
-MethodOption = Annotated[
-    str | None,
-    option("--method", "auto|ncc|sift|learned", text="auto: ncc and sift, each checking the other (default)."),
-]
-DeviceOption = Annotated[
-    str | None, option("--device", "auto|cpu|cuda", EXPERT, "Device to compute on (default: auto).")
-]
-SettingsOption = Annotated[
-    list[str] | None,
-    option("--settings", "FILE|NAME=VALUE", EXPERT, "Settings as `doctor --settings` lists them; repeatable."),
-]
-OutOption = Annotated[Path, option("--out", "DIR", OUTPUT, "Output folder to create.")]
-ForceOption = Annotated[bool, flag("--force", OUTPUT, "Replace existing results.")]
-JsonOption = Annotated[bool, flag("--json", OUTPUT, "Results as JSON on standard output.")]
-RerunOption = Annotated[
-    list[str] | None,
-    option(
-        "--rerun",
-        "FILE.rrd|HOST:PORT",
-        OUTPUT,
-        "Record the live view to a file, or show it in a running rerun viewer; repeat for both.",
-    ),
-]
+SurfaceOption = Annotated[Path | None, option("--surface", "FILE", MAP)]
+CorrectOption = Annotated[list[str] | None, option("--correct", "NAME=VALUE", INPUT)]
+StartOption = Annotated[str | None, option("--start", "LAT,LON[,SIGMA_M]", INPUT)]
+MethodOption = Annotated[str | None, option("--method", "auto|ncc|sift|learned")]
+DeviceOption = Annotated[str | None, option("--device", "auto|cpu|cuda", EXPERT)]
+SettingsOption = Annotated[list[str] | None, option("--settings", "FILE|NAME=VALUE", EXPERT)]
+OutOption = Annotated[Path, option("--out", "DIR", OUTPUT)]
+ForceOption = Annotated[bool, flag("--force", OUTPUT)]
+JsonOption = Annotated[bool, flag("--json", OUTPUT)]
+RerunOption = Annotated[list[str] | None, option("--rerun", "FILE.rrd|HOST:PORT", OUTPUT)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,8 +140,8 @@ class FlightOptions(CameraOptions, MapOptions):
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """Replace a command's parameters of the types above by their fields, one option each.
 
-    Options without a help text take it from the docstring: from "Options" of the command, which its own help then
-    leaves out, or from "Attributes" of the type.
+    The help of an option is its description in a docstring: under "Options" of the command, whose own help leaves
+    them out, under "Attributes" of the type, or for shared options under "Options" of this module.
     """
     hints = get_type_hints(command, include_extras=True)
     about, _, _ = (inspect.getdoc(command) or "").partition("Options:\n")
@@ -169,13 +152,15 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     for name, parameter in inspect.signature(command).parameters.items():
         kind, keyword = groups.get(name), inspect.Parameter.KEYWORD_ONLY
         if kind is None:
-            _describe(name, hints[name], command, "Options")
+            _describe(hints[name], field_descriptions(command, "Options").get(name) or _SHARED.get(name))
             parameters.append(parameter.replace(kind=keyword, annotation=hints[name]))
             continue
         types = get_type_hints(kind, include_extras=True)
+        described = _SHARED | {
+            n: text for owner in kind.__mro__[::-1] for n, text in field_descriptions(owner).items()
+        }
         for each in fields(kind):
-            for owner in kind.__mro__:
-                _describe(each.name, types[each.name], owner, "Attributes")
+            _describe(types[each.name], described.get(each.name))
             default = inspect.Parameter.empty if each.default is MISSING else each.default
             parameters.append(inspect.Parameter(each.name, keyword, default=default, annotation=types[each.name]))
 
@@ -193,11 +178,10 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
-def _describe(name: str, hint: Any, owner: Any, heading: str) -> None:
-    """Give an option that has no help text yet its description in a section of a docstring."""
-    for option_or_argument in getattr(hint, "__metadata__", ()):
-        if option_or_argument.help is None:
-            option_or_argument.help = field_descriptions(owner, heading).get(name)
+def _describe(hint: Any, text: str | None) -> None:
+    """Give an option or argument its help, unless it has one."""
+    for info in getattr(hint, "__metadata__", ()):
+        info.help = info.help or text
 
 
 def read_settings(texts: Sequence[str] | None) -> Settings:
