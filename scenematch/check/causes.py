@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import MOUNTS, mount_rotation
-from engine.geo import enu_from_body, wrap_difference_deg
+from engine.geo import Array, enu_from_body, wrap_difference_deg
 from scenematch.check.contradictions import SIGMA_DEG, attitude_deg, contradictions, height_sigma_m, is_alarming
-from scenematch.check.findings import GAIN, MIN_SEEN, MISFIT, OUTLIER, Array, Finding, TelemetrySeries, capped_cost
+from scenematch.check.findings import GAIN, MIN_SEEN, MISFIT, OUTLIER, Finding, TelemetrySeries, capped_cost
 from scenematch.check.ground_motion import optical_centre, velocity
 from scenematch.check.sightings import Sighting
 

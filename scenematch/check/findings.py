@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from engine.geo import Array
 
 MISFIT = 1.6
 """Mean chi-square of one component, beyond which something is wrong."""

@@ -10,8 +10,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.geo import wrap_difference_deg
-from scenematch.check.findings import GAIN, MIN_SEEN, MISFIT, OUTLIER, Array, Finding, TelemetrySeries, capped_cost
+from engine.geo import Array, wrap_difference_deg
+from scenematch.check.findings import GAIN, MIN_SEEN, MISFIT, OUTLIER, Finding, TelemetrySeries, capped_cost
 from scenematch.check.sightings import Sighting
 
 _VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": 0.3048}

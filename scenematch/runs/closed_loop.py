@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.matching import CLASSICAL
@@ -31,7 +29,7 @@ from scenematch.runs.results import LOOP, NOTES, SUMMARY, TRACK
 from scenematch.runs.simulation import FOLDER_OWNED, LOOP_OWNED, WorldSettings, picture_name, write_folder
 from scenematch.simulator import FlightStyle, Town, picture_at
 from scenematch.simulator.faults import FAULT_KINDS, Fault
-from scenematch.simulator.flight import NADIR_PITCH_DEG, truth_at
+from scenematch.simulator.flight import NADIR_PITCH_DEG, reach_m, truth_at
 from scenematch.simulator.light import Image
 from scenematch.simulator.loop import ClosedLoop
 from scenematch.simulator.pilot import plan_rounds
@@ -151,13 +149,12 @@ def plan_closed_loop(
     """The flight before it begins: circuits of the town, 150 m above its ground."""
     site = matcher.site
     style = FlightStyle()
-    corner = np.linalg.inv(camera.matrix) @ (camera.width_px - 0.5, camera.height_px - 0.5, 1.0)
-    reach_m = style.height_agl_m * math.hypot(corner[0], corner[1]) + _EDGE_M
-    half_m = [0.5 * n * site.gsd_m_per_px - reach_m for n in (site.width_px, site.height_px)]
+    least_m = reach_m(camera, style.height_agl_m) + _EDGE_M
+    half_m = [0.5 * n * site.gsd_m_per_px - least_m for n in (site.width_px, site.height_px)]
     if min(half_m) < _MIN_HALF_SIDE_M:
         sides = " x ".join(f"{n * site.gsd_m_per_px:.0f}" for n in (site.width_px, site.height_px))
         raise OptionError(
-            f"map: expected {2.0 * (reach_m + _MIN_HALF_SIDE_M):.0f} m or more a side, got {sides} m"
+            f"map: expected {2.0 * (least_m + _MIN_HALF_SIDE_M):.0f} m or more a side, got {sides} m"
         )
     style = replace(style, height_agl_m=style.height_agl_m + site.ground_m)
     route = plan_rounds((half_m[0], half_m[1]), 60.0 * loop.minutes, style)
