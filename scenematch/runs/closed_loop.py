@@ -19,7 +19,7 @@ from scenematch.files.notes import frame_note, write_notes
 from scenematch.files.track import track_row, write_track
 from scenematch.report.loop_record import summarise_loop, write_loop_csv
 from scenematch.runs.arguments import check_between, check_choice, check_device
-from scenematch.runs.evaluation import redraw
+from scenematch.runs.evaluation import evaluate
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.inputs import FOLDER_LAYOUT
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
@@ -136,7 +136,7 @@ def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: P
     write_notes(out / NOTES, notes)
     write_loop_csv(out / LOOP, flown)
     write_json(out / SUMMARY, {"settings": record.facts()})
-    summary = redraw(out, progress=progress)  # like any finished track, so that evaluate gives the same
+    summary = evaluate(out, force=True, progress=progress)  # like any finished track
     figures = summarise_loop(flown)
     figures |= {name: summary[name] for name in ("availability", "wrong_over_10m", "false_fixes")}
     write_json(out / "loop.json", figures | {"settings": record.facts()})

@@ -26,7 +26,7 @@ from scenematch.runs.settings import TrackSettings
 def evaluate(
     folder: StrPath, truth: StrPath | None = None, *, force: bool = False, progress: Progress = SILENT
 ) -> dict[str, Any]:
-    """Score a finished track again, if there is truth, and rewrite its summary and page.
+    """Score a finished track again, if there is truth, and rewrite its summary and page from its own record.
 
     Args:
         folder: folder of a finished run.
@@ -41,27 +41,7 @@ def evaluate(
         TelemetryError: the folder holds no finished track.
         OptionError: the page would lose its frames.
     """
-    return redraw(Path(folder), truth, keep_frames=truth is None and not force, progress=progress)
-
-
-def redraw(
-    folder: Path, truth: StrPath | None = None, *, keep_frames: bool = False, progress: Progress = SILENT
-) -> dict[str, Any]:
-    """Rewrite the results of a finished run from its own record.
-
-    Args:
-        folder: of the run.
-        truth: replaces the run's own.
-        keep_frames: do not replace a page that shows frames by one that no longer can.
-        progress: receives progress and messages.
-
-    Returns:
-        The summary.
-
-    Raises:
-        TelemetryError: the folder holds no finished track.
-        OptionError: the page would lose its frames.
-    """
+    folder = Path(folder)
     rows = read_track(folder / TRACK)
     record = read_record(folder / SUMMARY)
     path = record.truth if truth is None else truth
@@ -69,7 +49,7 @@ def redraw(
     site = open_recorded_map(record, progress)
     frames = _report_frames(record, rows, site)
     if frames.flight is None and shows_frames(folder / PAGE):
-        if keep_frames:
+        if truth is None and not force:
             raise OptionError(
                 f"runs: {folder / PAGE} shows frames, which redrawing would lose; add `force` to do it anyway; "
                 f"{frames.why_missing}"

@@ -10,7 +10,7 @@ from engine.orthomap import OrthoMap
 from scenematch.files.track import read_track
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.runs_page import MAX_RUNS, write_runs_page
-from scenematch.runs.evaluation import open_recorded_map, redraw
+from scenematch.runs.evaluation import evaluate, open_recorded_map
 from scenematch.runs.folders import StrPath, check_file
 from scenematch.runs.inputs import open_run_truth
 from scenematch.runs.progress import SILENT, Progress
@@ -44,7 +44,7 @@ def report(
     if len(runs) == 1:
         if out is not None:
             raise OptionError(f"out: expected none with one run, whose page is {runs[0] / PAGE}")
-        redraw(runs[0], keep_frames=not force, progress=progress)
+        evaluate(runs[0], force=force, progress=progress)
         return runs[0] / PAGE
     page = Path(COMPARISON if out is None else out)
     check_file(page, force)
