@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from scenematch.runs.inputs import FlightFiles
     from scenematch.runs.live_viewing import LiveViewTarget
     from scenematch.runs.map_input import MapInput
-    from scenematch.runs.settings import Settings
+    from scenematch.runs.settings import Settings, TrackSettings
 
 INPUT, MAP, OUTPUT, EXPERT = "Input", "Map", "Output", "Expert"
 """Panels of the help."""
@@ -135,6 +135,19 @@ class FlightOptions(CameraOptions, MapOptions):
             corrections=Corrections.from_texts(correct or ()),
             **table(settings, "input").of(FlightFiles),
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchingOptions:
+    """How frames are matched."""
+
+    start: StartOption = None
+    method: MethodOption = None
+    device: DeviceOption = None
+
+    def track_settings(self, settings: Settings) -> TrackSettings:
+        """The options combined with the settings."""
+        return settings.track(method=self.method, device=self.device, start=self.start)
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -16,14 +16,12 @@ from scenematch.cli.options import (
     MAP,
     OUTPUT,
     CameraOptions,
-    DeviceOption,
     ForceOption,
     JsonOption,
     MapOptions,
-    MethodOption,
+    MatchingOptions,
     RerunOption,
     SettingsOption,
-    StartOption,
     SurfaceOption,
     flag,
     live_view,
@@ -74,29 +72,6 @@ class PictureOptions(CameraOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatchingOptions:
-    """How frames are matched."""
-
-    start: StartOption = None
-    method: MethodOption = None
-    device: DeviceOption = None
-
-    def bridge_settings(self, settings: Settings) -> BridgeSettings:
-        """The options combined with the settings."""
-        how = settings.track(method=self.method, device=self.device, start=self.start)
-        made: BridgeSettings = table(
-            settings,
-            "bridge",
-            method=how.method,
-            device=how.device,
-            start=how.start,
-            matcher=how.matcher_options(),
-            navigator=how.navigator,
-        )
-        return made
-
-
-@dataclass(frozen=True, kw_only=True)
 class OptionalMapOptions:
     """The map, needed only to send fixes.
 
@@ -125,6 +100,15 @@ class OtherWork:
 
     out: Annotated[Path | None, option("--write-params", "FILE", OUTPUT)] = None
     measure_delay: Annotated[bool, flag("--measure-delay", OUTPUT)] = False
+
+
+def _bridge_settings(matching: MatchingOptions, settings: Settings) -> BridgeSettings:
+    """How a bridge matches frames: the options combined with the settings."""
+    how = matching.track_settings(settings)
+    matcher = how.matcher_options()
+    same = {name: getattr(how, name) for name in ("method", "device", "start", "navigator")}
+    made: BridgeSettings = table(settings, "bridge", **same, matcher=matcher)
+    return made
 
 
 @with_options
@@ -185,7 +169,7 @@ def _bridge(
         camera_source=pictures.camera_source,
         **table(given, "input").of(BridgeFiles),
     )
-    link, how = autopilot.link(given), matching.bridge_settings(given)
+    link, how = autopilot.link(given), _bridge_settings(matching, given)
     status = run_mavlink_bridge(files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {link.connect}")
     flown = console.options(
@@ -269,7 +253,7 @@ def ros(
     )
     if image is not None:
         node = replace(node, topics=replace(node.topics, image=image))
-    how = matching.bridge_settings(given)
+    how = _bridge_settings(matching, given)
     status = run_ros_bridge(node, how, live_view=live_view(rerun), progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"ROS {version} on {node.topics.image}")
     flown = console.options(map=site.map, surface=site.surface)

@@ -11,12 +11,10 @@ import typer
 from scenematch.cli import console
 from scenematch.cli.options import (
     CameraOptions,
-    DeviceOption,
     JsonOption,
     MapOptions,
-    MethodOption,
+    MatchingOptions,
     SettingsOption,
-    StartOption,
     option,
     read_settings,
     with_options,
@@ -31,13 +29,12 @@ def locate(
     image: Annotated[Path, typer.Argument(metavar="IMAGE")],
     site: MapOptions,
     lens: CameraOptions,
+    *,
     height_agl_m: Annotated[float | None, option("--height-agl", "M")] = None,
     heading_deg: Annotated[float | None, option("--heading", "DEG")] = None,
     roll_deg: Annotated[float | None, option("--roll", "DEG")] = None,
     pitch_deg: Annotated[float | None, option("--pitch", "DEG")] = None,
-    start: StartOption = None,
-    method: MethodOption = None,
-    device: DeviceOption = None,
+    matching: MatchingOptions,
     settings: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -56,7 +53,7 @@ def locate(
     from scenematch.runs.single_image import locate_image
 
     given = read_settings(settings)
-    how = given.track(method=method, device=device, start=start)
+    how = matching.track_settings(given)
     result = locate_image(
         image,
         site.map_input(given),
