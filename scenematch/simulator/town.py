@@ -20,7 +20,7 @@ from engine.orthomap import OrthoMap
 from scenematch.simulator.blocks import fill_blocks
 from scenematch.simulator.canvas import ASPHALT, CANOPY, CROP, PAVING, ROOF, WATER, Canvas, Colour
 from scenematch.simulator.conditions import CONDITIONS, Condition, apply_season, condition_by_name
-from scenematch.simulator.light import Array, Float32, Image, Light, illuminate
+from scenematch.simulator.light import Array, Float32, Image, illuminate
 from scenematch.simulator.optics import Sensor
 from scenematch.simulator.render import Glint, World, transformer
 from scenematch.simulator.terrain import draw_river, hills, raise_by_ground
@@ -243,23 +243,18 @@ def _rebuilt(drawn: _Drawn, changed: float, rng: np.random.Generator) -> _Drawn:
 
 
 def _draw(
-    rng: np.random.Generator,
-    size: tuple[int, int],
-    gsd: float,
-    light: Light,
-    relief_m: float,
-    river_rng: np.random.Generator | None,
-    hill_rng: np.random.Generator,
+    canvas: Canvas, relief_m: float, river_rng: np.random.Generator | None, hill_rng: np.random.Generator
 ) -> _Drawn:
     """Streets, blocks and cars on a canvas, and the hills below them."""
-    canvas = Canvas(rng, size, gsd, light)
     river = None if river_rng is None else draw_river(canvas, river_rng)
     edges_u, edges_v, roads = _streets(canvas)
     fill_blocks(canvas, edges_u, edges_v)
     canvas.texture()
     then, today = _park_cars(canvas, roads)
     lamps = _lamp_light(canvas, roads) * (canvas.height < LAMP_M)
-    ground = raise_by_ground(canvas, hills(size, gsd, relief_m, hill_rng), river) if relief_m else None
+    ground = None
+    if relief_m:
+        ground = raise_by_ground(canvas, hills(canvas.shape, canvas.gsd, relief_m, hill_rng), river)
     height, material = canvas.height, canvas.material
     return _Drawn(canvas, _Day(then, height, material), _Day(today, height, material), ground, lamps)
 
@@ -325,7 +320,8 @@ def build_town(
     margin = math.ceil(MARGIN_M / gsd_m_per_px)
     size = ((height_px + 2 * margin) * fine, (width_px + 2 * margin) * fine)
     rng, water_rng = generator(seed, 0x70), generator(seed, 0x71) if river else None
-    drawn = _draw(rng, size, gsd_m_per_px / fine, today.light, relief_m, water_rng, generator(seed, 0x72))
+    canvas = Canvas(rng, size, gsd_m_per_px / fine, today.light)
+    drawn = _draw(canvas, relief_m, water_rng, generator(seed, 0x72))
     if changed:
         drawn = _rebuilt(drawn, changed, generator(seed, 0x75))
     inner = (slice(margin * fine, -margin * fine),) * 2
