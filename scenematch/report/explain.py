@@ -21,6 +21,7 @@ from engine.window import level_crop
 from scenematch.files.flight import Flight, FlightFrame
 from scenematch.files.notes import FrameNote
 from scenematch.files.track import TrackRow
+from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.metrics import TrackErrors
 
 Image = NDArray[np.uint8]
@@ -96,30 +97,21 @@ def _evenly_spaced(indices: NDArray[np.intp], count: int) -> list[int]:
     return [int(i) for i in indices]
 
 
-def explain_frames(
-    flight: Flight,
-    matcher: SceneMatcher,
-    rows: Sequence[TrackRow],
-    notes: Sequence[FrameNote],
-    chosen: Sequence[int],
-    errors: TrackErrors,
-) -> list[SliderFrame]:
-    """Match selected frames again, each in the window of its run, and draw the results.
+def explain_frames(track: FinishedTrack, flight: Flight, matcher: SceneMatcher) -> list[SliderFrame]:
+    """Match some frames of a track again, each in the window of its run, and draw the results.
 
     Args:
+        track: with notes.
         flight: the flight that was tracked.
         matcher: the matcher of the run, or an equal one.
-        rows: the track.
-        notes: notes of the run, one per row.
-        chosen: indices of rows, ascending.
-        errors: of the track, with the positions of fixes and truth.
 
     Raises:
         TelemetryError: a frame can no longer be read.
     """
+    notes, errors = track.notes or (), track.errors
     out = []
-    for index in chosen:
-        item, row = flight.read(index), rows[index]
+    for index in choose_frames(track.rows, errors):
+        item, row = flight.read(index), track.rows[index]
         explained = match_again(matcher, item.frame, row, notes[index])
         places_m = (errors.truth_en_m[index], errors.fix_en_m[index])
         out.append(SliderFrame(index, _images(item, explained, row.fixed, matcher.site, places_m)))

@@ -16,7 +16,7 @@ from scenematch.files.notes import read_notes
 from scenematch.files.resampling import UTC_FROM_NS
 from scenematch.files.track import TrackRow
 from scenematch.report.consistency import motion_consistency
-from scenematch.report.explain import choose_frames, explain_frames
+from scenematch.report.explain import explain_frames
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.loop_record import read_loop_csv
 from scenematch.report.metrics import Ground, errors_en_m, summarise
@@ -96,9 +96,8 @@ def _write_page(path: Path, track: FinishedTrack, frames: ReportFrames) -> None:
         return write_page(path, track, why_not=f"No frames are shown: {frames.why_missing}")
     if track.notes is None or [note.frame for note in track.notes] != [row.frame for row in track.rows]:
         return write_page(path, track, why_not=f"No frames are shown: the run left no {NOTES} of its windows.")
-    chosen = choose_frames(track.rows, track.errors)
     try:
-        shown = explain_frames(frames.flight, frames.matcher, track.rows, track.notes, chosen, track.errors)
+        shown = explain_frames(track, frames.flight, frames.matcher)
     except EngineError as error:
         return write_page(path, track, why_not=f"No frames are shown: {error}")
     return write_page(path, track, shown)
