@@ -118,9 +118,8 @@ def fly_closed_loop(
         count = int(seconds * flight.options.frame_rate_hz)
         frames = progress.track(_fly(flight, seconds, view), count, "flying")
         lat, lon = map(float, site.frame.geodetic_from_enu(*flight.flown.start_m[:2]))
-        write_folder(
-            out, town, camera, frames, _truth_rows(flight, town, site), lat, lon
-        )  # written while it flies
+        # Written while it flies.
+        write_folder(out, town, camera, frames, _truth_rows(flight, town, site), lat, lon)
     record = _record(out, world, loop, site, town, str(matcher.device))
     return _write_results(out, flight, record, progress)
 
@@ -153,9 +152,8 @@ def plan_closed_loop(
     half_m = [0.5 * n * site.gsd_m_per_px - least_m for n in (site.width_px, site.height_px)]
     if min(half_m) < _MIN_HALF_SIDE_M:
         sides = " x ".join(f"{n * site.gsd_m_per_px:.0f}" for n in (site.width_px, site.height_px))
-        raise OptionError(
-            f"map: expected {2.0 * (least_m + _MIN_HALF_SIDE_M):.0f} m or more a side, got {sides} m"
-        )
+        side_m = 2.0 * (least_m + _MIN_HALF_SIDE_M)
+        raise OptionError(f"map: expected {side_m:.0f} m or more a side, got {sides} m")
     style = replace(style, height_agl_m=style.height_agl_m + site.ground_m)
     route = plan_rounds((half_m[0], half_m[1]), 60.0 * loop.minutes, style)
     rng = generator(seed, 0xCA)
