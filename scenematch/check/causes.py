@@ -9,23 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import MOUNTS, mount_rotation
-from engine.geo import enu_from_body, wrap_difference_deg
-from scenematch.check.contradictions import (
-    SIGMA_DEG,
-    attitude_deg,
-    contradictions,
-    height_sigma_m,
-    is_alarming,
-)
-from scenematch.check.findings import Array, Finding, TelemetrySeries
+from engine.geo import Array, enu_from_body, wrap_difference_deg
+from scenematch.check.contradictions import SIGMA_DEG, attitude_deg, contradictions, height_sigma_m, is_alarming
+from scenematch.check.findings import GAIN, MIN_SEEN, MISFIT, OUTLIER, Finding, TelemetrySeries, capped_cost
 from scenematch.check.ground_motion import optical_centre, velocity
 from scenematch.check.sightings import Sighting
 
-_OUTLIER = 9.0  # chi-square at which a difference is capped
-_MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
-_GAIN, _GAIN_SHARE = 0.6, 0.5  # a change must reduce it by the lesser of the two
+_GAIN_SHARE = 0.5  # a change of the attitude must reduce the cost by the lesser of this share and of GAIN
 _PENALTY = {"discrete": 0.15, "offset": 0.25, "shift": 0.3, "rotation": 0.5}
-_LEAST = 3
 _ANGLES = ("roll", "pitch", "heading")
 # An offset below both, as a share of the height and in sigmas, is named only if single pictures contradict it.
 _LEAST_HEIGHT_SHARE, _LEAST_HEIGHT_SIGMAS = 0.04, 5.0
@@ -43,7 +34,7 @@ def findings(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: flo
         seen: poses of some of its pictures.
         map_sigma_m: georeferencing accuracy of the map.
     """
-    if len(seen) < _LEAST:
+    if len(seen) < MIN_SEEN:
         return []
     attitude = _attitude(series, seen)
     # A late clock also shifts places forwards.
@@ -64,7 +55,7 @@ def is_known(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[str, ..
     columns = {**angles, "height": series.height_m[:, None], "velocity": series.velocity_mps,
                "map": series.reference_m}  # fmt: skip
     return tuple(
-        name for name, values in columns.items() if np.isfinite(values[index]).all(axis=1).sum() >= _LEAST
+        name for name, values in columns.items() if np.isfinite(values[index]).all(axis=1).sum() >= MIN_SEEN
     )
 
 
@@ -73,9 +64,9 @@ def is_known(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[str, ..
 
 def _cost(measured_deg: Array, told_deg: Array) -> float:
     """Mean chi-square of a component, with each value capped."""
-    chi = (wrap_difference_deg(measured_deg - told_deg) / SIGMA_DEG) ** 2
-    known = np.isfinite(chi)
-    return float(np.minimum(chi, _OUTLIER)[known].mean()) if known.any() else 0.0
+    off = wrap_difference_deg(measured_deg - told_deg) / SIGMA_DEG
+    known = np.isfinite(off)
+    return capped_cost(off[known]) if known.any() else 0.0
 
 
 def _signed(angles: Array) -> Array:
@@ -115,21 +106,21 @@ def _attitude(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | No
     index = np.array([s.index for s in seen])
     measured = np.array([attitude_deg(s) for s in seen])
     angles = series.angles_deg[index]
-    if np.isfinite(angles).sum() < 2 * _LEAST:
+    if np.isfinite(angles).sum() < 2 * MIN_SEEN:
         return None
     as_told = _cost(measured, angles)
     contradicted = _contradicted(series, seen, _ANGLES)
-    if as_told < _MISFIT and not contradicted:
+    if as_told < MISFIT and not contradicted:
         return None
     tried: list[tuple[float, Finding]] = [
         (_cost(measured, change(angles)) + _PENALTY["discrete"], Finding(cause, text, cure))
         for cause, text, cure, change in _DISCRETE
     ]
     tried.append(_turned_heading(measured, angles))
-    tried.append(_turned_mount(measured, angles, series.mount))
-    tried.append(_late(measured, series, index))
-    cost, finding = min((row for row in tried if math.isfinite(row[0])), key=lambda row: row[0])
-    if cost < as_told - min(_GAIN, _GAIN_SHARE * as_told):
+    others = (_turned_mount(measured, angles, series.mount), _late(measured, series, index))
+    tried += [other for other in others if other is not None]
+    cost, finding = min(tried, key=lambda row: row[0])
+    if cost < as_told - min(GAIN, _GAIN_SHARE * as_told):
         return finding
     suspected = _listed(contradicted or _ANGLES)
     text = f"{suspected} of the telemetry and of the pictures differ, and no single change would make them agree"
@@ -154,17 +145,17 @@ def _turned_heading(measured: Array, angles: Array) -> tuple[float, Finding]:
     return cost, Finding("heading", text, f"--correct heading_offset_deg={off_deg:+.1f}", off_deg, sigma_deg)
 
 
-def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, Finding]:
+def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, Finding] | None:
     """One rotation between the telemetry's body and the pictures': the camera is mounted differently."""
     known = np.isfinite(angles).all(axis=1)
-    if known.sum() < _LEAST:
-        return math.inf, Finding("mount", "", "")
+    if known.sum() < MIN_SEEN:
+        return None
     bodies = [enu_from_body(*row) for row in angles[known]]
     shown = [enu_from_body(*row) for row in measured[known]]
     turns = [b.T @ s for b, s in zip(bodies, shown, strict=True)]  # shown = telemetry's @ turn
     median = _middle_rotation(turns)
     leftover = [_rotation_deg(median.T @ turn) for turn in turns]
-    chi = np.minimum((np.array(leftover) / 1.5) ** 2 / 2.0, _OUTLIER)
+    chi = np.minimum((np.array(leftover) / 1.5) ** 2 / 2.0, OUTLIER)
     about_down_deg = math.degrees(math.atan2(median[1, 0], median[0, 0]))
     tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(median[2, 2])))))
     quarter = round(about_down_deg / 90.0) * 90
@@ -177,7 +168,7 @@ def _turned_mount(measured: Array, angles: Array, mount: Array) -> tuple[float, 
         cure = f"--mount {names[0]}" if names else _mount_line(hung)
         return float(chi.mean()) + _PENALTY["discrete"], Finding("mount", text, cure, float(quarter), sigma_deg)
     if tilt_deg < 1.0:  # only about the vertical: reported as a heading
-        return math.inf, Finding("mount", "", "")
+        return None
     axis = (mount @ np.array([0.0, 0.0, 1.0]), median @ mount @ np.array([0.0, 0.0, 1.0]))
     forward_deg = math.degrees(math.atan2(axis[1][0], axis[1][2]) - math.atan2(axis[0][0], axis[0][2]))
     text = (
@@ -192,11 +183,10 @@ def _mount_line(mount: Array) -> str:
     return f"mount: [{', '.join(f'{v:.5f}' for v in mount.ravel())}]{IN_CALIBRATION}"
 
 
-def _late(measured: Array, series: TelemetrySeries, index: NDArray[np.intp]) -> tuple[float, Finding]:
-    nothing = math.inf, Finding("clock", "", "")
+def _late(measured: Array, series: TelemetrySeries, index: NDArray[np.intp]) -> tuple[float, Finding] | None:
     known = np.isfinite(series.angles_deg).all(axis=1) & np.isfinite(series.time_s)
-    if known.sum() < 2 * _LEAST or not np.all(np.diff(series.time_s[known]) > 0.0):
-        return nothing
+    if known.sum() < 2 * MIN_SEEN or not np.all(np.diff(series.time_s[known]) > 0.0):
+        return None
     time_s, angles = series.time_s[known], series.angles_deg[known].copy()
     angles[:, 2] = np.degrees(np.unwrap(np.radians(angles[:, 2])))
 
@@ -210,9 +200,8 @@ def _late(measured: Array, series: TelemetrySeries, index: NDArray[np.intp]) -> 
     shift_s = float(_SHIFTS_S[best])
     late = "late" if shift_s > 0.0 else "early"
     text = f"the telemetry is {abs(shift_s):.2f} s {late} against the pictures"
-    return costs[best] + _PENALTY["shift"], Finding(
-        "clock", text, f"--correct offset_s={-shift_s:+.2f}", shift_s, 0.05
-    )
+    cure = f"--correct offset_s={-shift_s:+.2f}"
+    return costs[best] + _PENALTY["shift"], Finding("clock", text, cure, shift_s, 0.05)
 
 
 def _median_angle(angles_deg: Array) -> tuple[float, float]:
@@ -230,7 +219,7 @@ def _median_angle(angles_deg: Array) -> tuple[float, float]:
 def _middle_rotation(turns: Sequence[Array]) -> Array:
     """Robust mean of rotations: the mean of those nearest to the one that is nearest to all."""
     apart = np.array([[_rotation_deg(a.T @ b) for b in turns] for a in turns])
-    near = np.argsort(apart[int(np.argmin(np.median(apart, axis=1)))])[: max(_LEAST, (3 * len(turns)) // 4)]
+    near = np.argsort(apart[int(np.argmin(np.median(apart, axis=1)))])[: max(MIN_SEEN, (3 * len(turns)) // 4)]
     u, _, vt = np.linalg.svd(np.mean([turns[k] for k in near], axis=0))
     return np.asarray(u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt, np.float64)
 
@@ -246,22 +235,22 @@ def _height(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None
     height = series.height_m[[s.index for s in seen]]
     measured = np.array([s.height_agl_m for s in seen])
     known = np.isfinite(height)
-    if known.sum() < _LEAST:
+    if known.sum() < MIN_SEEN:
         return None
     height, measured = height[known], measured[known]
     sigma = height_sigma_m(measured)
 
     def cost(expected: Array) -> float:
-        return float(np.minimum(((measured - expected) / sigma) ** 2, _OUTLIER).mean())
+        return capped_cost((measured - expected) / sigma)
 
     off_m, factor = float(np.median(measured - height)), float(np.median(measured / height))
     by_offset, by_factor = cost(height + off_m), cost(height * factor)
     spread_m = 1.4826 * float(np.median(np.abs(measured - height - off_m)))
     sigma_m = max(spread_m, 0.5) * 1.25 / math.sqrt(known.sum())
     is_small = abs(off_m) < min(_LEAST_HEIGHT_SHARE * float(np.median(measured)), _LEAST_HEIGHT_SIGMAS * sigma_m)
-    if cost(height) < _MISFIT or (is_small and not _contradicted(series, seen, ("height",))):
+    if cost(height) < MISFIT or (is_small and not _contradicted(series, seen, ("height",))):
         return None
-    if min(by_offset, by_factor) > cost(height) - _GAIN:
+    if min(by_offset, by_factor) > cost(height) - GAIN:
         text = "the height does not agree with the pictures, and no offset or factor would make it"
         return Finding("height", text, "look at the telemetry's height")
     if abs(factor / _FEET - 1.0) < 0.04:
@@ -286,7 +275,7 @@ def _place(series: TelemetrySeries, seen: Sequence[Sighting], map_sigma_m: float
     reference_m = series.reference_m[index]
     off = np.array([s.en_m for s in seen]) - reference_m
     known = np.isfinite(off).all(axis=1)
-    if known.sum() < _LEAST:
+    if known.sum() < MIN_SEEN:
         return None
     middle = np.median(off[known], axis=0)
     if not np.isfinite(series.angles_deg[index, :2]).any():

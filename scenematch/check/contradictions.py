@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from engine.geo import wrap_difference_deg
-from scenematch.check.findings import Array, Contradiction, TelemetrySeries
+from engine.geo import Array, wrap_difference_deg
+from scenematch.check.findings import Contradiction, TelemetrySeries
 from scenematch.check.ground_motion import leg_differences
 from scenematch.check.sightings import Sighting
 

@@ -5,9 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from engine.geo import Array
+
+MISFIT = 1.6
+"""Mean chi-square of one component, beyond which something is wrong."""
+GAIN = 0.6
+"""By which a change must reduce it."""
+OUTLIER = 9.0
+"""Chi-square at which a difference is capped."""
+MIN_SEEN = 3
+"""Smallest number of pictures, or of displacements between them, that are compared."""
+
+
+def capped_cost(off: Array) -> float:
+    """Mean chi-square of differences in sigmas, each capped."""
+    return float(np.minimum(off**2, OUTLIER).mean())
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.geo import wrap_difference_deg
-from scenematch.check.findings import Array, Finding, TelemetrySeries
+from engine.geo import Array, wrap_difference_deg
+from scenematch.check.findings import GAIN, MIN_SEEN, MISFIT, OUTLIER, Finding, TelemetrySeries, capped_cost
 from scenematch.check.sightings import Sighting
 
-_OUTLIER = 9.0  # chi-square at which a difference is capped
-_MISFIT = 1.6  # mean chi-square of one component, beyond which something is wrong
-_GAIN = 0.6  # by which a change must reduce it
-_LEAST = 3
 _VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": 0.3048}
 # For offsets that turn with the heading: minimum reduction of the cost, its share, and the least offset reported.
 _TURNING_GAIN, _TURNING_RATIO, _TURNING_SIGMAS, _TURNING_LEAST_DEG = 0.35, 2.5, 4.0, 1.2
@@ -65,13 +61,13 @@ class _Leg:
 def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None:
     """Find a wrong unit, axis or sign of a velocity that does not agree with the sightings."""
     legs = _legs(series, seen)
-    if len(legs) < _LEAST:
+    if len(legs) < MIN_SEEN:
         return None
     moved, reckoned = np.array([leg.moved_m for leg in legs]), np.array([leg.reckoned_m for leg in legs])
     sigma = np.array([[leg.sigma_m] for leg in legs])
 
     def cost(expected: Array) -> float:
-        return _limited((moved - expected) / sigma)
+        return capped_cost((moved - expected) / sigma)
 
     tried = [(cost(reckoned[:, ::-1]), "the velocity's east and north are swapped",
               "--correct east_velocity_mps=north_velocity_mps --correct north_velocity_mps=east_velocity_mps"),
@@ -87,17 +83,12 @@ def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | Non
     factor = float(np.median((moved * reckoned).sum(axis=1) / np.maximum((reckoned**2).sum(axis=1), 1e-9)))
     if square > 0.0 and factor > 0.0:
         text = f"the vehicle moves {factor:.2f} times as far between pictures as velocity and stamps say"
-        tried.append(
-            (
-                cost(factor * reckoned) + 0.1,
-                text,
-                "look at the frame rate, the stamps and the unit of the velocity",
-            )
-        )
+        cure = "look at the frame rate, the stamps and the unit of the velocity"
+        tried.append((cost(factor * reckoned) + 0.1, text, cure))
     best, text, cure = min(tried, key=lambda row: row[0])
-    if cost(reckoned) < _MISFIT:
+    if cost(reckoned) < MISFIT:
         return None
-    if best > cost(reckoned) - _GAIN:
+    if best > cost(reckoned) - GAIN:
         text = "velocity and timestamps do not fit the motion between pictures, and no single change would help"
         return Finding("velocity", text, "look at the velocity and the stamps")
     return Finding("velocity", text, cure, factor)
@@ -106,7 +97,7 @@ def velocity(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | Non
 def leg_differences(series: TelemetrySeries, seen: Sequence[Sighting]) -> Array:
     """(N,) difference of each displacement from the velocity's, in standard deviations."""
     legs = _legs(series, seen)
-    return np.array([np.abs(leg.off).max() for leg in legs] if len(legs) >= _LEAST else [], np.float64)
+    return np.array([np.abs(leg.off).max() for leg in legs] if len(legs) >= MIN_SEEN else [], np.float64)
 
 
 def _legs(series: TelemetrySeries, seen: Sequence[Sighting]) -> list[_Leg]:
@@ -128,11 +119,11 @@ def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding
     usual = [one for one, tilt_off_deg in zip(seen, off_deg, strict=True) if tilt_off_deg < _TILT_OFF_DEG]
     legs = [leg for leg in _legs(series, usual) if _turns_as_told(series, leg)]
     turning = np.array([abs(leg.turn_deg) > _TURN_DEG for leg in legs], bool)
-    if len(legs) < _LEAST or not turning.any():
+    if len(legs) < MIN_SEEN or not turning.any():
         return None
     rows, off = np.array([leg.turned for leg in legs]), np.array([leg.off for leg in legs])
     aside_m, information = _common_offset(rows, off, turning)
-    as_told, best = _limited(off), _limited(off - rows @ aside_m)
+    as_told, best = capped_cost(off), capped_cost(off - rows @ aside_m)
     height_m = float(np.median([one.height_agl_m for one in seen]))
     # Most legs are more accurate than assumed.
     sigma_m = math.sqrt(max(best, _LEAST_COST) * float(np.trace(np.linalg.inv(information))))
@@ -143,11 +134,6 @@ def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding
     if size_m < _TURNING_SIGMAS * sigma_m or aside_deg < _TURNING_LEAST_DEG:
         return None
     return _named(aside_m, sigma_m, height_m, series)
-
-
-def _limited(left: Array) -> float:
-    """Mean chi-square of the residuals, each capped."""
-    return float(np.minimum(left**2, _OUTLIER).mean())
 
 
 def _turns_as_told(series: TelemetrySeries, leg: _Leg) -> bool:
@@ -164,8 +150,8 @@ def _common_offset(rows: Array, off: Array, turning: NDArray[np.bool_]) -> tuple
         offset of many sigmas makes every leg an outlier.
     """
     shown = np.linalg.solve(rows[turning], off[turning][..., None])[..., 0]
-    offset_m = min(shown, key=lambda one: _limited(off - rows @ one))
-    agreeing = (np.abs(off - rows @ offset_m) < _OUTLIER**0.5).all(axis=1)
+    offset_m = min(shown, key=lambda one: capped_cost(off - rows @ one))
+    agreeing = (np.abs(off - rows @ offset_m) < OUTLIER**0.5).all(axis=1)
     design = rows[agreeing].reshape(-1, 2)
     information = design.T @ design
     return np.linalg.solve(information, design.T @ off[agreeing].ravel()), information
@@ -179,9 +165,8 @@ def _named(aside_m: Array, sigma_m: float, height_m: float, series: TelemetrySer
         "the vehicle heads: the optical centre is off, or the camera's mount and the attitude alike"
     )
     cure = f"look at the calibration: cx and cy would be {-off_px[0]:+.0f} and {-off_px[1]:+.0f} px other"
-    return Finding(
-        "mount", text, cure, math.degrees(math.atan2(size_m, height_m)), math.degrees(sigma_m / height_m)
-    )
+    aside_deg, sigma_deg = math.degrees(math.atan2(size_m, height_m)), math.degrees(sigma_m / height_m)
+    return Finding("mount", text, cure, aside_deg, sigma_deg)
 
 
 def _leg(series: TelemetrySeries, a: Sighting, b: Sighting) -> _Leg | None:

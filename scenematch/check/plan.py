@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -21,6 +21,9 @@ from engine.window import level_for
 
 Mask = NDArray[np.bool_]
 
+NCC = NccOptions()
+"""Settings of the method that an audit predicts fixes of."""
+
 # Larger templates take longer and change little, so the audit then uses a coarser level.
 _MAX_TEMPLATE_PX = 320
 _CELLS_PER_AUDITED = 250  # of the grid under a part, which bounds its memory for a long corridor
@@ -35,13 +38,11 @@ class AuditOptions:
         prior_sigma_m: standard deviation of the position before a match.
         spacing: distance of the cells, as a share of the frame's footprint.
         max_cells: upper bound on the number of audited cells; the spacing grows accordingly.
-        ncc: settings of the NCC method.
     """
 
     prior_sigma_m: float = 10.0
     spacing: float = 0.25
     max_cells: int = 4000
-    ncc: NccOptions = field(default_factory=NccOptions)
 
     def __post_init__(self) -> None:
         check_positive(self, "prior_sigma_m", "spacing", "max_cells")
@@ -121,7 +122,7 @@ class AuditPlan:
     @property
     def exclusion_px(self) -> float:
         """Rivals closer than this belong to the peak itself, in pixels of the level."""
-        return self.options.ncc.exclusion_m / (self.site.gsd_m_per_px * 2.0**self.level)
+        return NCC.exclusion_m / (self.site.gsd_m_per_px * 2.0**self.level)
 
     @cached_property
     def centers_px(self) -> Array:

@@ -20,13 +20,12 @@ from engine.maps.prepared import PreparedMap
 from engine.matching.correlation import MIN_VALID_SHARE
 from engine.matching.covariance import score_sigma
 from engine.ncc_fft import surface
-from engine.options import NccOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import CPU
 from engine.runtime.workers import in_order, safe_count
 from engine.values import Window
 from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
-from scenematch.check.plan import AuditPlan
+from scenematch.check.plan import NCC, AuditPlan
 
 Gray = NDArray[np.uint8]
 Pictures = NDArray[np.float32]
@@ -74,8 +73,7 @@ def measure_self_match(plan: AuditPlan) -> Iterator[SelfMatchStatistics]:
 
     A large map is read on demand, using one core.
     """
-    options = plan.options.ncc
-    prepared = PreparedMap(plan.site, CPU, options.enhance_radius_px, options.score)
+    prepared = PreparedMap(plan.site, CPU, NCC.enhance_radius_px, NCC.score)
     noise, centers_px = _noise(plan.shape), plan.centers_px[plan.audited]
 
     def measured(index: int) -> SelfMatchStatistics:
@@ -109,7 +107,7 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px:
     other = None if plan.other is None else _seen_on(plan.other, plan, extent)
     # Nodata is 0 once enhanced: rivals there are weak, as with the masked NCC that a flight uses.
     region = prepared.cut(_window(plan, middle), level)
-    scores = surface(region.search, _templates(gray, noise, plan.options.ncc, other))
+    scores = surface(region.search, _templates(gray, noise, other))
     x, y = x0 - region.window.x0, y0 - region.window.y0
     own, rivals = _own_and_rivals(scores, x, y, plan.exclusion_px)
     leads = own - rivals
@@ -138,11 +136,11 @@ def _window(plan: AuditPlan, middle_px: Array) -> Window:
     return window
 
 
-def _templates(gray: Gray, noise: Pictures, options: NccOptions, other: Gray | None) -> Pictures:
+def _templates(gray: Gray, noise: Pictures, other: Gray | None) -> Pictures:
     """(T, h, w) enhanced: the patch unchanged, shaken, changed (draws), and that of another date."""
 
     def enhanced(picture: Gray) -> Pictures:
-        return enhance(picture, radius_px=options.enhance_radius_px, score=options.score)
+        return enhance(picture, radius_px=NCC.enhance_radius_px, score=NCC.score)
 
     part = _SHAKE_PX / (max(gray.shape) / 2.0)
     shaken = cv2.GaussianBlur(_perturbed(gray, math.degrees(part), 1.0 + part, 0.0), (0, 0), _SHAKE_BLUR_PX)

@@ -92,11 +92,8 @@ def _mirrored(frame: Frame) -> Frame:
 
 
 def _by_features(matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]) -> list[Sighting]:
-    out = []
-    for index, result in enumerate(matcher.locate_many([Frame(frame.image) for frame in frames], priors)):
-        if isinstance(result, Fix) and (found := _sighting(index, result, matcher.site)) is not None:
-            out.append(found)
-    return out
+    pictures = [Frame(frame.image) for frame in frames]
+    return _located(matcher, range(len(frames)), pictures, priors)
 
 
 def _by_correlation(
@@ -105,10 +102,8 @@ def _by_correlation(
     """Use the height and turn at which most of a few pictures match, then refine to whole poses."""
     if not matcher.site.has_surface:  # refinement needs one
         return []
-    usable = [
-        k for k, frame in enumerate(frames) if frame.height_agl_m is not None and frame.heading_deg is not None
-    ]
-    usable = [k for k in usable if priors[k] is not None]  # each would search the whole map
+    known = [frame.height_agl_m is not None and frame.heading_deg is not None for frame in frames]
+    usable = [k for k, is_known in enumerate(known) if is_known and priors[k] is not None]  # else: the whole map
     probed = usable[:: max(1, len(usable) // _PROBED)][:_PROBED]
     best: tuple[int, float, float] = (0, 1.0, 0.0)
     until_s = time.monotonic() + _MOST_S
@@ -123,11 +118,16 @@ def _by_correlation(
     if best[0] < 2:
         return []
     changed = [_changed(frames[k], *best[1:]) for k in usable]
-    out = []
-    for k, result in zip(usable, matcher.locate_many(changed, [priors[k] for k in usable]), strict=True):
-        if isinstance(result, Fix) and (found := _sighting(k, result, matcher.site)) is not None:
-            out.append(found)
-    return out
+    return _located(matcher, usable, changed, [priors[k] for k in usable])
+
+
+def _located(
+    matcher: SceneMatcher, indices: Sequence[int], frames: Sequence[Frame], priors: Sequence[Prior | None]
+) -> list[Sighting]:
+    """The sightings of frames, each with its index."""
+    results = zip(indices, matcher.locate_many(frames, priors), strict=True)
+    found = [_sighting(index, fix, matcher.site) for index, fix in results if isinstance(fix, Fix)]
+    return [one for one in found if one is not None]
 
 
 def _changed(frame: Frame, height_factor: float, turn_deg: float) -> Frame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from typing import Annotated, Any
@@ -19,18 +20,7 @@ from scenematch.cli.argument_names import (
     typed_name,
     urls_as_typed,
 )
-from scenematch.cli.commands import (
-    bridge,
-    check,
-    compare,
-    demo,
-    doctor,
-    evaluate,
-    export,
-    locate,
-    simulate,
-    track,
-)
+from scenematch.cli.commands import bridge, check, compare, demo, doctor, evaluate, export, locate, simulate, track
 from scenematch.cli.commands import map as map_commands
 
 app = typer.Typer(
@@ -44,20 +34,15 @@ map_app = typer.Typer(help="Inspect, audit or fetch a map.")
 bridge_app = typer.Typer(help="Send live fixes to an autopilot or to ROS.")
 
 # In the order of the help.
-app.command(cls=Command)(demo.demo)
-app.command(cls=Command)(check.check)
-app.command(cls=Command)(track.track)
-app.command(cls=Command)(compare.compare)
-app.command(cls=Command)(locate.locate)
-app.command(cls=Command)(simulate.simulate)
-app.command(cls=Command)(evaluate.evaluate)
-app.command(cls=Command)(export.export)
-app.command(cls=Command)(doctor.doctor)
-map_app.command("info", cls=Command)(map_commands.info)
-map_app.command("audit", cls=Command)(map_commands.audit)
-map_app.command("fetch", cls=Command)(map_commands.fetch)
-bridge_app.command("mavlink", cls=Command)(bridge.mavlink)
-bridge_app.command("ros", cls=Command)(bridge.ros)
+_COMMANDS: tuple[tuple[typer.Typer, tuple[Callable[..., None], ...]], ...] = (
+    (app, (demo.demo, check.check, track.track, compare.compare, locate.locate)),
+    (app, (simulate.simulate, evaluate.evaluate, export.export, doctor.doctor)),
+    (map_app, (map_commands.info, map_commands.audit, map_commands.fetch)),
+    (bridge_app, (bridge.mavlink, bridge.ros)),
+)
+for group, functions in _COMMANDS:
+    for function in functions:
+        group.command(cls=Command)(function)
 app.add_typer(map_app, name="map")
 app.add_typer(bridge_app, name="bridge")
 

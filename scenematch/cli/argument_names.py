@@ -22,12 +22,10 @@ _paths: ContextVar[Mapping[str, str]] = ContextVar("paths", default=_NOTHING)
 """Of the command that runs: what was typed for an argument, by the path that it holds."""
 
 
-_MADE_OF: Mapping[str, Sequence[str]] = MappingProxyType(
-    {
-        "--rerun": ("recording", "viewer"),
-        "--correct": ("columns", "angles", "heading_offset_deg", "height_offset_m", "offset_s"),
-    }
-)
+_MADE_OF = {
+    "--rerun": ("recording", "viewer"),
+    "--correct": ("columns", "angles", "heading_offset_deg", "height_offset_m", "offset_s"),
+}
 """Arguments that one option sets together, by that option."""
 
 

@@ -1,8 +1,22 @@
-"""Options that several commands share, the objects they build, and how to print them for the next command."""
+"""Options that several commands share, the objects they build, and how to print them for the next command.
+
+Options:
+    surface: Surface model, a GeoTIFF of heights.
+    correct: Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.
+    start: Where the flight begins (default: the telemetry's first position, or anywhere on the map).
+    method: auto: ncc and sift, each checking the other (default).
+    device: Device to compute on (default: auto).
+    settings: Settings as `doctor --settings` lists them; repeatable.
+    out: Output folder to create.
+    force: Replace existing results.
+    as_json: Results as JSON on standard output.
+    rerun: Record the live view to a file, or show it in a running rerun viewer; repeat for both.
+"""
 
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
@@ -13,109 +27,54 @@ import typer
 
 from scenematch.cli import console
 from scenematch.cli.argument_names import name_settings
+from scenematch.files.settings import field_descriptions
 
 if TYPE_CHECKING:
     from scenematch.runs.cameras import CameraInput
     from scenematch.runs.inputs import FlightFiles
     from scenematch.runs.live_viewing import LiveViewTarget
     from scenematch.runs.map_input import MapInput
-    from scenematch.runs.settings import Settings
+    from scenematch.runs.settings import Settings, TrackSettings
 
 INPUT, MAP, OUTPUT, EXPERT = "Input", "Map", "Output", "Expert"
 """Panels of the help."""
+_SHARED = field_descriptions(sys.modules[__name__], "Options")
 
 
-def option(name: str, metavar: str, text: str, panel: str | None = None, **limits: Any) -> Any:
-    """An option with a value, in a panel of the help; ``limits`` such as ``min`` are typer's."""
-    return typer.Option(name, metavar=metavar, help=text, rich_help_panel=panel, **limits)
+def option(name: str, metavar: str, panel: str | None = None, **limits: Any) -> Any:
+    """An option with a value, in a panel of the help; ``limits`` such as ``min`` are typer's.
+
+    Its help is its description in a docstring, see :func:`with_options`.
+    """
+    return typer.Option(name, metavar=metavar, rich_help_panel=panel, **limits)
 
 
-def flag(name: str, text: str, panel: str | None = None) -> Any:
+def flag(name: str, panel: str | None = None) -> Any:
     """An option without a value."""
-    return typer.Option(name, help=text, rich_help_panel=panel)
+    return typer.Option(name, rich_help_panel=panel)
 
 
-MapOption = Annotated[Path, option("--map", "FILE", "GeoTIFF, or a picture with a world file.", MAP)]
-SurfaceOption = Annotated[Path | None, option("--surface", "FILE", "Surface model, a GeoTIFF of heights.", MAP)]
-FramesOption = Annotated[
-    Path, option("--frames", "DIR|VIDEO|BAG", "Folder of pictures, a video, or a ROS bag.", INPUT)
-]
-CameraOption = Annotated[
-    Path | None, option("--camera", "FILE", "Calibration file (default: from the bag, the topic or EXIF).", INPUT)
-]
-HfovOption = Annotated[
-    float | None, option("--hfov-deg", "DEG", "Horizontal field of view, instead of --camera.", INPUT)
-]
-MountOption = Annotated[
-    str | None,
-    option(
-        "--mount",
-        "NAME",
-        "nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.",
-        INPUT,
-    ),
-]
-TelemetryOption = Annotated[
-    Path | None,
-    option(
-        "--telemetry",
-        "FILE",
-        "telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the video's .SRT, or EXIF).",
-        INPUT,
-    ),
-]
-TruthOption = Annotated[
-    Path | None,
-    option("--truth", "FILE", "truth.csv, a log or photographs (default: truth.csv beside the telemetry).", INPUT),
-]
-CorrectOption = Annotated[
-    list[str] | None,
-    option(
-        "--correct",
-        "NAME=VALUE",
-        "Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.",
-        INPUT,
-    ),
-]
-StartOption = Annotated[
-    str | None,
-    option(
-        "--start",
-        "LAT,LON[,SIGMA_M]",
-        "Where the flight begins (default: the telemetry's first position, or anywhere on the map).",
-        INPUT,
-    ),
-]
-MethodOption = Annotated[
-    str | None,
-    option("--method", "auto|ncc|sift|learned", "auto: ncc and sift, each checking the other (default)."),
-]
-DeviceOption = Annotated[
-    str | None, option("--device", "auto|cpu|cuda", "Device to compute on (default: auto).", EXPERT)
-]
-SettingsOption = Annotated[
-    list[str] | None,
-    option("--settings", "FILE|NAME=VALUE", "Settings as `doctor --settings` lists them; repeatable.", EXPERT),
-]
-OutOption = Annotated[Path, option("--out", "DIR", "Output folder to create.", OUTPUT)]
-ForceOption = Annotated[bool, flag("--force", "Replace existing results.", OUTPUT)]
-JsonOption = Annotated[bool, flag("--json", "Results as JSON on standard output.", OUTPUT)]
-RerunOption = Annotated[
-    list[str] | None,
-    option(
-        "--rerun",
-        "FILE.rrd|HOST:PORT",
-        "Record the live view to a file, or show it in a running rerun viewer; repeat for both.",
-        OUTPUT,
-    ),
-]
+SurfaceOption = Annotated[Path | None, option("--surface", "FILE", MAP)]
+CorrectOption = Annotated[list[str] | None, option("--correct", "NAME=VALUE", INPUT)]
+StartOption = Annotated[str | None, option("--start", "LAT,LON[,SIGMA_M]", INPUT)]
+MethodOption = Annotated[str | None, option("--method", "auto|ncc|sift|learned")]
+DeviceOption = Annotated[str | None, option("--device", "auto|cpu|cuda", EXPERT)]
+SettingsOption = Annotated[list[str] | None, option("--settings", "FILE|NAME=VALUE", EXPERT)]
+OutOption = Annotated[Path, option("--out", "DIR", OUTPUT)]
+ForceOption = Annotated[bool, flag("--force", OUTPUT)]
+JsonOption = Annotated[bool, flag("--json", OUTPUT)]
+RerunOption = Annotated[list[str] | None, option("--rerun", "FILE.rrd|HOST:PORT", OUTPUT)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions:
-    """The map."""
+    """The map.
 
-    map: MapOption
+    Attributes:
+        map: GeoTIFF, or a picture with a world file.
+    """
+
+    map: Annotated[Path, option("--map", "FILE", MAP)]
     surface: SurfaceOption = None
 
     def map_input(self, settings: Settings) -> MapInput:
@@ -128,11 +87,17 @@ class MapOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOptions:
-    """The camera."""
+    """The camera.
 
-    camera: CameraOption = None
-    hfov_deg: HfovOption = None
-    mount: MountOption = None
+    Attributes:
+        camera: Calibration file (default: from the bag, the topic or EXIF).
+        hfov_deg: Horizontal field of view, instead of --camera.
+        mount: nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.
+    """
+
+    camera: Annotated[Path | None, option("--camera", "FILE", INPUT)] = None
+    hfov_deg: Annotated[float | None, option("--hfov-deg", "DEG", INPUT)] = None
+    mount: Annotated[str | None, option("--mount", "NAME", INPUT)] = None
 
     def camera_input(self, settings: Settings) -> CameraInput:
         """The camera combined with its settings."""
@@ -144,11 +109,17 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FlightOptions(CameraOptions, MapOptions):
-    """The files of a flight."""
+    """The files of a flight.
 
-    frames: FramesOption
-    telemetry: TelemetryOption = None
-    truth: TruthOption = None
+    Attributes:
+        frames: Folder of pictures, a video, or a ROS bag.
+        telemetry: telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the video's .SRT, or EXIF).
+        truth: truth.csv, a log or photographs (default: truth.csv beside the telemetry).
+    """
+
+    frames: Annotated[Path, option("--frames", "DIR|VIDEO|BAG", INPUT)]
+    telemetry: Annotated[Path | None, option("--telemetry", "FILE", INPUT)] = None
+    truth: Annotated[Path | None, option("--truth", "FILE", INPUT)] = None
 
     def files(self, settings: Settings, correct: Sequence[str] | None = None) -> FlightFiles:
         """The files combined with their settings."""
@@ -166,9 +137,27 @@ class FlightOptions(CameraOptions, MapOptions):
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class MatchingOptions:
+    """How frames are matched."""
+
+    start: StartOption = None
+    method: MethodOption = None
+    device: DeviceOption = None
+
+    def track_settings(self, settings: Settings) -> TrackSettings:
+        """The options combined with the settings."""
+        return settings.track(method=self.method, device=self.device, start=self.start)
+
+
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace a command's parameters of the types above by their fields, one option each."""
+    """Replace a command's parameters of the types above by their fields, one option each.
+
+    The help of an option is its description in a docstring: under "Options" of the command, whose own help leaves
+    them out, under "Attributes" of the type, or for shared options under "Options" of this module.
+    """
     hints = get_type_hints(command, include_extras=True)
+    about, _, _ = (inspect.getdoc(command) or "").partition("Options:\n")
     groups: dict[str, type[Any]] = {
         name: kind for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)
     }
@@ -176,10 +165,15 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     for name, parameter in inspect.signature(command).parameters.items():
         kind, keyword = groups.get(name), inspect.Parameter.KEYWORD_ONLY
         if kind is None:
+            _describe(hints[name], field_descriptions(command, "Options").get(name) or _SHARED.get(name))
             parameters.append(parameter.replace(kind=keyword, annotation=hints[name]))
             continue
         types = get_type_hints(kind, include_extras=True)
+        described = _SHARED | {
+            n: text for owner in kind.__mro__[::-1] for n, text in field_descriptions(owner).items()
+        }
         for each in fields(kind):
+            _describe(types[each.name], described.get(each.name))
             default = inspect.Parameter.empty if each.default is MISSING else each.default
             parameters.append(inspect.Parameter(each.name, keyword, default=default, annotation=types[each.name]))
 
@@ -191,9 +185,16 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         }
         command(**given, **made)
 
+    call.__doc__ = about.rstrip()
     call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     call.__annotations__ = {each.name: each.annotation for each in parameters}
     return call
+
+
+def _describe(hint: Any, text: str | None) -> None:
+    """Give an option or argument its help, unless it has one."""
+    for info in getattr(hint, "__metadata__", ()):
+        info.help = info.help or text
 
 
 def read_settings(texts: Sequence[str] | None) -> Settings:
@@ -215,13 +216,10 @@ def use_threads(count: int = 1) -> None:
 
 def table(settings: Settings, name: str, **given: Any) -> Any:
     """A table of the settings; an error in one of them names it as ``--settings`` does."""
-    from importlib import import_module
+    from scenematch.runs.settings import TABLES, table_class
 
-    from scenematch.runs.settings import TABLES
-
-    module, kind, hidden = TABLES[name]
-    names = [each.name for each in fields(getattr(import_module(module), kind))]
-    name_settings(name, [each for each in names if each not in hidden])
+    names = [each.name for each in fields(table_class(name))]
+    name_settings(name, [each for each in names if each not in TABLES[name][2]])
     return settings.table(name, **given)
 
 

@@ -100,7 +100,7 @@ def print_audit(result: MapAudit, title: str) -> None:
     """Print what an audit found, and the poor stretches of its route."""
     audit, route = result.audit, result.route
     plan = audit.plan
-    footprint = " x ".join(f"{n * 2.0**plan.level * plan.site.gsd_m_per_px:.0f}" for n in plan.view.footprint_px)
+    footprint = " x ".join(f"{metres:.0f}" for metres in result.summary["footprint_m"])
     pairs = [
         ("frame on the ground", f"{footprint} m from {plan.height_agl_m:g} m"),
         ("places", f"{len(plan)}, every {plan.spacing_px.mean() * plan.site.gsd_m_per_px:.0f} m"),

@@ -216,9 +216,9 @@ def _literal(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False) if isinstance(value, bool | str) else repr(value)
 
 
-def field_descriptions(cls: type[Any]) -> dict[str, str]:
-    """The description of each field in the class's docstring, as one line."""
-    _, _, section = (inspect.getdoc(cls) or "").partition("Attributes:\n")
+def field_descriptions(cls: Any, heading: str = "Attributes") -> dict[str, str]:
+    """The descriptions in a section of a docstring, by name, each as one line."""
+    _, _, section = (inspect.getdoc(cls) or "").partition(f"{heading}:\n")
     out: dict[str, str] = {}
     for line in section.splitlines():
         if line and not line.startswith(" "):

@@ -92,15 +92,8 @@ def _draw_marks(ax: Any, audit: Audit) -> None:
     for flag, (marker, colour, label) in _MARKS.items():
         positions_m = (audit.plan.centers_px[audit.flags == flag] + 0.5) * scale
         if len(positions_m):
-            ax.plot(
-                *positions_m.T,
-                marker,
-                color=colour,
-                markersize=size,
-                markeredgewidth=1.0,
-                linestyle="",
-                label=label,
-            )
+            style: dict[str, Any] = {"markersize": size, "markeredgewidth": 1.0, "linestyle": ""}
+            ax.plot(*positions_m.T, marker, color=colour, label=label, **style)
 
 
 def _draw_route(ax: Any, route: RouteAvailability, scale: float) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from engine.geo import Array, LocalFrame
 from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
+from scenematch.report.metrics import column
 
 MAX_STEP_S = 5.0
 """Longest step that counts; in longer ones the velocity's own error dominates."""
@@ -40,8 +41,8 @@ def motion_consistency(
         return None
     time_s, velocity_mps = _velocity(telemetry)
     fixed = [k for k, row in enumerate(rows) if row.fixed]
-    places = [(rows[k].lat_deg, rows[k].lon_deg) for k in fixed]
-    at_m = frame.enu_from_geodetic(*np.array(places, np.float64).reshape(-1, 2).T)
+    fixes = [rows[k] for k in fixed]
+    at_m = frame.enu_from_geodetic(column(fixes, "lat_deg"), column(fixes, "lon_deg"))
     off_m, intervals_s = [], []
     for n, (begin, end) in enumerate(pairwise(fixed)):
         interval_s = time_s[end] - time_s[begin]
@@ -52,18 +53,13 @@ def motion_consistency(
             intervals_s.append(float(interval_s))
     if not off_m:
         return None
-    median_m, p95_m = np.percentile(off_m, [50, 95])
-    return {
-        "steps": len(off_m),
-        "interval_s": float(np.median(intervals_s)),
-        "median_m": float(median_m),
-        "p95_m": float(p95_m),
-        "max_m": max(off_m),
-    }
+    median_m, p95_m, max_m = np.percentile(off_m, [50, 95, 100]).tolist()
+    facts = {"steps": len(off_m), "interval_s": float(np.median(intervals_s))}
+    return facts | {"median_m": median_m, "p95_m": p95_m, "max_m": max_m}
 
 
 def _velocity(telemetry: Sequence[TelemetryRow]) -> tuple[Array, Array]:
     """(N,) seconds from the first frame, and (N, 2) velocity, NaN if it is unknown."""
     time_s = np.array([row.timestamp_ns - telemetry[0].timestamp_ns for row in telemetry], np.float64) / 1e9
-    pairs = [(row.east_velocity_mps, row.north_velocity_mps) for row in telemetry]
-    return time_s, np.array([(np.nan, np.nan) if None in pair else pair for pair in pairs], np.float64)
+    axes = [column(telemetry, name) for name in ("east_velocity_mps", "north_velocity_mps")]
+    return time_s, np.stack(axes, axis=-1)

@@ -21,6 +21,7 @@ from engine.window import level_crop
 from scenematch.files.flight import Flight, FlightFrame
 from scenematch.files.notes import FrameNote
 from scenematch.files.track import TrackRow
+from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.metrics import TrackErrors
 
 Image = NDArray[np.uint8]
@@ -91,36 +92,30 @@ def choose_frames(rows: Sequence[TrackRow], errors: TrackErrors) -> list[int]:
 
 def _evenly_spaced(indices: NDArray[np.intp], count: int) -> list[int]:
     """At most ``count`` of the indices, evenly spaced, with the first and the last."""
-    if len(indices) <= count:
-        return [int(i) for i in indices]
-    return (
-        [int(i) for i in indices[np.round(np.linspace(0, len(indices) - 1, count)).astype(int)]] if count else []
-    )
+    if len(indices) > count:
+        indices = indices[np.round(np.linspace(0, len(indices) - 1, count)).astype(int)]
+    return [int(i) for i in indices]
 
 
-def explain_frames(
-    flight: Flight,
-    matcher: SceneMatcher,
-    rows: Sequence[TrackRow],
-    notes: Sequence[FrameNote],
-    chosen: Sequence[int],
-    errors: TrackErrors,
-) -> list[SliderFrame]:
-    """Match selected frames again, each in the window of its run, and draw the results.
+def explain_frames(track: FinishedTrack, flight: Flight, matcher: SceneMatcher) -> list[SliderFrame]:
+    """Match some frames of a track again, each in the window of its run, and draw the results.
 
     Args:
+        track: with notes.
         flight: the flight that was tracked.
         matcher: the matcher of the run, or an equal one.
-        rows: the track.
-        notes: notes of the run, one per row.
-        chosen: indices of rows, ascending.
-        errors: of the track, with the positions of fixes and truth.
 
     Raises:
         TelemetryError: a frame can no longer be read.
     """
-    drawer = _Drawer(matcher, errors)
-    return [SliderFrame(i, drawer.images(i, flight.read(i), rows[i], notes[i])) for i in chosen]
+    notes, errors = track.notes or (), track.errors
+    out = []
+    for index in choose_frames(track.rows, errors):
+        item, row = flight.read(index), track.rows[index]
+        explained = match_again(matcher, item.frame, row, notes[index])
+        places_m = (errors.truth_en_m[index], errors.fix_en_m[index])
+        out.append(SliderFrame(index, _images(item, explained, row.fixed, matcher.site, places_m)))
+    return out
 
 
 def jpeg_bytes(image: Image, quality: int) -> bytes:
@@ -166,7 +161,7 @@ def match_again(
     Returns:
         The window and the explanation, or None if the window is unknown or the frame cannot be matched.
     """
-    window = _window(row, note)
+    window = run_window(row, note)
     if window is None:
         return None
     matched = _as_matched(frame, row, note, matcher.site)
@@ -177,56 +172,51 @@ def match_again(
         return None
 
 
-@dataclass(frozen=True, slots=True)
-class _Drawer:
-    matcher: SceneMatcher
-    errors: TrackErrors
-
-    def images(self, index: int, item: FlightFrame, row: TrackRow, note: FrameNote) -> list[SliderImage]:
-        """The frame, its rectified form, the window, and the score surface or the matches, if they exist."""
-        image = item.frame.image
-        assert isinstance(image, np.ndarray)  # read from a file
-        frame = _slider_image(image, "the frame as it was taken", f"Frame {item.name} as the camera took it.")
-        explained = match_again(self.matcher, item.frame, row, note)
-        if explained is None:
-            return [frame]
-        window, found = explained
-        out = [frame]
-        if found.rectified is not None:
-            text, alt = (
-                "rectified onto the map, contrast stretched",
-                "The frame in the map's pixels and axes.",
-            )
-            out.append(_slider_image(stretch_contrast(found.rectified), text, alt))
-        out.append(self._map(index, window, found, row))
-        if found.surface is not None:
-            out.append(_surface_image(found.surface))
-        if found.matches is not None:
-            out.append(_matches_image(found, found.matches, self.matcher.site, window))
+def _images(
+    item: FlightFrame,
+    explained: tuple[Window, Explanation] | None,
+    fixed: bool,
+    site: OrthoMap,
+    places_m: tuple[Array, Array],
+) -> list[SliderImage]:
+    """The frame, its rectified form, the window, and the score surface or the matches, if they exist."""
+    image = item.frame.image
+    assert isinstance(image, np.ndarray)  # read from a file
+    out = [_slider_image(image, "the frame as it was taken", f"Frame {item.name} as the camera took it.")]
+    if explained is None:
         return out
-
-    def _map(self, index: int, window: Window, found: Explanation, row: TrackRow) -> SliderImage:
-        """The window with the matched outline, the fix and the truth."""
-        crop, per_px = draw_window(self.matcher.site, window)
-        marks = [] if found.surface is None else [_searched_area(found.surface, window, per_px)]
-        if found.outline_px is not None:
-            corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in window_pixels(found.outline_px, window, per_px))
-            marks.append(f'<polygon class="{"found" if row.fixed else "doubted"}" points="{corners}"/>')
-        caption = f"the window, {window.width_px} by {window.height_px} map pixels"
-        for name, position_m in (
-            ("ring: truth", self.errors.truth_en_m[index]),
-            ("cross: fix", self.errors.fix_en_m[index]),
-        ):
-            if np.isfinite(position_m).all():
-                marks.append(
-                    _mark(window_pixels(self.matcher.site.pixel_from_enu(position_m), window, per_px), name)
-                )
-                caption += f"; {name}"
-        alt = "The window of the map that was searched, with the matched outline."
-        return replace(_slider_image(crop, caption, alt), overlay="".join(marks))
+    window, found = explained
+    if found.rectified is not None:
+        caption, alt = "rectified onto the map, contrast stretched", "The frame in the map's pixels and axes."
+        out.append(_slider_image(stretch_contrast(found.rectified), caption, alt))
+    out.append(_window_image(window, found, fixed, site, places_m))
+    if found.surface is not None:
+        out.append(_surface_image(found.surface))
+    if found.matches is not None:
+        out.append(_matches_image(found, found.matches, site, window))
+    return out
 
 
-def _window(row: TrackRow, note: FrameNote) -> Window | None:
+def _window_image(
+    window: Window, found: Explanation, fixed: bool, site: OrthoMap, places_m: tuple[Array, Array]
+) -> SliderImage:
+    """The window with the matched outline, the truth and the fix."""
+    crop, per_px = draw_window(site, window)
+    marks = [] if found.surface is None else [_searched_area(found.surface, window, per_px)]
+    if found.outline_px is not None:
+        corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in window_pixels(found.outline_px, window, per_px))
+        marks.append(f'<polygon class="{"found" if fixed else "doubted"}" points="{corners}"/>')
+    caption = f"the window, {window.width_px} by {window.height_px} map pixels"
+    for name, position_m in zip(("ring: truth", "cross: fix"), places_m, strict=True):
+        if np.isfinite(position_m).all():
+            marks.append(_mark(window_pixels(site.pixel_from_enu(position_m), window, per_px), name))
+            caption += f"; {name}"
+    alt = "The window of the map that was searched, with the matched outline."
+    return replace(_slider_image(crop, caption, alt), overlay="".join(marks))
+
+
+def run_window(row: TrackRow, note: FrameNote) -> Window | None:
+    """The window that the run searched for a frame; None if unknown."""
     corner, size = (note.window_x0_px, note.window_y0_px), (row.window_width_px, row.window_height_px)
     if corner[0] is None or corner[1] is None or size[0] is None or size[1] is None:
         return None

@@ -8,14 +8,11 @@ import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
 from engine.geo import Array
 from engine.orthomap import OrthoMap
 from engine.values import Window
-from scenematch.report.explain import SIDE_PX, jpeg_bytes, level_within
-
-Image = NDArray[np.uint8]
+from scenematch.report.explain import SIDE_PX, Image, jpeg_bytes, level_within
 
 SIGMAS = 3.0
 """Size of the ellipsoid about a fix, in standard deviations."""

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from engine.errors import BackendError
 from engine.geo import Array
@@ -30,6 +29,7 @@ from scenematch.files.resampling import UTC_FROM_NS
 from scenematch.files.track import track_row
 from scenematch.report.explain import (
     SIDE_PX,
+    Image,
     draw_matches,
     draw_surface,
     draw_window,
@@ -49,8 +49,6 @@ from scenematch.report.live_shapes import (
     outline,
     padded,
 )
-
-Image = NDArray[np.uint8]
 
 PICTURES = ("rectified", "window", "window/found", "window/fix", "surface", "surface/peak", "matches")
 """Image entities that a frame may lack; they are then cleared."""

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from scenematch.files.track import TrackRow
 from scenematch.report.charts import ChartArea, line
-from scenematch.report.loop_record import LoopRecord
+from scenematch.report.finished_track import FinishedTrack
+from scenematch.report.loop_record import LoopRecord, rms
 from scenematch.report.page_charts import Chart
 from scenematch.report.page_map import TrackMap, connected
-from scenematch.report.plot_data import TrackPlotData
 from scenematch.report.verdict import metres
 
 LOOP_LEGEND = [
@@ -24,9 +21,7 @@ LOOP_LEGEND = [
 def loop_sentence(loop: LoopRecord) -> str:
     """The verdict on the loop in one sentence."""
     off = loop.off_plan_m
-    rms_m, estimate_m = (
-        float(np.sqrt(np.mean(values**2))) for values in (off, loop.estimate_error_m[loop.settled])
-    )
+    rms_m, estimate_m = rms(off), rms(loop.estimate_error_m[loop.settled])
     return (
         f"Closed loop: steered by the fixes, the vehicle was {metres(rms_m)} RMS and at most "
         f"{metres(float(off.max()))} from its plan, with an estimate that was {metres(estimate_m)} RMS off."
@@ -39,19 +34,12 @@ def loop_marks(track_map: TrackMap, loop: LoopRecord) -> list[str]:
     return [line(estimate, "estimate"), line(plan, "plan")]
 
 
-def draw_loop_charts(loop: LoopRecord, rows: Sequence[TrackRow], plot_data: TrackPlotData) -> list[Chart]:
-    """Distance from the plan, and the estimate's error with its sigma, on the time axis of the track's charts.
-
-    Args:
-        loop: the samples.
-        rows: the track, with its stamps.
-        plot_data: plot data of the track.
-    """
-    start_ns = rows[0].timestamp_ns
+def draw_loop_charts(loop: LoopRecord, track: FinishedTrack) -> list[Chart]:
+    """Distance from the plan, and the estimate's error with its sigma, on the time axis of the track's charts."""
+    start_ns = track.rows[0].timestamp_ns
     if start_ns is None:
         return []
-    time = (loop.timestamp_ns - start_ns) / 1e9
-    limits = (float(plot_data.time[0]), float(plot_data.time[-1]))
+    time, limits = (loop.timestamp_ns - start_ns) / 1e9, track.time_limits
     settled = loop.settled  # the initial uncertainty would set the scale
     plan = ChartArea(limits, (0.0, 1.1 * max(0.1, float(loop.off_plan_m.max()))))
     top = 1.1 * max(0.1, float(loop.estimate_error_m[settled].max()), float(3.0 * loop.sigma_m[settled].max()))
@@ -66,7 +54,7 @@ def draw_loop_charts(loop: LoopRecord, rows: Sequence[TrackRow], plot_data: Trac
     ]
     off = "Distance of the vehicle from its plan (m)"
     error = "Error of the estimate (m), on three of its sigmas; red: no recent fix"
-    label = plot_data.time_label
+    label = track.time_label
     return [
         (off, plan.svg(off, label, [plan.line(time[inside], loop.off_plan_m[inside], "plan")], timed=True)),
         (error, estimate.svg(error, label, estimate_marks, timed=True)),

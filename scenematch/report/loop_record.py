@@ -119,11 +119,11 @@ def summarise_loop(result: LoopResult) -> dict[str, Any]:
     return {
         "seconds": round(result.record[-1].time_s, 2),
         "handed_over": result.record[-1].mode is Mode.HANDED_OVER,
-        "plan_rms_m": _rms(off),
+        "plan_rms_m": rms(off),
         "plan_max_m": float(off.max()),
-        "path_rms_m": _rms(_off_path(result)),
-        "height_rms_m": _rms(plan[:, 2]),
-        "estimate_rms_m": _rms(wrong),
+        "path_rms_m": rms(_off_path(result)),
+        "height_rms_m": rms(plan[:, 2]),
+        "estimate_rms_m": rms(wrong),
         "estimate_max_m": float(wrong.max()),
         "estimate_nees": float(nees.mean()),
         "frames": len(result.answers),
@@ -135,7 +135,8 @@ def summarise_loop(result: LoopResult) -> dict[str, Any]:
     }
 
 
-def _rms(values: Array) -> float:
+def rms(values: Array) -> float:
+    """Root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 

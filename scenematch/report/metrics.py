@@ -62,6 +62,12 @@ class TrackErrors:
         return np.asarray(np.hypot(self.error_en_m[:, 0], self.error_en_m[:, 1]), dtype=np.float64)
 
     @property
+    def sigma_m(self) -> Array:
+        """(N,) stated standard deviation along the longer axis of the covariance."""
+        a, b, c = self.covariance_en_m2[:, 0, 0], self.covariance_en_m2[:, 0, 1], self.covariance_en_m2[:, 1, 1]
+        return np.asarray(np.sqrt((a + c) / 2.0 + np.hypot((a - c) / 2.0, b)), dtype=np.float64)
+
+    @property
     def normalised_squared_errors(self) -> Array:
         """(N,) normalised squared error e^T C^-1 e; its mean (NEES) is 2 if the covariance is consistent."""
         c = self.covariance_en_m2 + _FLOOR_M2 * np.eye(2)
@@ -74,6 +80,12 @@ class TrackErrors:
     def beyond(self) -> NDArray[np.bool_]:
         """(N,) whether the error exceeds three stated sigmas; False if either is unknown."""
         return np.asarray(self.normalised_squared_errors > FALSE_SIGMAS**2, dtype=np.bool_)
+
+
+def column(records: Sequence[object], name: str) -> Array:
+    """(N,) one attribute of each record; NaN if it or the record is None."""
+    values = (getattr(record, name, None) for record in records)
+    return np.array([np.nan if value is None else value for value in values], np.float64)
 
 
 def truth_per_row(rows: Sequence[TrackRow], truth: Sequence[Truth]) -> list[Truth | None]:
@@ -92,20 +104,13 @@ def errors_en_m(rows: Sequence[TrackRow], truth: Sequence[Truth] | None, frame: 
     Returns:
         Positions, errors and covariances in metres, N rows each.
     """
-    true_lat_lon = [(t.lat_deg, t.lon_deg) if t else (np.nan, np.nan) for t in truth_per_row(rows, truth or [])]
-    fix_lat_lon = [
-        (row.lat_deg, row.lon_deg) if row.lat_deg is not None and row.lon_deg is not None else (np.nan, np.nan)
-        for row in rows
-    ]
-    covariance = np.full((len(rows), 2, 2), np.nan)
-    for i, row in enumerate(rows):
-        if row.sigma_east_m is not None and row.sigma_north_m is not None:
-            cross = row.covariance_en_m2 or 0.0
-            covariance[i] = [[row.sigma_east_m**2, cross], [cross, row.sigma_north_m**2]]
     truth_en, fix_en = (
-        frame.enu_from_geodetic(*np.array(lat_lon, dtype=np.float64).reshape(-1, 2).T)
-        for lat_lon in (true_lat_lon, fix_lat_lon)
+        frame.enu_from_geodetic(column(places, "lat_deg"), column(places, "lon_deg"))
+        for places in (truth_per_row(rows, truth or []), rows)
     )
+    east, north = column(rows, "sigma_east_m"), column(rows, "sigma_north_m")
+    cross = np.nan_to_num(column(rows, "covariance_en_m2")) + 0.0 * east  # unknown with the sigmas
+    covariance = np.stack([east**2, cross, cross, north**2], axis=-1).reshape(-1, 2, 2)
     return TrackErrors(truth_en, fix_en, fix_en - truth_en, covariance)
 
 
@@ -123,15 +128,12 @@ def height_pairs_m(rows: Sequence[TrackRow], truth: Sequence[Truth] | None, grou
     Returns:
         (N, 2) measured and true heights in metres; NaN where unknown.
     """
-    pairs = np.full((len(rows), 2), np.nan)
-    for i, (row, t) in enumerate(zip(rows, truth_per_row(rows, truth or []), strict=True)):
-        if row.up_m is not None:
-            pairs[i, 0] = row.up_m - ground.ground_m
-        if t is not None and t.alt_amsl_m is not None and ground.ground_amsl_m is not None:
-            pairs[i, 1] = t.alt_amsl_m - ground.ground_amsl_m
-        elif t is not None and t.height_agl_m is not None:
-            pairs[i, 1] = t.height_agl_m
-    return pairs
+    true = truth_per_row(rows, truth or [])
+    true_m = column(true, "height_agl_m")
+    if ground.ground_amsl_m is not None:
+        amsl_m = column(true, "alt_amsl_m") - ground.ground_amsl_m
+        true_m = np.where(np.isfinite(amsl_m), amsl_m, true_m)
+    return np.column_stack([column(rows, "up_m") - ground.ground_m, true_m])
 
 
 def summarise(
@@ -168,7 +170,7 @@ def summarise(
         "reasons": _counts(row.reason for row in rows if row.reason is not None),
         "method": "mixed" if len(methods) > 1 else next(iter(methods), None),
         "methods": _counts(methods.elements()),
-        "latency_ms": _latency([row.latency_ms for row in rows if row.latency_ms is not None]),
+        "latency_ms": _latency(rows),
         "deadlines_missed": sum(row.deadline_met is False for row in rows),
         **_stated(rows),
     }
@@ -196,20 +198,17 @@ def _counts(values: Any) -> dict[str, int]:
 
 
 def _stated(rows: Sequence[TrackRow]) -> dict[str, float | None]:
-    sigmas_m = [
-        max(row.sigma_east_m, row.sigma_north_m)
-        for row in rows
-        if row.sigma_east_m is not None and row.sigma_north_m is not None
-    ]
-    median_m, p95_m = map(float, np.percentile(sigmas_m, [50, 95])) if sigmas_m else (None, None)
+    sigmas_m = np.maximum(column(rows, "sigma_east_m"), column(rows, "sigma_north_m"))
+    sigmas_m = sigmas_m[np.isfinite(sigmas_m)]
+    median_m, p95_m = map(float, np.percentile(sigmas_m, [50, 95])) if sigmas_m.size else (None, None)
     return {"stated_sigma_median_m": median_m, "stated_sigma_p95_m": p95_m}
 
 
-def _latency(values: list[float]) -> dict[str, float | None]:
-    if not values:
-        return dict.fromkeys(("p50", "p95", "p99", "max"))
-    p50, p95, p99 = np.percentile(values, [50, 95, 99])
-    return {"p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(max(values))}
+def _latency(rows: Sequence[TrackRow]) -> dict[str, float | None]:
+    values = column(rows, "latency_ms")
+    known = values[np.isfinite(values)]
+    figures = np.percentile(known, [50, 95, 99, 100]).tolist() if known.size else [None] * 4
+    return dict(zip(("p50", "p95", "p99", "max"), figures, strict=True))
 
 
 def _accuracy(errors: TrackErrors) -> dict[str, Any]:

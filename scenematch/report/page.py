@@ -17,7 +17,6 @@ from scenematch.report.page_frames import draw_slider, frame_data
 from scenematch.report.page_map import TrackMap, draw_map, map_of_tracks, track_marks
 from scenematch.report.page_parts import CROSS, charts_with_axis, fill_page, map_with_legend, section
 from scenematch.report.page_tables import draw_inputs, draw_refusals, draw_segments, draw_tiles
-from scenematch.report.plot_data import TrackPlotData
 from scenematch.report.verdict import verdict_of
 
 Legend = list[tuple[str, str]]
@@ -32,22 +31,21 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
         shown: frames of the slider with their images.
         why_not: why there are none.
     """
-    plot_data, settings = track.plot_data(), track.summary["settings"]
-    track_map = map_of_tracks(track.site, [plot_data], _view_px(track))
+    track_map = map_of_tracks([track], _view_px(track))
     verdict = verdict_of(track.summary)
     sentences = [verdict.accuracy, *([loop_sentence(track.loop)] if track.loop else []), verdict.latency]
     segments = draw_segments(track.summary)
     body = [
-        section("Where", _where(track, plot_data, track_map, bool(shown)), "map-section"),
-        section("When", _when(track, plot_data)),
+        section("Where", _where(track, track_map, bool(shown)), "map-section"),
+        section("When", _when(track)),
         *([section("Errors by segment", segments)] if segments else []),
         section("Refusals", draw_refusals(track, shown)),
-        section("Frame by frame", draw_slider(track, plot_data, shown, why_not), "frames"),
-        section("Inputs and versions", f'<div class="inputs">\n{draw_inputs(settings)}\n</div>'),
+        section("Frame by frame", draw_slider(track, shown, why_not), "frames"),
+        section("Inputs and versions", f'<div class="inputs">\n{draw_inputs(track.settings)}\n</div>'),
     ]
     subheading = f"{track.method}, {len(track.rows)} frames"
-    if plot_data.time_label.startswith("time") and len(plot_data.time) > 1:
-        subheading += f" over {plot_data.time[-1]:.0f} s"
+    if track.is_timed and len(track.rows) > 1:
+        subheading += f" over {track.time[-1]:.0f} s"
     fill_page(
         path,
         heading=track.name,
@@ -55,7 +53,7 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
         grade=verdict.grade,
         verdict="\n".join(f"<p>{escape(sentence)}</p>" for sentence in sentences),
         body=body,
-        data={"box": track_map.box, "frames": [frame_data(item, track, plot_data, track_map) for item in shown]},
+        data={"box": track_map.box, "frames": [frame_data(item, track, track_map) for item in shown]},
     )
 
 
@@ -69,35 +67,33 @@ def _view_px(track: FinishedTrack) -> float:
     return float(np.median(sides)) if sides else 0.0
 
 
-def _where(track: FinishedTrack, plot_data: TrackPlotData, track_map: TrackMap, slider: bool) -> str:
+def _where(track: FinishedTrack, track_map: TrackMap, slider: bool) -> str:
     """The map with its legend, and the key figures."""
-    marks = track_marks(track_map, plot_data)
+    marks = track_marks(track_map, track)
     if track.loop is not None:
         marks[4:4] = loop_marks(track_map, track.loop)  # above the fixes, below the true path
-    fixes, beyond = int((~plot_data.refused).sum()), int(plot_data.errors.beyond.sum())
-    label = (
-        f"Map with {fixes} fixes, {beyond} of them beyond three sigmas; {int(plot_data.refused.sum())} refused."
-    )
-    drawn = map_with_legend(draw_map(track_map, label, marks), track_map, _map_legend(track, plot_data, slider))
+    fixes, beyond = int(track.fixed.sum()), int(track.errors.beyond.sum())
+    refused = len(track.rows) - fixes
+    label = f"Map with {fixes} fixes, {beyond} of them beyond three sigmas; {refused} refused."
+    drawn = map_with_legend(draw_map(track_map, label, marks), track_map, _map_legend(track, slider))
     tiles = "\n".join(
         f"<li><strong>{escape(v)}</strong><span>{escape(k)}</span></li>" for k, v in draw_tiles(track)
     )
     return f'<div class="where">\n<div>\n{drawn}\n</div>\n<ul class="tiles">\n{tiles}\n</ul>\n</div>'
 
 
-def _map_legend(track: FinishedTrack, plot_data: TrackPlotData, slider: bool) -> Legend:
-    has_truth = bool(np.isfinite(plot_data.errors.truth_en_m).any())
-    has_sigma = bool(np.isfinite(plot_data.errors.covariance_en_m2).any())
+def _map_legend(track: FinishedTrack, slider: bool) -> Legend:
+    has_truth = np.isfinite(track.errors.truth_en_m).any()
     line, kind = ("truth", "truth") if has_truth else ("path of the fixes", "fix")
     legend = [(line, f'<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="{kind}"/>')]
     if track.loop is not None:
         legend += LOOP_LEGEND
     legend.append(("fix", '<path class="dots fix" d="M11 7h0"/>'))
-    if has_sigma:
+    if np.isfinite(track.errors.covariance_en_m2).any():
         legend.append(("three stated sigmas, of some fixes", '<circle cx="11" cy="7" r="6" class="fix"/>'))
-    if plot_data.refused.any():
+    if not track.fixed.all():
         legend.append(("refused", f'<path d="{CROSS}" class="refused"/>'))
-    if plot_data.errors.beyond.any():
+    if track.errors.beyond.any():
         legend.append(("fix beyond three of its sigmas", f'<path d="{CROSS}" class="beyond"/>'))
     if slider:
         legend.append(
@@ -106,18 +102,18 @@ def _map_legend(track: FinishedTrack, plot_data: TrackPlotData, slider: bool) ->
     return legend
 
 
-def _when(track: FinishedTrack, plot_data: TrackPlotData) -> str:
+def _when(track: FinishedTrack) -> str:
     """The charts over time with their legend."""
-    charts = draw_charts(track.rows, track.notes, plot_data, track.summary["settings"].get("budget_ms"))
+    charts = draw_charts(track)
     if track.loop is not None and charts:
-        charts[1:1] = draw_loop_charts(track.loop, track.rows, plot_data)
-    charts += draw_motion(track.rows, track.notes, track.telemetry, track.truth, plot_data)
+        charts[1:1] = draw_loop_charts(track.loop, track)
+    charts += draw_motion(track)
     if not charts:
         return "<p>There are no frames.</p>"
     legend = [("fix", '<path class="dots fix" d="M11 7h0"/>')]
-    if plot_data.errors.beyond.any():
+    if track.errors.beyond.any():
         legend.append(("fix beyond three of its sigmas", '<path class="dots beyond" d="M11 7h0"/>'))
-    if np.isfinite(plot_data.errors.truth_en_m).any():
+    if np.isfinite(track.errors.truth_en_m).any():
         legend.append(("truth", '<path d="M0 7h22" class="line truth"/>'))
     if track.telemetry:
         legend.append(("telemetry", '<path d="M0 7h22" class="line telemetry"/>'))

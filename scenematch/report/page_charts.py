@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from engine.geo import Array
-from scenematch.files.notes import FrameNote
-from scenematch.files.track import TrackRow
-from scenematch.report.charts import ChartArea, Limits, dots
-from scenematch.report.metrics import FALSE_SIGMAS
-from scenematch.report.plot_data import TrackPlotData, larger_variance_m2
+from scenematch.report.charts import ChartArea, dots
+from scenematch.report.finished_track import FinishedTrack
+from scenematch.report.metrics import FALSE_SIGMAS, column
 
 Chart = tuple[str, str]
 """Caption and SVG."""
@@ -20,144 +16,119 @@ _BINS = 48
 _HEADROOM = 1.08  # upper limit relative to the highest value
 
 
-def draw_charts(
-    rows: Sequence[TrackRow], notes: Sequence[FrameNote] | None, plot_data: TrackPlotData, budget_ms: float | None
-) -> list[Chart]:
-    """The charts with their captions; those without data are omitted.
-
-    Args:
-        rows: the track.
-        notes: one per row, or None.
-        plot_data: plot data of the track.
-        budget_ms: latency budget of each frame, or None.
-
-    Returns:
-        Caption and SVG of each chart.
-    """
-    if not rows:
+def draw_charts(track: FinishedTrack) -> list[Chart]:
+    """The charts with their captions; those without data are omitted."""
+    if not track.rows:
         return []
-    time = (float(plot_data.time[0]), float(plot_data.time[-1]))
-    latency_ms = column(rows, "latency_ms")
-    charts = [_error(plot_data, time), *_in_sigmas(plot_data, time), _answers(rows, notes, plot_data, time)]
-    if np.isfinite(plot_data.heights).any():
-        charts.append(_height(plot_data, time))
-    if np.isfinite(column(rows, "score")).any():
-        charts.append(_score(rows, plot_data, time))
+    latency_ms, budget_ms = column(track.rows, "latency_ms"), track.settings.get("budget_ms")
+    charts = [_error(track), *_in_sigmas(track), _answers(track)]
+    if np.isfinite(track.heights).any():
+        charts.append(_height(track))
+    if np.isfinite(column(track.rows, "score")).any():
+        charts.append(_score(track))
     if np.isfinite(latency_ms).any():
-        charts += [_latency(latency_ms, plot_data, time, budget_ms), _histogram(latency_ms, budget_ms)]
+        charts += [_latency(track, latency_ms, budget_ms), _histogram(latency_ms, budget_ms)]
     return charts
 
 
-def column(records: Sequence[object], name: str) -> Array:
-    """(N,) one attribute of each record; NaN if it or the record is None."""
-    values = (getattr(record, name, None) for record in records)
-    return np.array([np.nan if value is None else value for value in values], np.float64)
-
-
-def _error(plot_data: TrackPlotData, time: Limits) -> Chart:
+def _error(track: FinishedTrack) -> Chart:
     """The error with one and three stated sigmas as lines; without truth the stated sigma."""
-    errors, known = plot_data.errors, np.isfinite(plot_data.errors.distance_m)
-    sigma = np.sqrt(larger_variance_m2(errors.covariance_en_m2))
+    errors, known = track.errors, np.isfinite(track.errors.distance_m)
+    sigma = errors.sigma_m
     stated = sigma[np.isfinite(sigma)]
     if not known.any():
         top = 1.2 * float(np.percentile(stated, 98)) if stated.size else 1.0
-        area = ChartArea(time, (0.0, max(top, 0.5)))
+        area = ChartArea(track.time_limits, (0.0, max(top, 0.5)))
         what = "Stated sigma (m)"
-        marks = [area.dots(plot_data.time, sigma, "fix"), area.overflow(plot_data.time, sigma, "over")]
-        return what, area.svg(f"{what} over time", plot_data.time_label, marks, timed=True)
+        marks = [area.dots(track.time, sigma, "fix"), area.overflow(track.time, sigma, "over")]
+        return what, area.svg(f"{what} over time", track.time_label, marks, timed=True)
     typical = float(np.percentile(errors.distance_m[known], 97))
     # Three sigmas are visible unless they would flatten the errors.
     shown = 1.1 * FALSE_SIGMAS * float(np.percentile(stated, 90)) if stated.size else 0.0
-    area = ChartArea(time, (0.0, max(1.3 * typical, min(shown, 5.0 * typical), 0.1)))
+    area = ChartArea(track.time_limits, (0.0, max(1.3 * typical, min(shown, 5.0 * typical), 0.1)))
     beyond = np.where(errors.beyond, errors.distance_m, np.nan)
     lines = [
-        area.line(plot_data.time, np.where(factor * sigma <= area.y_limits[1], factor * sigma, np.nan), kind)
+        area.line(track.time, np.where(factor * sigma <= area.y_limits[1], factor * sigma, np.nan), kind)
         for factor, kind in ((FALSE_SIGMAS, "sigmas"), (1.0, "sigma"))
     ]
     marks = [
         *lines,
-        area.dots(plot_data.time, errors.distance_m, "fix"),
-        area.dots(plot_data.time, beyond, "beyond"),
-        area.overflow(plot_data.time, errors.distance_m, "over"),
+        area.dots(track.time, errors.distance_m, "fix"),
+        area.dots(track.time, beyond, "beyond"),
+        area.overflow(track.time, errors.distance_m, "over"),
     ]
     what = "Horizontal error (m)"
     if all(lines):
         what += ", with one and three stated sigmas (lines)"
     elif stated.size:
         what += ", with its stated sigma (line)" if any(lines) else f"; stated sigma {np.median(stated):.1f} m"
-    return what, area.svg(f"{what} over time", plot_data.time_label, marks, timed=True)
+    return what, area.svg(f"{what} over time", track.time_label, marks, timed=True)
 
 
-def _in_sigmas(plot_data: TrackPlotData, time: Limits) -> list[Chart]:
+def _in_sigmas(track: FinishedTrack) -> list[Chart]:
     """The error in units of the sigma that the fix states in its direction."""
-    sigmas = np.sqrt(plot_data.errors.normalised_squared_errors)
+    sigmas = np.sqrt(track.errors.normalised_squared_errors)
     known = sigmas[np.isfinite(sigmas)]
     if not known.size:
         return []
-    area = ChartArea(time, (0.0, max(1.25 * FALSE_SIGMAS, 1.2 * float(np.percentile(known, 97)))))
-    beyond = plot_data.errors.beyond
+    area = ChartArea(track.time_limits, (0.0, max(1.25 * FALSE_SIGMAS, 1.2 * float(np.percentile(known, 97)))))
+    beyond = track.errors.beyond
     marks = [
-        area.dots(plot_data.time[~beyond], sigmas[~beyond], "fix"),
-        area.dots(plot_data.time[beyond], sigmas[beyond], "beyond"),
-        area.overflow(plot_data.time, sigmas, "over"),
+        area.dots(track.time[~beyond], sigmas[~beyond], "fix"),
+        area.dots(track.time[beyond], sigmas[beyond], "beyond"),
+        area.overflow(track.time, sigmas, "over"),
     ]
     fixed = [area.horizontal(FALSE_SIGMAS, "limit", f"{FALSE_SIGMAS:g} sigma")]
     what = "Horizontal error, in stated sigmas"
-    return [(what, area.svg(f"{what} over time", plot_data.time_label, marks, timed=True, fixed=fixed))]
+    return [(what, area.svg(f"{what} over time", track.time_label, marks, timed=True, fixed=fixed))]
 
 
-def _answers(
-    rows: Sequence[TrackRow], notes: Sequence[FrameNote] | None, plot_data: TrackPlotData, time: Limits
-) -> Chart:
+def _answers(track: FinishedTrack) -> Chart:
     """Fix or reason of refusal of each frame, over the state of the navigator."""
-    kinds = ["fix", *sorted({row.reason or "unknown" for row in rows if not row.fixed})]
-    level = np.array([kinds.index("fix" if row.fixed else row.reason or "unknown") for row in rows], np.float64)
-    area = ChartArea(time, (len(kinds) - 0.5, -0.5), left=150.0)
-    fixed = np.array([row.fixed for row in rows])
-    beyond = plot_data.errors.beyond
-    marks = [area.strip(plot_data.time, [note.state for note in notes])] if notes else []
+    answers = ["fix" if row.fixed else row.reason or "unknown" for row in track.rows]
+    kinds = ["fix", *sorted({*answers} - {"fix"})]
+    level = np.array([kinds.index(answer) for answer in answers], np.float64)
+    area = ChartArea(track.time_limits, (len(kinds) - 0.5, -0.5), left=150.0)
+    fixed, beyond = track.fixed, track.errors.beyond
+    marks = [area.strip(track.time, [note.state for note in track.notes])] if track.notes else []
     for kind, chosen in (("refused", ~fixed), ("fix", fixed & ~beyond), ("beyond", beyond)):
-        marks.append(dots(area.points(plot_data.time[chosen], level[chosen]), kind))
+        marks.append(dots(area.points(track.time[chosen], level[chosen]), kind))
     names = [kind.replace("_", " ") for kind in kinds]
-    chart = area.svg("Answers over time", plot_data.time_label, marks, rows=names, timed=True)
-    return "Answers, over the state of the navigator" if notes else "Answers", chart
+    chart = area.svg("Answers over time", track.time_label, marks, rows=names, timed=True)
+    return "Answers, over the state of the navigator" if track.notes else "Answers", chart
 
 
-def _height(plot_data: TrackPlotData, time: Limits) -> Chart:
-    measured, true = plot_data.heights.T
-    known = plot_data.heights[np.isfinite(plot_data.heights)]
+def _height(track: FinishedTrack) -> Chart:
+    measured, true = track.heights.T
+    known = track.heights[np.isfinite(track.heights)]
     low, high = np.percentile(known, [1, 99])
     margin = max(0.15 * (high - low), 1.0)
-    area = ChartArea(time, (float(low - margin), float(high + margin)))
-    marks = [area.line(plot_data.time, true, "truth"), area.dots(plot_data.time, measured, "fix")]
+    area = ChartArea(track.time_limits, (float(low - margin), float(high + margin)))
+    marks = [area.line(track.time, true, "truth"), area.dots(track.time, measured, "fix")]
     what = "True height above ground (m); this method measures none"
     if np.isfinite(measured).any():
         what = "Height above ground (m)" + (", measured and true (line)" if np.isfinite(true).any() else "")
-    return what, area.svg(what, plot_data.time_label, marks, timed=True)
+    return what, area.svg(what, track.time_label, marks, timed=True)
 
 
-def _score(rows: Sequence[TrackRow], plot_data: TrackPlotData, time: Limits) -> Chart:
-    score, methods = column(rows, "score"), [row.method for row in rows]
-    area = ChartArea(time, (min(0.0, float(np.nanmin(score))), 1.0))
-    fixed = np.array([row.fixed for row in rows])
-    sift = np.array([method in ("sift", "learned") for method in methods])
+def _score(track: FinishedTrack) -> Chart:
+    score, fixed = column(track.rows, "score"), track.fixed
+    area = ChartArea(track.time_limits, (min(0.0, float(np.nanmin(score))), 1.0))
+    sift = np.array([row.method in ("sift", "learned") for row in track.rows])
     both = sift.any() and not sift.all()
     kinds = (("refused", ~fixed), ("fix", fixed & ~sift), ("sift" if both else "fix", fixed & sift))
-    marks = [area.dots(plot_data.time[chosen], score[chosen], kind) for kind, chosen in kinds]
+    marks = [area.dots(track.time[chosen], score[chosen], kind) for kind, chosen in kinds]
     what = "Score: correlation, and of SIFT (green) the share of matches that agree"
     if not both:
         what = "Score: share of matches that agree" if sift.any() else "Score: correlation at the peak"
-    return what, area.svg(what, plot_data.time_label, marks, timed=True)
+    return what, area.svg(what, track.time_label, marks, timed=True)
 
 
-def _latency(latency_ms: Array, plot_data: TrackPlotData, time: Limits, budget_ms: float | None) -> Chart:
-    area = ChartArea(time, (0.0, _top_ms(latency_ms, budget_ms)))
-    marks = [
-        area.dots(plot_data.time, latency_ms, "fix"),
-        area.overflow(plot_data.time, latency_ms, "over"),
-    ]
+def _latency(track: FinishedTrack, latency_ms: Array, budget_ms: float | None) -> Chart:
+    area = ChartArea(track.time_limits, (0.0, _top_ms(latency_ms, budget_ms)))
+    marks = [area.dots(track.time, latency_ms, "fix"), area.overflow(track.time, latency_ms, "over")]
     fixed = [] if budget_ms is None else [area.horizontal(budget_ms, "limit", f"budget {budget_ms:g} ms")]
-    return "Latency (ms)", area.svg("Latency over time", plot_data.time_label, marks, timed=True, fixed=fixed)
+    return "Latency (ms)", area.svg("Latency over time", track.time_label, marks, timed=True, fixed=fixed)
 
 
 def _histogram(latency_ms: Array, budget_ms: float | None) -> Chart:

@@ -9,13 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from engine.values import Window
 from scenematch.files.notes import FrameNote
 from scenematch.files.track import TrackRow
-from scenematch.report.explain import SliderFrame
+from scenematch.report.explain import SliderFrame, run_window
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.page_map import TrackMap
-from scenematch.report.plot_data import TrackPlotData
 from scenematch.report.verdict import metres
 
 
@@ -24,13 +22,11 @@ def shows_frames(page: Path) -> bool:
     return page.is_file() and 'id="slider"' in page.read_text(encoding="utf-8", errors="replace")
 
 
-def draw_slider(track: FinishedTrack, plot_data: TrackPlotData, shown: Sequence[SliderFrame], why_not: str) -> str:
+def draw_slider(track: FinishedTrack, shown: Sequence[SliderFrame], why_not: str) -> str:
     """The slider, or the reason for its absence."""
     if not shown:
         return f"<p>{escape(why_not or 'No frames are shown.')}</p>"
-    text = (
-        f"{_choice(track, plot_data, shown)} Move by the slider, the arrow keys, or a click on the map or a chart."
-    )
+    text = f"{_choice(track, shown)} Move by the slider, the arrow keys, or a click on the map or a chart."
     return (
         f'<p class="sub">{text} Each was matched again for this page, in the window that the run used.</p>'
         '<div class="slider"><button type="button" id="before" aria-label="Frame before">&#9664;</button>'
@@ -42,14 +38,11 @@ def draw_slider(track: FinishedTrack, plot_data: TrackPlotData, shown: Sequence[
     )
 
 
-def _choice(track: FinishedTrack, plot_data: TrackPlotData, shown: Sequence[SliderFrame]) -> str:
+def _choice(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
     """Describe which frames are shown."""
     if len(shown) == len(track.rows):
         return f"All {len(shown)} frames."
-    kinds = {
-        "beyond three sigmas": np.flatnonzero(plot_data.errors.beyond),
-        "refused": np.flatnonzero([not row.fixed for row in track.rows]),
-    }
+    kinds = {"beyond three sigmas": np.flatnonzero(track.errors.beyond), "refused": np.flatnonzero(~track.fixed)}
     there = {item.index for item in shown}
     parts = [
         f"{'' if there.issuperset(found) else f'{len(there.intersection(found))} of '}{len(found)} {kind}"
@@ -60,35 +53,25 @@ def _choice(track: FinishedTrack, plot_data: TrackPlotData, shown: Sequence[Slid
     return f"{len(shown)} of {len(track.rows)} frames: {', '.join(parts)}."
 
 
-def frame_data(
-    shown: SliderFrame, track: FinishedTrack, plot_data: TrackPlotData, track_map: TrackMap
-) -> dict[str, Any]:
+def frame_data(shown: SliderFrame, track: FinishedTrack, track_map: TrackMap) -> dict[str, Any]:
     """The data of one frame for the page's script."""
     i = shown.index
     row, note = track.rows[i], track.notes[i] if track.notes else None
-    beyond = bool(plot_data.errors.beyond[i])
-    position_m = plot_data.refused_en_m[i] if plot_data.refused[i] else plot_data.errors.fix_en_m[i]
-    window = None
-    if (
-        note is not None
-        and note.window_x0_px is not None
-        and note.window_y0_px is not None
-        and row.window_width_px
-    ):
-        size = (row.window_width_px, row.window_height_px or 0)
-        window = track_map.rectangle(Window(note.window_x0_px, note.window_y0_px, *size))
+    beyond = bool(track.errors.beyond[i])
+    position_m = track.errors.fix_en_m[i] if row.fixed else track.refused_en_m[i]
+    window = None if note is None else run_window(row, note)
     reason = (row.reason or "").replace("_", " ")
     return {
         "name": row.frame,
         "kind": "beyond" if beyond else "fix" if row.fixed else "refused",
         "answer": ("Fix beyond three of its sigmas" if beyond else "Fix") if row.fixed else f"Refused: {reason}",
         "detail": None if note is None else note.detail,
-        "facts": _facts(i, row, note, plot_data),
-        "t": round(float(plot_data.time[i]), 3),
+        "facts": _facts(i, row, note, track),
+        "t": round(float(track.time[i]), 3),
         "xy": [round(float(v), 1) for v in track_map.drawing_xy(position_m)]
         if np.isfinite(position_m).all()
         else None,
-        "window": window,
+        "window": None if window is None else track_map.rectangle(window),
         "pictures": [
             {"s": p.src, "w": p.width_px, "h": p.height_px, "c": p.caption, "a": p.alt, "o": p.overlay}
             for p in shown.images
@@ -96,21 +79,18 @@ def frame_data(
     }
 
 
-def _facts(i: int, row: TrackRow, note: FrameNote | None, plot_data: TrackPlotData) -> list[tuple[str, str]]:
+def _facts(i: int, row: TrackRow, note: FrameNote | None, track: FinishedTrack) -> list[tuple[str, str]]:
     """Figures of one frame by name."""
-    sigma = (
-        None if row.sigma_east_m is None or row.sigma_north_m is None else (row.sigma_east_m, row.sigma_north_m)
-    )
-    error_m, known = float(plot_data.errors.distance_m[i]), bool(np.isfinite(plot_data.errors.distance_m[i]))
-    sigmas = float(np.sqrt(plot_data.errors.normalised_squared_errors[i]))
+    stated = None
+    if row.sigma_east_m is not None and row.sigma_north_m is not None:
+        stated = f"{row.sigma_east_m:.2f} m east, {row.sigma_north_m:.2f} m north"
+    error_m = float(track.errors.distance_m[i])
+    sigmas = float(np.sqrt(track.errors.normalised_squared_errors[i]))
     facts = [
-        (
-            plot_data.time_label.partition(" ")[0],
-            f"{plot_data.time[i]:.2f} s" if "(s)" in plot_data.time_label else f"{i}",
-        ),
-        ("error", metres(error_m) if known else None),
+        ("time", f"{track.time[i]:.2f} s") if track.is_timed else ("frame", f"{i}"),
+        ("error", metres(error_m) if np.isfinite(error_m) else None),
         ("in its sigmas", f"{sigmas:.1f}" if np.isfinite(sigmas) else None),
-        ("stated sigma", None if sigma is None else f"{sigma[0]:.2f} m east, {sigma[1]:.2f} m north"),
+        ("stated sigma", stated),
         ("score", None if row.score is None else f"{row.score:.3f}"),
         ("confidence", None if note is None or note.confidence is None else f"{note.confidence:.3f}"),
         ("method", f"{row.method or '-'}" + (f", {note.stage}" if note is not None and note.stage else "")),

@@ -16,7 +16,8 @@ from engine.values import Window
 from engine.window import level_crop
 from scenematch.report.charts import crosses, dots, line, ticks
 from scenematch.report.explain import jpeg_data_uri, level_within
-from scenematch.report.plot_data import TrackPlotData
+from scenematch.report.finished_track import FinishedTrack
+from scenematch.report.metrics import TrackErrors
 
 _MAX_MAP_PX = 1500  # longer side as drawn
 _MAP_BYTES = 900_000
@@ -50,10 +51,7 @@ class TrackMap:
     @property
     def extent_m(self) -> tuple[float, float]:
         """Width and height on the ground in metres."""
-        return (
-            self.window.width_px * self.site.gsd_m_per_px,
-            self.window.height_px * self.site.gsd_m_per_px,
-        )
+        return (self.window.width_px * self.site.gsd_m_per_px, self.window.height_px * self.site.gsd_m_per_px)
 
     def drawing_xy(self, en_m: Array) -> Array:
         """East and north (..., 2) in metres as x and y (..., 2) of the drawing."""
@@ -66,15 +64,17 @@ class TrackMap:
         return (round(x, 1), round(y, 1), window.width_px / 2.0**self.level, window.height_px / 2.0**self.level)
 
 
-def map_of_tracks(site: OrthoMap, tracks: Sequence[TrackPlotData], view_px: float = 0.0) -> TrackMap:
+def map_of_tracks(tracks: Sequence[FinishedTrack], view_px: float = 0.0) -> TrackMap:
     """The part of the map with fixes, refusals and truth, plus a margin; the whole map if there are none.
 
     Args:
-        site: the map.
-        tracks: one, or several to draw together.
+        tracks: one, or several to draw together on the first one's map.
         view_px: side of the window of one frame, the smallest size of the part.
     """
-    positions_m = np.concatenate([p for data in tracks for p in _positions_m(data)])
+    site = tracks[0].site
+    positions_m = np.concatenate(
+        [en_m for t in tracks for en_m in (t.errors.fix_en_m, t.errors.truth_en_m, t.refused_en_m)]
+    )
     pixels = site.pixel_from_enu(positions_m[np.isfinite(positions_m).all(axis=1)])
     size = np.array([site.width_px, site.height_px], np.float64)
     low, high = np.zeros(2), size
@@ -90,10 +90,6 @@ def map_of_tracks(site: OrthoMap, tracks: Sequence[TrackPlotData], view_px: floa
     width, height = (int(v) for v in np.ceil(high) - [x0, y0])
     level = level_within(site, max(width, height), _MAX_MAP_PX)
     return TrackMap(site, Window(x0, y0, width, height), level)
-
-
-def _positions_m(data: TrackPlotData) -> tuple[Array, Array, Array]:
-    return data.errors.fix_en_m, data.errors.truth_en_m, data.refused_en_m
 
 
 def draw_map(track_map: TrackMap, label: str, marks: Sequence[str]) -> str:
@@ -113,16 +109,16 @@ def draw_map(track_map: TrackMap, label: str, marks: Sequence[str]) -> str:
     return f"{head}{''.join(marks)}{_scale_bar(track_map)}</svg>"
 
 
-def track_marks(track_map: TrackMap, data: TrackPlotData) -> list[str]:
+def track_marks(track_map: TrackMap, track: FinishedTrack) -> list[str]:
     """The marks of one track: path, ellipses, fixes, refusals, fixes beyond three sigmas, the selected frame."""
-    fixes, beyond = track_map.drawing_xy(data.errors.fix_en_m), data.errors.beyond
-    refused = track_map.drawing_xy(data.refused_en_m)
+    fixes, beyond = track_map.drawing_xy(track.errors.fix_en_m), track.errors.beyond
+    refused = track_map.drawing_xy(track.refused_en_m)
     _, _, width, height = track_map.box
     arm = max(width, height) / 170.0
-    kind, path = _path(track_map, data)
+    kind, path = _path(track_map, track.errors)
     return [
         line(path, "halo"),
-        _ellipses(track_map, data),
+        _ellipses(track_map, track.errors),
         dots(fixes, "under"),
         dots(fixes[~beyond], "fix"),
         line(path, kind),
@@ -154,16 +150,15 @@ def connected(track_map: TrackMap, positions_m: Array) -> Array:
     return points
 
 
-def _path(track_map: TrackMap, data: TrackPlotData) -> tuple[str, Array]:
+def _path(track_map: TrackMap, errors: TrackErrors) -> tuple[str, Array]:
     """The true path, or the fixes' without truth: its class, and its points in units of the drawing."""
-    truth = data.errors.truth_en_m
-    kind, positions_m = ("truth", truth) if np.isfinite(truth).any() else ("path", data.errors.fix_en_m)
+    truth = errors.truth_en_m
+    kind, positions_m = ("truth", truth) if np.isfinite(truth).any() else ("path", errors.fix_en_m)
     return kind, connected(track_map, positions_m)
 
 
-def _ellipses(track_map: TrackMap, data: TrackPlotData) -> str:
+def _ellipses(track_map: TrackMap, errors: TrackErrors) -> str:
     """Outlines of three sigmas around some fixes, spaced to be readable."""
-    errors = data.errors
     known = np.flatnonzero(np.isfinite(errors.fix_en_m[:, 0]) & np.isfinite(errors.covariance_en_m2[:, 0, 0]))
     parts: list[str] = []
     drawn: list[tuple[float, float, float]] = []  # x, y and the longer half axis

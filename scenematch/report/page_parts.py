@@ -64,14 +64,14 @@ def section(title: str, body: str, name: str = "") -> str:
 
 def map_with_legend(drawn: str, track_map: TrackMap, legend: Sequence[tuple[str, str]]) -> str:
     """The drawn map with its buttons, a legend of (name, SVG mark), and its extent."""
-    items = "".join(f"<li><svg aria-hidden='true'>{mark}</svg>{escape(name)}</li>" for name, mark in legend)
     width_m, height_m = track_map.extent_m
     return (
         f'<div class="map-box">\n{drawn}\n<div class="zoom">'
         '<button type="button" id="zoom-in" aria-label="Zoom in">+</button>'
         '<button type="button" id="zoom-out" aria-label="Zoom out">&minus;</button>'
         '<button type="button" id="zoom-all" aria-label="Show all">&#8634;</button></div>\n</div>\n'
-        f'<ul class="legend on-map">{items}</ul><p class="hint">{width_m:,.0f} by {height_m:,.0f} m of the map. '
+        f'<ul class="legend on-map">{_items(legend)}</ul>'
+        f'<p class="hint">{width_m:,.0f} by {height_m:,.0f} m of the map. '
         "Zoom by the buttons or Ctrl and the wheel; drag to move.</p>"
     )
 
@@ -79,15 +79,18 @@ def map_with_legend(drawn: str, track_map: TrackMap, legend: Sequence[tuple[str,
 def charts_with_axis(charts: Sequence[Chart], legend: Sequence[tuple[str, str]]) -> str:
     """Charts with the buttons of their common time axis, and a legend of (name, SVG mark)."""
     figures = "\n".join(f"<figure><figcaption>{escape(c)}</figcaption>{svg}</figure>" for c, svg in charts)
-    items = "".join(f"<li><svg aria-hidden='true'>{mark}</svg>{escape(name)}</li>" for name, mark in legend)
     return (
         '<div class="time"><p class="hint">Drag across a chart, or Ctrl and the wheel, to zoom all in time.</p>'
         '<output id="time-span"></output>'
         '<button type="button" id="time-in" aria-label="Shorter time">+</button>'
         '<button type="button" id="time-out" aria-label="Longer time">&minus;</button>'
         '<button type="button" id="time-all" aria-label="Whole time">&#8634;</button></div>\n'
-        f'<div class="charts">\n{figures}\n</div>\n<ul class="legend">{items}</ul>'
+        f'<div class="charts">\n{figures}\n</div>\n<ul class="legend">{_items(legend)}</ul>'
     )
+
+
+def _items(legend: Sequence[tuple[str, str]]) -> str:
+    return "".join(f"<li><svg aria-hidden='true'>{mark}</svg>{escape(name)}</li>" for name, mark in legend)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], kind: str = "figures") -> str:

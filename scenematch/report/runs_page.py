@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,11 +12,10 @@ from engine.errors import OptionError
 from engine.geo import Array
 from scenematch.report.charts import ChartArea, Limits, dots, line
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.metrics import FALSE_SIGMAS, figures_in_words
-from scenematch.report.page_charts import Chart, column
-from scenematch.report.page_map import connected, draw_map, map_of_tracks
+from scenematch.report.metrics import FALSE_SIGMAS, column, figures_in_words
+from scenematch.report.page_charts import Chart
+from scenematch.report.page_map import TrackMap, connected, draw_map, map_of_tracks
 from scenematch.report.page_parts import charts_with_axis, fill_page, map_with_legend, section, table
-from scenematch.report.plot_data import TrackPlotData, larger_variance_m2
 from scenematch.report.verdict import metres, verdict_of
 
 MAX_RUNS = 6
@@ -37,21 +35,22 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
     """
     if not 1 <= len(tracks) <= MAX_RUNS:
         raise OptionError(f"runs: expected 1 to {MAX_RUNS}, got {len(tracks)}")
-    data = {name: track.plot_data() for name, track in tracks.items()}
     first = next(iter(tracks.values()))
-    track_map = map_of_tracks(first.site, list(data.values()))
+    track_map = map_of_tracks(list(tracks.values()))
     verdicts = {name: verdict_of(track.summary) for name, track in tracks.items()}
-    truth = next((d.errors.truth_en_m for d in data.values() if np.isfinite(d.errors.truth_en_m).any()), None)
+    truths = [track.errors.truth_en_m for track in tracks.values()]
+    truth = next((truth for truth in truths if np.isfinite(truth).any()), None)
     true_path = np.empty((0, 2)) if truth is None else connected(track_map, truth)
-    marks = [line(true_path, "halo"), *_run_marks(data, track_map), line(true_path, "truth")]
+    marks = [line(true_path, "halo"), *_run_marks(tracks, track_map), line(true_path, "truth")]
     drawn = draw_map(track_map, f"Map with the tracks of {', '.join(tracks)}.", marks)
     legend = (
         [("truth", '<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="truth"/>')] if len(true_path) else []
     )
+    run_legend = [(name, f'<path class="dots r{index}" d="M11 7h0"/>') for index, name in enumerate(tracks)]
     body = [
         section("Figures", _figures(tracks)),
         section("Where", f"{map_with_legend(drawn, track_map, legend)}\n{_switches(tracks)}", "map-section"),
-        section("When", charts_with_axis(_charts(tracks, data), _run_legend(tracks))),
+        section("When", charts_with_axis(_charts(tracks), run_legend)),
     ]
     grades = {verdict.grade for verdict in verdicts.values()}
     fill_page(
@@ -79,11 +78,11 @@ def _figures(tracks: Mapping[str, FinishedTrack]) -> str:
     return table(("run", "method", *columns), rows)
 
 
-def _run_marks(data: Mapping[str, TrackPlotData], track_map: Any) -> list[str]:
+def _run_marks(tracks: Mapping[str, FinishedTrack], track_map: TrackMap) -> list[str]:
     """Fixes and path of each run in its colour."""
     return [
         f'<g class="run{index}">{line(path, f"r{index} thin")}{dots(path, f"r{index}")}</g>'
-        for index, path in enumerate(connected(track_map, d.errors.fix_en_m) for d in data.values())
+        for index, path in enumerate(connected(track_map, track.errors.fix_en_m) for track in tracks.values())
     ]
 
 
@@ -97,20 +96,17 @@ def _switches(tracks: Mapping[str, FinishedTrack]) -> str:
     return f'<ul class="legend">{items}</ul>'
 
 
-def _run_legend(tracks: Mapping[str, FinishedTrack]) -> list[tuple[str, str]]:
-    return [(name, f'<path class="dots r{index}" d="M11 7h0"/>') for index, name in enumerate(tracks)]
-
-
-def _charts(tracks: Mapping[str, FinishedTrack], data: Mapping[str, TrackPlotData]) -> list[Chart]:
+def _charts(tracks: Mapping[str, FinishedTrack]) -> list[Chart]:
     """Error, error in sigmas, and latency over time, and the share of frames by error and latency.
 
     Charts over time are left out if only some runs have timestamps.
     """
-    errors_m = [d.errors.distance_m for d in data.values()]
-    latencies_ms = [column(track.rows, "latency_ms") for track in tracks.values()]
+    runs = tracks.values()
+    errors_m = [track.errors.distance_m for track in runs]
+    latencies_ms = [column(track.rows, "latency_ms") for track in runs]
     shares = [_share_within("error", "m", errors_m), _share_within("latency", "ms", latencies_ms)]
-    ends = [float(d.time[-1]) for d in data.values() if d.time.size]
-    labels = {d.time_label for d in data.values() if d.time.size}
+    ends = [track.time_limits[1] for track in runs if track.rows]
+    labels = {track.time_label for track in runs if track.rows}
     if len(labels) > 1:  # seconds and frame numbers have no common axis
         return [chart for chart in shares if chart is not None]
     if not ends or not max(ends):
@@ -119,13 +115,13 @@ def _charts(tracks: Mapping[str, FinishedTrack], data: Mapping[str, TrackPlotDat
     series = {
         "Horizontal error (m)": errors_m,
         f"Horizontal error, in stated sigmas; {FALSE_SIGMAS:g} is the limit": [
-            np.sqrt(d.errors.normalised_squared_errors) for d in data.values()
+            np.sqrt(track.errors.normalised_squared_errors) for track in runs
         ],
-        "Stated sigma (m)": [np.sqrt(larger_variance_m2(d.errors.covariance_en_m2)) for d in data.values()],
+        "Stated sigma (m)": [track.errors.sigma_m for track in runs],
         "Latency (ms)": latencies_ms,
     }
     (label,) = labels
-    times = [d.time for d in data.values()]
+    times = [track.time for track in runs]
     charts = [_over_time(what, label, time, times, values) for what, values in series.items()]
     return [chart for chart in charts + shares if chart is not None]
 

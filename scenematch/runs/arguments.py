@@ -113,6 +113,16 @@ def check_above(name: str, value: float | None, low: float, most: float) -> None
         raise OptionError(f"{name}: expected a number above {low:g} and at most {most:g}, got {value:g}")
 
 
+def check_between(name: str, value: float | None, low: float, high: float) -> None:
+    """Refuse a number outside of a range, whose ends belong to it; None means not given.
+
+    Raises:
+        OptionError: it is.
+    """
+    if value is not None and not low <= value <= high:  # NaN fails too
+        raise OptionError(f"{name}: expected {low:g} to {high:g}, got {value:g}")
+
+
 def check_every(every: int) -> None:
     """Refuse an invalid frame interval.
 

@@ -12,7 +12,7 @@ from engine.errors import OptionError
 from scenematch.bridges.pictures import CapturedImage, capture, replay
 from scenematch.files.flight import open_flight
 from scenematch.files.frames import VIDEO_SUFFIXES
-from scenematch.runs.arguments import check_every, check_unused
+from scenematch.runs.arguments import check_between, check_every, check_unused
 from scenematch.runs.cameras import CameraInput
 from scenematch.runs.folders import StrPath
 from scenematch.runs.map_input import MapInput
@@ -62,10 +62,7 @@ class BridgeFiles:
         check_every(self.every)
         if self.rate_hz is not None and not 1e-3 <= self.rate_hz < math.inf:
             raise OptionError(f"rate_hz: expected a number of 0.001 or more, got {self.rate_hz:g}")
-        if self.exposure_to_grab_ms is not None and not 0.0 <= self.exposure_to_grab_ms <= _MAX_GRAB_MS:
-            raise OptionError(
-                f"exposure_to_grab_ms: expected 0 to {_MAX_GRAB_MS:g}, got {self.exposure_to_grab_ms:g}"
-            )
+        check_between("exposure_to_grab_ms", self.exposure_to_grab_ms, 0.0, _MAX_GRAB_MS)
 
     def _check_live_camera(self) -> None:
         if self.camera.camera is None and self.camera.hfov_deg is None:

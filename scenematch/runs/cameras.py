@@ -61,14 +61,9 @@ class CameraInput:
         """The camera from a calibration's path, from None, or unchanged."""
         return value if isinstance(value, CameraInput) else cls(value)
 
-    @property
-    def has_mount(self) -> bool:
-        """Whether the mount is given."""
-        return self.mount is not None or self.camera_pitch_deg is not None
-
     def mounted(self, camera: Camera) -> Camera:
-        """The camera with its mount."""
-        if not self.has_mount:
+        """The camera with its mount, if one is given."""
+        if self.mount is None and self.camera_pitch_deg is None:
             return camera
         return replace(camera, mount=mount_rotation(self.mount or "nadir", self.camera_pitch_deg))
 

@@ -75,15 +75,14 @@ def _that_can_be_set(finding: Finding, has_gimbal: bool, has_calibration: bool) 
     if finding.cause != "mount" or not (has_gimbal or where):
         return finding
     if has_gimbal:
-        return replace(
-            finding, cure="the gimbal's angles replace a mount: correct the angles with --correct "
-            "roll_deg=roll_deg+DEG, --correct pitch_deg=pitch_deg+DEG or --correct heading_offset_deg=DEG",
-        )  # fmt: skip
-    return (
-        finding
-        if has_calibration
-        else replace(finding, cure=f"write a calibration file with {line}, for --camera")
-    )
+        corrections = (
+            "roll_deg=roll_deg+DEG, --correct pitch_deg=pitch_deg+DEG or --correct heading_offset_deg=DEG"
+        )
+        cure = f"the gimbal's angles replace a mount: correct the angles with --correct {corrections}"
+        return replace(finding, cure=cure)
+    if has_calibration:
+        return finding
+    return replace(finding, cure=f"write a calibration file with {line}, for --camera")
 
 
 def _of_truth(stamp_ns: int, truth: list[Truth]) -> Prior | None:

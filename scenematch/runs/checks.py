@@ -72,26 +72,20 @@ def _needs(method: str, profile: str) -> list[str]:
     return [*needs, "heading_deg"] if method == "ncc" else needs
 
 
-def say_what_lacks(flight: Flight, method: str, profile: str, progress: Progress) -> None:
-    """Report how many frames the method will certainly refuse, and which method would not."""
-    for name in _needs(method, profile):
-        lacking = sum(getattr(row, name) is None for row in flight.rows)
-        if lacking:
-            other = "" if profile == "paper" else "; sift and auto do not need it"
-            progress.message(f"{lacking} of {len(flight)} frames lack {name}, so {method} will refuse them{other}")
-
-
-def check_needs(flight: Flight, method: str, profile: str) -> None:
-    """Refuse a method if no frame has the telemetry that it needs.
+def check_needs(flight: Flight, method: str, profile: str, progress: Progress) -> None:
+    """Report how many frames the method will certainly refuse for lack of telemetry, and which method would not.
 
     Raises:
         TelemetryError: every frame would be refused.
     """
-    needs = _needs(method, profile)
+    needs, other = _needs(method, profile), "" if profile == "paper" else "; sift and auto do not need it"
     if needs and not any(all(getattr(row, name) is not None for name in needs) for row in flight.rows):
-        other = "" if profile == "paper" else "; sift and auto do not need it"
         asked, doubts = " and ".join(needs), "".join(f"; {remark}" for remark in flight.remarks)
         raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}{doubts}")
+    for name in needs:
+        lacking = sum(getattr(row, name) is None for row in flight.rows)
+        if lacking:
+            progress.message(f"{lacking} of {len(flight)} frames lack {name}, so {method} will refuse them{other}")
 
 
 def check_start(start: Prior | None, site: OrthoMap) -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from engine.camera import Camera
 from engine.errors import OptionError
@@ -21,18 +18,18 @@ from engine.values import Frame, Truth
 from scenematch.files.notes import frame_note, write_notes
 from scenematch.files.track import track_row, write_track
 from scenematch.report.loop_record import summarise_loop, write_loop_csv
-from scenematch.runs.arguments import check_choice, check_device
-from scenematch.runs.evaluation import redraw
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder
+from scenematch.runs.arguments import check_between, check_choice, check_device
+from scenematch.runs.evaluation import evaluate
+from scenematch.runs.folders import StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.inputs import FOLDER_LAYOUT
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.record import RunRecord
 from scenematch.runs.results import LOOP, NOTES, SUMMARY, TRACK
-from scenematch.runs.simulation import FOLDER_OWNED, LOOP_OWNED, WorldSettings, write_folder
+from scenematch.runs.simulation import FOLDER_OWNED, LOOP_OWNED, WorldSettings, picture_name, write_folder
 from scenematch.simulator import FlightStyle, Town, picture_at
 from scenematch.simulator.faults import FAULT_KINDS, Fault
-from scenematch.simulator.flight import NADIR_PITCH_DEG, truth_at
+from scenematch.simulator.flight import NADIR_PITCH_DEG, reach_m, truth_at
 from scenematch.simulator.light import Image
 from scenematch.simulator.loop import ClosedLoop
 from scenematch.simulator.pilot import plan_rounds
@@ -72,8 +69,7 @@ class ClosedLoopSettings:
     def __post_init__(self) -> None:
         check_choice("method", self.method, CLASSICAL)
         check_choice("fault", self.fault, FAULT_KINDS)
-        if not 0.1 <= self.minutes <= 120.0:
-            raise OptionError(f"minutes: expected 0.1 to 120, got {self.minutes:g}")
+        check_between("minutes", self.minutes, 0.1, 120.0)
         check_device(self.device)
 
     def planned_fault(self) -> Fault:
@@ -121,7 +117,9 @@ def fly_closed_loop(
         seconds = 60.0 * loop.minutes
         count = int(seconds * flight.options.frame_rate_hz)
         frames = progress.track(_fly(flight, seconds, view), count, "flying")
-        _write_folder(out, frames, flight, town, camera, site)
+        lat, lon = map(float, site.frame.geodetic_from_enu(*flight.flown.start_m[:2]))
+        # Written while it flies.
+        write_folder(out, town, camera, frames, _truth_rows(flight, town, site), lat, lon)
     record = _record(out, world, loop, site, town, str(matcher.device))
     return _write_results(out, flight, record, progress)
 
@@ -129,20 +127,18 @@ def fly_closed_loop(
 def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: Progress) -> dict[str, Any]:
     """Write track, record, figures of merit and report of a finished flight."""
     flown, latency_ms = flight.flown, 1e3 * flight.options.latency_s
-    answers = [(_name(k), answer) for k, answer in enumerate(flown.answers)]
+    answers = [(picture_name(k), answer) for k, answer in enumerate(flown.answers)]
     rows = [track_row(name, answer.result, latency_ms=latency_ms, deadline_met=None) for name, answer in answers]
     write_track(out / TRACK, rows)
     states = [NavigatorState.LOST if answer.state is None else answer.state for _, answer in answers]
     notes = [frame_note(name, a.result, state.value) for (name, a), state in zip(answers, states, strict=True)]
     write_notes(out / NOTES, notes)
     write_loop_csv(out / LOOP, flown)
-    (out / SUMMARY).write_text(json.dumps({"settings": record.facts()}), encoding="utf-8")
-    summary = redraw(out, progress=progress)  # like any finished track, so that evaluate gives the same
+    write_json(out / SUMMARY, {"settings": record.facts()})
+    summary = evaluate(out, force=True, progress=progress)  # like any finished track
     figures = summarise_loop(flown)
     figures |= {name: summary[name] for name in ("availability", "wrong_over_10m", "false_fixes")}
-    (out / "loop.json").write_text(
-        json.dumps(figures | {"settings": record.facts()}, indent=2) + "\n", encoding="utf-8"
-    )
+    write_json(out / "loop.json", figures | {"settings": record.facts()})
     return figures | {"folder": str(out.resolve())}
 
 
@@ -152,14 +148,12 @@ def plan_closed_loop(
     """The flight before it begins: circuits of the town, 150 m above its ground."""
     site = matcher.site
     style = FlightStyle()
-    corner = np.linalg.inv(camera.matrix) @ (camera.width_px - 0.5, camera.height_px - 0.5, 1.0)
-    reach_m = style.height_agl_m * math.hypot(corner[0], corner[1]) + _EDGE_M
-    half_m = [0.5 * n * site.gsd_m_per_px - reach_m for n in (site.width_px, site.height_px)]
+    least_m = reach_m(camera, style.height_agl_m) + _EDGE_M
+    half_m = [0.5 * n * site.gsd_m_per_px - least_m for n in (site.width_px, site.height_px)]
     if min(half_m) < _MIN_HALF_SIDE_M:
         sides = " x ".join(f"{n * site.gsd_m_per_px:.0f}" for n in (site.width_px, site.height_px))
-        raise OptionError(
-            f"map: expected {2.0 * (reach_m + _MIN_HALF_SIDE_M):.0f} m or more a side, got {sides} m"
-        )
+        side_m = 2.0 * (least_m + _MIN_HALF_SIDE_M)
+        raise OptionError(f"map: expected {side_m:.0f} m or more a side, got {sides} m")
     style = replace(style, height_agl_m=style.height_agl_m + site.ground_m)
     route = plan_rounds((half_m[0], half_m[1]), 60.0 * loop.minutes, style)
     rng = generator(seed, 0xCA)
@@ -170,28 +164,14 @@ def plan_closed_loop(
     return ClosedLoop(route, view, matcher, seed=seed, fault=loop.planned_fault())
 
 
-def _name(k: int) -> str:
-    return f"{k:06d}.jpg"
-
-
-def _fly(flight: ClosedLoop, seconds: float, view: LiveView | None) -> Iterator[Frame]:
-    """The frames of a flight in progress, each shown once it is answered."""
+def _fly(flight: ClosedLoop, seconds: float, view: LiveView | None) -> Iterator[tuple[str, Frame]]:
+    """The names and frames of a flight in progress, each shown once it is answered."""
     latency_ms = 1e3 * flight.options.latency_s
     for k, frame in enumerate(flight.fly(seconds)):
         if view is not None:
             answer = flight.flown.answers[-1]
-            view.show(k, _name(k), frame, answer.result, answer.state, latency_ms)
-        yield frame
-
-
-def _write_folder(
-    out: Path, frames: Iterator[Frame], flight: ClosedLoop, town: Town, camera: Camera, site: OrthoMap
-) -> None:
-    """Fly, and write the folder meanwhile: pictures, telemetry from the filter, truth, camera and map."""
-    start = flight.flown.start_m
-    lat, lon = site.frame.geodetic_from_enu(start[0], start[1])
-    named = ((_name(k), frame) for k, frame in enumerate(frames))
-    write_folder(out, town, camera, named, _truth_rows(flight, town, site), float(lat), float(lon))
+            view.show(k, picture_name(k), frame, answer.result, answer.state, latency_ms)
+        yield picture_name(k), frame
 
 
 def _truth_rows(flight: ClosedLoop, town: Town, site: OrthoMap) -> Iterator[Truth]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 from engine.errors import OptionError
 from engine.matching import METHODS
 from scenematch.report.runs_page import MAX_RUNS
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder
+from scenematch.runs.folders import StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.inputs import FlightFiles, open_inputs
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.reporting import COMPARISON, draw_together
@@ -23,10 +22,7 @@ DEFAULT_RUNS = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")
 
 
 def parse_runs(
-    texts: Sequence[str] = (),
-    *,
-    settings: Sequence[StrPath] = (),
-    **overrides: Any,
+    texts: Sequence[str] = (), *, settings: Sequence[StrPath] = (), **overrides: Any
 ) -> dict[str, TrackSettings]:
     """Settings by run name; each run is given as METHOD, METHOD/PROFILE or a settings file.
 
@@ -93,7 +89,7 @@ def compare(
         name: track(files, out / name, settings, force=force, inputs=inputs, diagnosis=False, progress=progress)
         for name, settings in runs.items()
     }
-    (out / TABLE).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+    write_json(out / TABLE, results)
     if len(runs) <= MAX_RUNS:  # the page has no colours for more
         draw_together(out / COMPARISON, {name: out / name for name in runs}, progress=progress)
     return results

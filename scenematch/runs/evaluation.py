@@ -12,7 +12,6 @@ from engine.orthomap import OrthoMap
 from scenematch.files.corrections import Corrections
 from scenematch.files.settings import nested, options_from_mapping
 from scenematch.files.track import TrackRow, read_track
-from scenematch.report.metrics import Ground
 from scenematch.report.page_frames import shows_frames
 from scenematch.runs.cameras import CameraInput
 from scenematch.runs.folders import StrPath
@@ -27,7 +26,7 @@ from scenematch.runs.settings import TrackSettings
 def evaluate(
     folder: StrPath, truth: StrPath | None = None, *, force: bool = False, progress: Progress = SILENT
 ) -> dict[str, Any]:
-    """Score a finished track again, if there is truth, and rewrite its summary and page.
+    """Score a finished track again, if there is truth, and rewrite its summary and page from its own record.
 
     Args:
         folder: folder of a finished run.
@@ -42,37 +41,15 @@ def evaluate(
         TelemetryError: the folder holds no finished track.
         OptionError: the page would lose its frames.
     """
-    return redraw(Path(folder), truth, keep_frames=truth is None and not force, progress=progress)
-
-
-def redraw(
-    folder: Path, truth: StrPath | None = None, *, keep_frames: bool = False, progress: Progress = SILENT
-) -> dict[str, Any]:
-    """Rewrite the results of a finished run from its own record.
-
-    Args:
-        folder: of the run.
-        truth: replaces the run's own.
-        keep_frames: do not replace a page that shows frames by one that no longer can.
-        progress: receives progress and messages.
-
-    Returns:
-        The summary.
-
-    Raises:
-        TelemetryError: the folder holds no finished track.
-        OptionError: the page would lose its frames.
-    """
+    folder = Path(folder)
     rows = read_track(folder / TRACK)
     record = read_record(folder / SUMMARY)
     path = record.truth if truth is None else truth
-    start_ns = rows[0].timestamp_ns if rows else None
-    truth_rows = None if path is None else open_run_truth(Path(path), start_ns, progress)
+    truth_rows = open_run_truth(path, rows, progress)
     site = open_recorded_map(record, progress)
-    ground = Ground(record.ground_m, record.ground_amsl_m)
     frames = _report_frames(record, rows, site)
     if frames.flight is None and shows_frames(folder / PAGE):
-        if keep_frames:
+        if truth is None and not force:
             raise OptionError(
                 f"runs: {folder / PAGE} shows frames, which redrawing would lose; add `force` to do it anyway; "
                 f"{frames.why_missing}"
@@ -80,7 +57,7 @@ def redraw(
         progress.message(f"{folder / PAGE} loses the frames that it shows: {frames.why_missing}")
     if path is not None:
         record = replace(record, truth=str(Path(path).resolve()))
-    return write_results(folder, rows, truth_rows, site, ground, record, frames, progress=progress)
+    return write_results(folder, rows, truth_rows, site, record, frames, progress=progress)
 
 
 def open_recorded_map(record: RunRecord, progress: Progress = SILENT) -> OrthoMap:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from engine.errors import OptionError
 
@@ -57,3 +58,8 @@ def prepare_folder(out: Path, force: bool, owned: Sequence[str]) -> None:
     for pattern in owned:
         for file in out.glob(pattern):
             file.unlink()
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Write values as JSON for programs and people."""
+    path.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")

@@ -16,16 +16,11 @@ from scenematch.files.flight import Flight, open_flight, subtitles_beside
 from scenematch.files.frames import VIDEO_SUFFIXES
 from scenematch.files.logs.readers import LogClock, is_log, is_photographs, open_truth
 from scenematch.files.ros.bags import is_bag
+from scenematch.files.telemetry import TelemetryRow
+from scenematch.files.track import TrackRow
 from scenematch.runs.arguments import check_every, parse_position
 from scenematch.runs.cameras import CameraInput
-from scenematch.runs.checks import (
-    check_gimbal,
-    check_needs,
-    check_pictures,
-    check_position,
-    check_start,
-    say_what_lacks,
-)
+from scenematch.runs.checks import check_gimbal, check_needs, check_pictures, check_position, check_start
 from scenematch.runs.folders import StrPath
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.progress import SILENT, Progress
@@ -110,9 +105,7 @@ class FlightFiles:
             raise OptionError(f"odometry_topic: expected a bag as telemetry, got {telemetry or frames}")
         check_every(every)
         paths = {"frames": frames, "telemetry": telemetry, "truth": truth, "frame_stamps": frame_stamps}
-        for name, path in paths.items():
-            object.__setattr__(self, name, None if path is None else Path(path))
-        values = {
+        values = {name: None if path is None else Path(path) for name, path in paths.items()} | {
             "map": MapInput.of(map), "camera": camera, "log_offset_s": log_offset_s, "image_topic": image_topic,
             "odometry_topic": odometry_topic, "every": every, "corrections": corrections or Corrections(),
         }  # fmt: skip
@@ -207,11 +200,9 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     flight = files.open_flight(_columns(runs))
     camera = files.load_camera(flight, progress)
     truth_path = files.find_truth()
-    stamp_ns = flight.rows[0].timestamp_ns if flight.rows else None
-    truth = None if truth_path is None else open_run_truth(truth_path, stamp_ns, progress)
+    truth = open_run_truth(truth_path, flight.rows, progress)
     for settings in runs:
-        check_needs(flight, settings.method, settings.profile)
-        say_what_lacks(flight, settings.method, settings.profile, progress)
+        check_needs(flight, settings.method, settings.profile, progress)
         if settings.method == "learned":
             from engine.learned import load_matcher
 
@@ -235,9 +226,19 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     return FlightInputs(site, camera, flight, truth_path, truth)
 
 
-def open_run_truth(path: Path, stamp_ns: int | None, progress: Progress = SILENT) -> list[Truth]:
-    """Read a truth (:func:`scenematch.files.logs.readers.open_truth`), and report if it is only a receiver's."""
-    truth = open_truth(path, stamp_ns)
+def open_run_truth(
+    path: StrPath | None, rows: Sequence[TelemetryRow] | Sequence[TrackRow], progress: Progress = SILENT
+) -> list[Truth] | None:
+    """Read the truth of a run, if there is one, and report if it is only a receiver's.
+
+    Args:
+        path: see :func:`scenematch.files.logs.readers.open_truth`.
+        rows: of the run, with its timestamps.
+        progress: receives the message.
+    """
+    if path is None:
+        return None
+    truth = open_truth(Path(path), rows[0].timestamp_ns if rows else None)
     if is_photographs(path):
         progress.message(
             f"truth: {len(truth)} positions from the photographs' EXIF, by a receiver: errors include its own, "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -84,21 +84,13 @@ def _check_viewer(address: str) -> None:
         raise BackendError(f"viewer: no viewer listens at {address}; {start}") from None
 
 
-@contextmanager
-def open_view(matcher: SceneMatcher, target: LiveViewTarget) -> Iterator[LiveView | None]:
+def open_view(matcher: SceneMatcher, target: LiveViewTarget) -> AbstractContextManager[LiveView | None]:
     """The live view of a run, closed when the context ends; None without a target.
 
     Raises:
         BackendError: the recording cannot be written.
     """
-    if not target:
-        yield None
-        return
-    view = target.open(matcher)
-    try:
-        yield view
-    finally:
-        view.close()
+    return closing(target.open(matcher)) if target else nullcontext()
 
 
 @contextmanager
@@ -112,8 +104,5 @@ def open_bridge_view(
         return
     from scenematch.report.live_view import Watcher
 
-    watcher = Watcher(target.open(matcher))
-    try:
+    with closing(Watcher(target.open(matcher))) as watcher:
         yield lambda prior: watcher.follow(make(prior)), watcher
-    finally:
-        watcher.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from scenematch.check.self_match import SelfMatchStatistics, measure_self_match
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.route import read_route
 from scenematch.runs.arguments import parse_circle
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder
+from scenematch.runs.folders import StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.renaming import renamed_in_errors
@@ -99,7 +98,7 @@ def audit_map(
     route = None if waypoints is None else predict_route(audit, *waypoints.T)
     _write(out, audit, route, Path(files.map.map).name)
     facts = _summary(audit, route, files)
-    (out / "summary.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    write_json(out / "summary.json", facts)
     return MapAudit(audit, route, facts)
 
 

@@ -15,21 +15,14 @@ from engine.geo import LocalFrame
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.values import MAX_SIGMA_M
 from scenematch.fetch.grid import FINE_ENOUGH, Access, Grid
-from scenematch.fetch.heights import (
-    GLO30,
-    GLO30_SLOPE_SIGMA_DEG,
-    Heights,
-    files_for,
-    read_part,
-    write_heights,
-)
+from scenematch.fetch.heights import GLO30, GLO30_SLOPE_SIGMA_DEG, Heights, files_for, read_part, write_heights
 from scenematch.fetch.pictures import fetch_pictures, kept_pictures, remove_pictures
 from scenematch.fetch.place import Bounds, Place, Wanted
 from scenematch.fetch.servers import plan
 from scenematch.fetch.urls import check_url, shown
 from scenematch.fetch.xyz import is_template
 from scenematch.files.photos import exif_telemetry
-from scenematch.runs.arguments import check_above, parse_place
+from scenematch.runs.arguments import check_above, check_between, check_unused, parse_place
 from scenematch.runs.folders import StrPath, check_file
 from scenematch.runs.progress import SILENT, Progress
 
@@ -174,20 +167,15 @@ def _checked(settings: FetchSettings, progress: Progress) -> Wanted:
     wanted = _wanted(settings, progress)
     check_above("radius_m", wanted.place.radius_m, 0.0, _MAX_RADIUS_M)
     check_above("gsd_m_per_px", wanted.gsd_m_per_px, 0.0, 1e3)
-    for name, most in (
-        ("timeout_s", 3600.0),
-        ("map_sigma_m", MAX_SIGMA_M),
-        ("surface_slope_sigma_deg", 45.0),
-    ):
-        check_above(name, getattr(settings, name), 0.0, most)
+    check_above("timeout_s", settings.timeout_s, 0.0, 3600.0)
+    check_above("map_sigma_m", settings.map_sigma_m, 0.0, MAX_SIGMA_M)
+    check_above("surface_slope_sigma_deg", settings.surface_slope_sigma_deg, 0.0, 45.0)
     if not 0.0 <= settings.pause_ms <= 60_000.0:
         raise OptionError(f"pause_ms: expected milliseconds from 0 to 60000, got {settings.pause_ms:g}")
-    if not 16 <= settings.tile_px <= 4096:
-        raise OptionError(f"tile_px: expected 16 to 4096, got {settings.tile_px}")
-    if settings.surface is None and settings.surface_datum is not None:
-        raise OptionError("surface_datum: expected with `surface` only")
-    if settings.surface is None and settings.surface_slope_sigma_deg is not None:
-        raise OptionError("surface_slope_sigma_deg: expected with `surface` only")
+    check_between("tile_px", settings.tile_px, 16, 4096)
+    if settings.surface is None:
+        names = ("surface_datum", "surface_slope_sigma_deg")
+        check_unused({name: getattr(settings, name) for name in names}, "surface")
     if is_template(settings.source):
         for name in ("layer", "crs", "image_format"):
             if getattr(settings, name) is not None:
@@ -216,14 +204,9 @@ def _wanted(settings: FetchSettings, progress: Progress) -> Wanted:
         raise OptionError("radius_m: expected with LAT,LON; it is optional only with photographs")
     else:
         place = Place(*_place(settings.around), radius_m)
-    return Wanted(
-        place=place,
-        gsd_m_per_px=GSD_M_PER_PX if gsd_m_per_px is None else gsd_m_per_px,
-        max_tiles=settings.max_tiles,
-        layer=settings.layer,
-        crs=settings.crs,
-        image_format=settings.image_format,
-    )
+    gsd_m_per_px = GSD_M_PER_PX if gsd_m_per_px is None else gsd_m_per_px
+    server = {name: getattr(settings, name) for name in ("max_tiles", "layer", "crs", "image_format")}
+    return Wanted(place=place, gsd_m_per_px=gsd_m_per_px, **server)
 
 
 def _place(around: str) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from engine.errors import MapError, OptionError
 from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M
-from scenematch.runs.arguments import is_in_degrees, parse_bounds
+from scenematch.runs.arguments import check_above, is_in_degrees, parse_bounds
 from scenematch.runs.folders import StrPath
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.renaming import renamed_in_errors
@@ -54,10 +54,7 @@ class MapInput:
             OptionError: the accuracy is out of range, or bounds or CRS do not suit the file.
             MapError: a file cannot be read, or is nowhere on the Earth.
         """
-        if self.map_sigma_m is not None and not 0.0 < self.map_sigma_m <= MAX_SIGMA_M:
-            raise OptionError(
-                f"map_sigma_m: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {self.map_sigma_m:g}"
-            )
+        check_above("map_sigma_m", self.map_sigma_m, 0.0, MAX_SIGMA_M)
         corners = parse_bounds("map_bounds", self.map_bounds)
         in_degrees = self.map_crs is None or corners is None or is_in_degrees(corners)
         try:

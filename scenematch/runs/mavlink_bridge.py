@@ -24,7 +24,7 @@ from scenematch.bridges.links import parse_connection
 from scenematch.bridges.parameters import MAX_DELAY_MS
 from scenematch.bridges.pictures import CapturedImage
 from scenematch.bridges.vehicle import NedOrigin
-from scenematch.runs.arguments import check_choice, check_device, check_unused, parse_position
+from scenematch.runs.arguments import check_between, check_choice, check_device, check_unused, parse_position
 from scenematch.runs.bridge_files import BridgeFiles
 from scenematch.runs.checks import check_position
 from scenematch.runs.last_fix import LastFix, last_fix_file, remember_delay
@@ -83,11 +83,7 @@ class MavlinkSettings:
     def __post_init__(self) -> None:
         if not self.set_origin:
             check_unused({"origin_alt_m": self.origin_alt_m}, "set_origin")
-        if self.origin_alt_m is not None and not abs(self.origin_alt_m) <= _MAX_ALT_M:
-            raise OptionError(
-                f"origin_alt_m: expected {-_MAX_ALT_M:g} to {_MAX_ALT_M:g}, got {self.origin_alt_m:g}"
-            )
-
+        check_between("origin_alt_m", self.origin_alt_m, -_MAX_ALT_M, _MAX_ALT_M)
         if not 2 <= self.component_id <= 255:
             raise OptionError(f"component_id: expected 2 to 255 (1 is the autopilot), got {self.component_id}")
 
@@ -171,6 +167,12 @@ class BridgeSettings:
             return None
         return Realtime(nice=self.nice, cores=self.cores)
 
+    def schedule_this_thread(self) -> None:
+        """Give this thread the scheduling of the matching threads: it, too, may hold Python's lock."""
+        scheduling = self.scheduling()
+        if scheduling is not None:
+            set_realtime(replace(scheduling, cores=()))  # a camera's command would inherit cores
+
     def live_options(self, deadline_ms: float = 121.0) -> LiveOptions:
         """The deadlines of the frames, or the default ones."""
         deadline_ms = deadline_ms if self.deadline_ms is None else self.deadline_ms
@@ -243,9 +245,7 @@ def run_mavlink_bridge(
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
         with bridge:
-            scheduling = settings.scheduling()
-            if scheduling is not None:  # this thread, too, may hold Python's lock
-                set_realtime(replace(scheduling, cores=()))  # a camera's command would inherit cores
+            settings.schedule_this_thread()
             # Ctrl-C is the usual way to stop a camera's bridge and must keep the counts.
             with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
                 _run(bridge, pictures, camera, settings.seconds, progress, beat)

@@ -11,6 +11,7 @@ from typing import Any
 
 from engine.errors import EngineError, TelemetryError
 from scenematch.files.corrections import Corrections
+from scenematch.report.metrics import Ground
 
 PATHS = ("map", "surface", "camera", "frames", "telemetry", "truth", "frame_stamps")
 """The files of a record."""
@@ -100,6 +101,11 @@ class RunRecord:
             if not (holds(value) or (none and value is None)):
                 or_null = " or null" if none else ""
                 raise TelemetryError(f"{each.name}: expected {expected}{or_null}, got {_shown(value)}")
+
+    @property
+    def ground(self) -> Ground:
+        """Level of the ground on the map."""
+        return Ground(self.ground_m, self.ground_amsl_m)
 
     def facts(self) -> dict[str, Any]:
         """The record as JSON values."""

@@ -7,13 +7,12 @@ from pathlib import Path
 
 from engine.errors import OptionError
 from engine.orthomap import OrthoMap
-from scenematch.files.logs.readers import open_truth
 from scenematch.files.track import read_track
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.metrics import Ground
 from scenematch.report.runs_page import MAX_RUNS, write_runs_page
-from scenematch.runs.evaluation import open_recorded_map, redraw
+from scenematch.runs.evaluation import evaluate, open_recorded_map
 from scenematch.runs.folders import StrPath, check_file
+from scenematch.runs.inputs import open_run_truth
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.record import read_record
 from scenematch.runs.results import PAGE, SUMMARY, TRACK, figures_of
@@ -45,7 +44,7 @@ def report(
     if len(runs) == 1:
         if out is not None:
             raise OptionError(f"out: expected none with one run, whose page is {runs[0] / PAGE}")
-        redraw(runs[0], keep_frames=not force, progress=progress)
+        evaluate(runs[0], force=force, progress=progress)
         return runs[0] / PAGE
     page = Path(COMPARISON if out is None else out)
     check_file(page, force)
@@ -90,8 +89,6 @@ def draw_together(page: Path, runs: dict[str, Path], *, progress: Progress = SIL
 def _finished(folder: Path, site: OrthoMap) -> FinishedTrack:
     """A finished run on a map, with its figures recomputed."""
     rows, record = read_track(folder / TRACK), read_record(folder / SUMMARY)
-    start_ns = rows[0].timestamp_ns if rows else None
-    truth = None if record.truth is None else open_truth(Path(record.truth), start_ns)
-    ground = Ground(record.ground_m, record.ground_amsl_m)
-    summary = figures_of(rows, truth, site, ground) | {"settings": record.facts()}
-    return FinishedTrack(rows, truth, site, ground, summary, None)
+    truth = open_run_truth(record.truth, rows)
+    summary = figures_of(rows, truth, site, record.ground) | {"settings": record.facts()}
+    return FinishedTrack(rows, truth, site, record.ground, summary, None)

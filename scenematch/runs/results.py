@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,12 +16,13 @@ from scenematch.files.notes import read_notes
 from scenematch.files.resampling import UTC_FROM_NS
 from scenematch.files.track import TrackRow
 from scenematch.report.consistency import motion_consistency
-from scenematch.report.explain import choose_frames, explain_frames
+from scenematch.report.explain import explain_frames
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.loop_record import read_loop_csv
 from scenematch.report.metrics import Ground, errors_en_m, summarise
 from scenematch.report.page import write_page
 from scenematch.report.segments import segment_errors
+from scenematch.runs.folders import write_json
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.record import RunRecord
 
@@ -47,7 +47,6 @@ def write_results(
     rows: list[TrackRow],
     truth: list[Truth] | None,
     site: OrthoMap,
-    ground: Ground,
     record: RunRecord,
     frames: ReportFrames,
     *,
@@ -57,7 +56,7 @@ def write_results(
     """Write summary.json and, if requested, the report page, replacing older ones."""
     telemetry = None if frames.flight is None else frames.flight.rows
     motion = {"motion_consistency": motion_consistency(rows, telemetry, site.frame)}
-    summary = figures_of(rows, truth, site, ground) | motion | {"settings": record.facts()}
+    summary = figures_of(rows, truth, site, record.ground) | motion | {"settings": record.facts()}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
         fixed = [row.timestamp_ns for row in rows if row.fixed and row.timestamp_ns is not None]
         given = [row.timestamp_ns for row in truth or []]
@@ -65,10 +64,13 @@ def write_results(
             f"no fix is scored: expected a truth at the times of the fixes, {_span(fixed)}, got {_span(given)} in "
             f"{record.truth}"
         )
-    (out / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    if not report:
-        return summary
-    _write_page(out / PAGE, finished_track(out, rows, truth, site, ground, summary, frames), frames)
+    write_json(out / SUMMARY, summary)
+    if report:
+        notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
+        is_loop = "closed_loop" in summary["settings"]  # a loop.csv may be another run's
+        loop = read_loop_csv(out / LOOP) if is_loop and (out / LOOP).is_file() else None
+        track = FinishedTrack(rows, truth, site, record.ground, summary, notes, telemetry, loop)
+        _write_page(out / PAGE, track, frames)
     return summary
 
 
@@ -88,33 +90,14 @@ def _span(stamps_ns: list[int]) -> str:
     return f"{ends[0] / 1e9:.1f} to {ends[1] / 1e9:.1f} s"
 
 
-def finished_track(
-    out: Path,
-    rows: list[TrackRow],
-    truth: list[Truth] | None,
-    site: OrthoMap,
-    ground: Ground,
-    summary: dict[str, Any],
-    frames: ReportFrames,
-) -> FinishedTrack:
-    """A finished track with the other files of its folder."""
-    notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
-    is_loop = "closed_loop" in summary["settings"]  # a loop.csv may be another run's
-    loop = read_loop_csv(out / LOOP) if is_loop and (out / LOOP).is_file() else None
-    telemetry = None if frames.flight is None else frames.flight.rows
-    return FinishedTrack(rows, truth, site, ground, summary, notes, telemetry, loop)
-
-
 def _write_page(path: Path, track: FinishedTrack, frames: ReportFrames) -> None:
     """Write the report, with some frames matched again if possible."""
     if frames.flight is None or frames.matcher is None:
         return write_page(path, track, why_not=f"No frames are shown: {frames.why_missing}")
     if track.notes is None or [note.frame for note in track.notes] != [row.frame for row in track.rows]:
         return write_page(path, track, why_not=f"No frames are shown: the run left no {NOTES} of its windows.")
-    errors = track.plot_data().errors
-    chosen = choose_frames(track.rows, errors)
     try:
-        shown = explain_frames(frames.flight, frames.matcher, track.rows, track.notes, chosen, errors)
+        shown = explain_frames(track, frames.flight, frames.matcher)
     except EngineError as error:
         return write_page(path, track, why_not=f"No frames are shown: {error}")
     return write_page(path, track, shown)

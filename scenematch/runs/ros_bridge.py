@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from engine.camera import Camera
 from engine.errors import BackendError, OptionError
 from engine.matching.matcher import SceneMatcher
-from engine.runtime.realtime import set_realtime
 from scenematch.bridges.ros import RosBridge, RosNode, RosStatus, RosTopics
 from scenematch.bridges.ros_out import RosOptions
 from scenematch.bridges.vehicle import NedOrigin
@@ -113,9 +112,7 @@ def run_ros_bridge(
         bridge = RosBridge(node, site, make_navigator, options, start, settings.live_options(), watch=watcher)
         progress.message(f"listening to {ros.topics.image}")
         try:
-            scheduling = settings.scheduling()
-            if scheduling is not None:  # this thread, too, may hold Python's lock
-                set_realtime(replace(scheduling, cores=()))  # a camera's command would inherit cores
+            settings.schedule_this_thread()
             report = status_reporter(lambda: bridge.status.line(), progress)
             with running_service() as beat, suppress(KeyboardInterrupt):  # the usual end, with its counts
 

@@ -133,7 +133,7 @@ TABLES = {
     "mavlink": ("scenematch.runs.mavlink_bridge", "MavlinkSettings", ("connect",)),
     "parameters": ("scenematch.runs.mavlink_parameters", "ParameterSettings", ()),
     "ros": ("scenematch.runs.ros_bridge", "RosSettings", ("map", "camera", "version", "arguments")),
-    "audit": ("scenematch.check.plan", "AuditOptions", ("ncc",)),
+    "audit": ("scenematch.check.plan", "AuditOptions", ()),
     "fetch": ("scenematch.runs.map_fetch", "FetchSettings", ("around", "source", "dry_run", "force")),
 }  # fmt: skip
 """Tables of a settings file besides those of :class:`TrackSettings`: module, class, and fields that are not
@@ -141,6 +141,12 @@ settings.
 
 A module is imported only when its table is used: fetching a map needs no torch.
 """
+
+
+def table_class(name: str) -> Any:
+    """The class of a table of :data:`TABLES`."""
+    module, kind, _ = TABLES[name]
+    return getattr(import_module(module), kind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,14 +215,13 @@ class Settings:
         Raises:
             OptionError: a name is unknown, or a value is invalid.
         """
-        module, kind, hidden = TABLES[name]
         values = self._values().get(name, {})
         if not isinstance(values, dict):
             raise OptionError(f"{name}: expected a table, got {values!r}")
-        for key in hidden:
+        for key in TABLES[name][2]:
             if key in values:
                 raise OptionError(f"{name}.{key}: not a setting")
-        return self._built(getattr(import_module(module), kind), values, name, given)
+        return self._built(table_class(name), values, name, given)
 
     def _built(self, cls: Any, values: Mapping[str, Any], within: str, given: Mapping[str, Any]) -> Any:
         given = {name: value for name, value in given.items() if value is not None}
@@ -243,8 +248,8 @@ class Settings:
 def documented_settings() -> str:
     """A settings file with every setting, its meaning and its default, all commented out."""
     texts = ["# Threads of torch and OpenCV.\n#threads = 1\n", settings_text(TrackSettings())]
-    for name, (module, kind, hidden) in TABLES.items():
-        cls = getattr(import_module(module), kind)
+    for name, (_, _, hidden) in TABLES.items():
+        cls = table_class(name)
         needed = {each.name: "" for each in fields(cls) if each.default is each.default_factory is MISSING}
         texts.append(settings_text(cls(**needed), name, hidden))
     return "\n".join(texts)

@@ -14,7 +14,7 @@ from engine.camera import Camera
 from engine.errors import OptionError
 from engine.values import Frame, Prior, Truth
 from scenematch.files.flight import write_flight_folder
-from scenematch.runs.arguments import check_choice
+from scenematch.runs.arguments import check_between, check_choice
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder
 from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.progress import SILENT, Progress
@@ -68,8 +68,7 @@ class WorldSettings:
             check_choice("condition", self.condition, tuple(CONDITIONS))
         if self.surface is not None and self.map is None:
             raise OptionError(f"surface: expected with `map` only, got {self.surface}")
-        if not 0.0 <= self.relief_m <= MAX_RELIEF_M:
-            raise OptionError(f"relief_m: expected 0 to {MAX_RELIEF_M:g}, got {self.relief_m:g}")
+        check_between("relief_m", self.relief_m, 0.0, MAX_RELIEF_M)
         if self.relief_m and self.map is not None:
             raise OptionError(
                 f"relief_m: expected without `map`, whose surface has its own, got {self.relief_m:g}"
@@ -134,10 +133,15 @@ def simulate(
 def write_flight(folder: StrPath, plan: FlightPlan, *, progress: Progress = SILENT) -> FlightFiles:
     """Write the simulated flight to disk like any other flight; it is then read back."""
     truth = plan.truth_rows()
-    names = [f"{index:06d}.jpg" for index in range(len(plan))]
-    frames = progress.track(zip(names, plan.iter_frames(), strict=True), len(plan), "flying")
+    named = ((picture_name(index), frame) for index, frame in enumerate(plan.iter_frames()))
+    frames = progress.track(named, len(plan), "flying")
     write_folder(folder, plan.town, plan.camera, frames, truth, truth[0].lat_deg, truth[0].lon_deg)
     return FlightFiles.in_folder(folder)
+
+
+def picture_name(index: int) -> str:
+    """The file name of a simulated picture."""
+    return f"{index:06d}.jpg"
 
 
 def write_folder(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from engine.errors import OptionError, TelemetryError
 from engine.matching import METHODS
@@ -55,7 +56,7 @@ def locate_image(
         OptionError: an argument is out of range.
         MapError, CalibrationError, TelemetryError: a file cannot be read, or does not fit another.
     """
-    known = {
+    known: dict[str, Any] = {
         "height_agl_m": height_agl_m, "heading_deg": heading_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg,
     }  # fmt: skip
     _check_numbers(known)
@@ -68,10 +69,7 @@ def locate_image(
     check_position("start", prior, site, OptionError)
     pixels = read_image(image)
     check_size(calibration, pixels.shape)
-    frame = Frame(
-        pixels, height_agl_m=height_agl_m, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg
-    )
-    return SceneMatcher(site, calibration, method, device, options).locate(frame, prior)
+    return SceneMatcher(site, calibration, method, device, options).locate(Frame(pixels, **known), prior)
 
 
 def _check_picture(file: Path) -> None:

@@ -13,7 +13,7 @@ from scenematch.files.export import WRITERS, PoseRow, pose_rows, segments, tum_r
 from scenematch.files.logs.readers import open_truth
 from scenematch.files.notes import read_notes
 from scenematch.files.track import TrackRow, read_track
-from scenematch.report.metrics import Ground, height_pairs_m, truth_per_row
+from scenematch.report.metrics import height_pairs_m, truth_per_row
 from scenematch.runs.arguments import check_choice
 from scenematch.runs.folders import StrPath, check_file
 from scenematch.runs.record import read_record
@@ -72,7 +72,7 @@ def _at_truth(folder: Path, track: list[TrackRow], path: Path) -> list[PoseRow]:
     Heights are in the datum of the surface model, as compared in ``summary.json``.
     """
     record = read_record(folder / SUMMARY)
-    ground, frame = Ground(record.ground_m, record.ground_amsl_m), LocalFrame(**record.origin)
+    ground, frame = record.ground, LocalFrame(**record.origin)
     fixes = [row for row in track if row.fixed]
     truth = open_truth(path, track[0].timestamp_ns)
     heights_m = height_pairs_m(fixes, truth, ground)[:, 1] + ground.ground_m

@@ -20,7 +20,6 @@ from scenematch.files.settings import changed
 from scenematch.files.telemetry import ground_amsl_m
 from scenematch.files.track import TrackRow, TrackWriter, read_track, track_row
 from scenematch.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
-from scenematch.report.metrics import Ground
 from scenematch.runs.arguments import parse_budget, parse_position
 from scenematch.runs.checking import as_rows, diagnose_flight
 from scenematch.runs.folders import StrPath, check_folder, prepare_folder
@@ -87,14 +86,13 @@ def track(
     frames = progress.track(flight, len(flight), description)
     with open_view(matcher, live_view) as view:
         attitude = _follow(frames, navigator, out, budget, use_priors=start is None, view=view)
-    ground = Ground(site.ground_m, ground_amsl_m(flight.rows))
     # From the rows in the file, so that evaluate gives the same figures.
     rows, shown = read_track(out / TRACK), ReportFrames(flight, matcher)
-    record = _record(files, settings, inputs, str(matcher.device), ground, attitude)
+    record = _record(files, settings, inputs, str(matcher.device), attitude)
     share = _fixed_share(rows)
     if diagnosis and settings.profile == "engine" and share < _CHECKED_SHARE:
         record = replace(record, diagnosis=_diagnosis(files, settings, inputs, share, progress))
-    return write_results(out, rows, inputs.truth, site, ground, record, shown, report=report, progress=progress)
+    return write_results(out, rows, inputs.truth, site, record, shown, report=report, progress=progress)
 
 
 def _fixed_share(rows: Sequence[TrackRow]) -> float:
@@ -118,12 +116,7 @@ def _diagnosis(
 
 
 def _record(
-    files: FlightFiles,
-    settings: TrackSettings,
-    inputs: FlightInputs,
-    device: str,
-    ground: Ground,
-    attitude: AttitudeCheck | None,
+    files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, device: str, attitude: AttitudeCheck | None
 ) -> RunRecord:
     """The record of a run, for summary.json."""
     given = files.flat() | {"truth": inputs.truth_path}
@@ -144,8 +137,8 @@ def _record(
         budget_ms=settings.budget_ms,
         changed=changed(settings),
         origin={"lat_deg": inputs.site.frame.lat_deg, "lon_deg": inputs.site.frame.lon_deg},
-        ground_m=ground.ground_m,
-        ground_amsl_m=ground.ground_amsl_m,
+        ground_m=inputs.site.ground_m,
+        ground_amsl_m=ground_amsl_m(inputs.flight.rows),
         surface_datum=inputs.site.surface_datum,
         attitude=None if attitude is None else asdict(attitude),
     )

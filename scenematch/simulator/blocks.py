@@ -94,11 +94,8 @@ def _park(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
     t = np.linspace(-0.5, 0.5, 40)
     for swing in (1, -1):
         wave = 0.22 * np.sin(t * rng.uniform(5, 9) + rng.uniform(0, 6)) + swing * t * 0.6
-        line = canvas.px(np.column_stack([u + t * du, v + wave * dv]))
-        points = [np.rint(line * 16).astype(np.int32)]
-        cv2.polylines(
-            canvas.rgb, points, False, canvas.tint((188, 172, 142)), round(2.6 / canvas.gsd), cv2.LINE_AA, 4
-        )
+        path = np.column_stack([u + t * du, v + wave * dv])
+        canvas.stroke(canvas.rgb, path, canvas.tint((188, 172, 142)), 2.6, cv2.LINE_AA)
     around = np.linspace(0, 2 * math.pi, 60)
     radius = dv * 0.19 * (1 + 0.2 * np.sin(2 * around + rng.uniform(0, 6)) + 0.1 * np.sin(5 * around))
     shore = np.column_stack([u + du * 0.2 + 1.5 * radius * np.cos(around), v + radius * np.sin(around)])

@@ -95,6 +95,21 @@ class Canvas:
         if busy:
             cv2.fillPoly(self.busy, [points], (255,), cv2.LINE_8, 4)
 
+    def stroke(
+        self, raster: Image, uv: Array, value: Colour | tuple[int], width_m: float, edges: int = cv2.LINE_8
+    ) -> None:
+        """Draw a line.
+
+        Args:
+            raster: (H, W, 3) colours, or (H, W) of something else.
+            uv: (N, 2) town coordinates along it.
+            value: what the raster holds on it.
+            width_m: of the line.
+            edges: how OpenCV draws its edges.
+        """
+        points = np.rint(self.px(uv) * 16.0).astype(np.int32)
+        cv2.polylines(raster, [points], False, value, round(width_m / self.gsd), edges, 4)
+
     def rect(
         self,
         u: float,

@@ -68,11 +68,6 @@ class Condition:
         """The air between camera and ground, None if perfectly clear."""
         return None if math.isinf(self.visibility_m) else Atmosphere(self.visibility_m, self.air_rgb)
 
-    @property
-    def changes_ground(self) -> bool:
-        """Whether the season changes the drawn colours."""
-        return bool(self.snow or self.leaves < 1.0 or self.turned or self.dry)
-
     def sensor(self, sensor: Sensor) -> Sensor:
         """The camera's sensor on this day."""
         return sensor if self.noise == 1.0 else replace(sensor, noise_sd=self.noise * sensor.noise_sd)
@@ -158,32 +153,26 @@ def apply_season(
     Returns:
         (H, W, 3) uint8 colours and (H, W) heights.
     """
-    if not condition.changes_ground:
+    if not (condition.snow or condition.leaves < 1.0 or condition.turned or condition.dry):
         return albedo, height_m
     ground = np.zeros_like(height_m) if ground_m is None else ground_m
     rgb, height, kind = albedo.astype(np.float32), height_m.copy(), material.copy()
     large, small = (_noise(rng, kind.shape, m / gsd_m_per_px) for m in (14.0, 1.4))
     grain = _noise(rng, kind.shape, 0.45 / gsd_m_per_px)
     _wither(rgb, kind, condition, large, rng, gsd_m_per_px)
-    _shed(rgb, height, kind, ground, condition, grain, small)
+    _shed(rgb, height, kind, ground, condition.leaves, grain, small)
     if condition.snow:
         _cover_with_snow(rgb, kind, condition.snow, large, small)
     return np.clip(rgb, 0, 255).astype(np.uint8), height
 
 
 def _shed(
-    rgb: Float32,
-    height: Float32,
-    kind: Image,
-    ground: Float32,
-    condition: Condition,
-    grain: Float32,
-    small: Float32,
+    rgb: Float32, height: Float32, kind: Image, ground: Float32, leaves: float, grain: Float32, small: Float32
 ) -> None:
     """Open the crowns of trees by their share of leaves: bare ground between branches, in place."""
-    bare = (kind == CANOPY) & (0.5 + 0.29 * grain + 0.12 * small > condition.leaves)
-    if condition.leaves < 0.5:  # a bare tree shows only wood
-        wood = ((kind == CANOPY) & ~bare).astype(np.float32) * np.float32(0.85 * (1.0 - condition.leaves))
+    bare = (kind == CANOPY) & (0.5 + 0.29 * grain + 0.12 * small > leaves)
+    if leaves < 0.5:  # a bare tree shows only wood
+        wood = ((kind == CANOPY) & ~bare).astype(np.float32) * np.float32(0.85 * (1.0 - leaves))
         _mix(rgb, np.array(_BARK_RGB, np.float32), wood)
         height[wood > 0] = ground[wood > 0] + np.float32(0.65) * (height - ground)[wood > 0]
     rgb[bare] = np.array(_LITTER_RGB, np.float32) * (1.0 + 0.08 * small[bare][:, None])

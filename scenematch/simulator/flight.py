@@ -249,13 +249,6 @@ def _waypoints(town: Town, camera: Camera, height_m: float, rng: np.random.Gener
     return np.asarray(square - np.sign(square) * rng.uniform(0.0, 6.0, square.shape))
 
 
-def _check_frames(frames: int | None, rate_hz: float) -> None:
-    if frames is not None and frames < 1:
-        raise OptionError(f"frames: expected 1 or more, got {frames}")
-    if not (math.isfinite(rate_hz) and rate_hz > 0):
-        raise OptionError(f"rate_hz: expected above 0, got {rate_hz}")
-
-
 def _sways(motion: Motion, time_s: Array) -> tuple[ExposureMotion, ...]:
     """Velocity and turn rate at each time, by central differences over one step of the motion."""
     before, now, after = (motion.at(time_s + step) for step in (-COURSE_STEP_S, 0.0, COURSE_STEP_S))
@@ -317,7 +310,10 @@ def plan_flight(
     Raises:
         OptionError: an argument is out of range, or the map is too small for the height.
     """
-    _check_frames(frames, rate_hz)
+    if frames is not None and frames < 1:
+        raise OptionError(f"frames: expected 1 or more, got {frames}")
+    if not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise OptionError(f"rate_hz: expected above 0, got {rate_hz}")
     style, camera = style or FlightStyle(), camera or paper_camera()
     town = town or build_town(seed, **town_options)
     motion, origin = _fly_over(town, camera, style, generator(seed, 0xF1))

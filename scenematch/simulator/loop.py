@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.geo import Array, attitude_from_rotation
 from engine.navigation.navigator import Matcher, Navigator
@@ -38,6 +37,7 @@ from scenematch.simulator.ekf import (
 )
 from scenematch.simulator.faults import Fault, ShiftedMap
 from scenematch.simulator.history import History
+from scenematch.simulator.light import Image
 from scenematch.simulator.pilot import Gains, Pilot, Route, Setpoint
 from scenematch.simulator.quadrotor import STEP_S, Airframe, State, Wind, WindField, advance, hovering, shaken
 from scenematch.simulator.sensors import Instruments, SensorSuite, steps_between
@@ -54,7 +54,6 @@ __all__ = [
     "fly_closed_loop",
 ]
 
-Image = NDArray[np.uint8]
 RenderCallback = Callable[[State], Image]
 """Returns the camera's picture at a state of the vehicle."""
 

@@ -224,12 +224,7 @@ def _row_rays(
 
 
 def _resampled(
-    world: World,
-    camera: Camera,
-    grid_m: tuple[float, float],
-    up_m: float,
-    attitude: Attitude,
-    rays: list[Float32],
+    world: World, camera: Camera, grid_m: tuple[float, float], up_m: float, attitude: Attitude, rays: list[Float32]
 ) -> Image:
     """The mean of the pictures along all rays, resampled from one sharp pinhole picture that contains them all."""
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]

@@ -92,7 +92,10 @@ class Rays:
         Returns:
             Right and down, (H, W) each.
         """
-        scale = 1.0 / (np.maximum(self._at(self.ahead), self._sky_drop) if self.sees_sky else self._at(self.ahead))
+        fall = self._at(self.ahead)
+        if self.sees_sky:
+            fall = np.maximum(fall, np.maximum(self._away / math.tan(math.radians(FAR_DEG)), 1e-9))
+        scale = 1.0 / fall
         right, down = (self._at(row) * scale for row in self.reach)
         return right.astype(np.float32), down.astype(np.float32)
 
@@ -125,11 +128,6 @@ class Rays:
             return 0
         ground = (self.sky_share() < 1.0).any(axis=1)
         return int(ground.argmax()) if ground.any() else 0
-
-    @property
-    def _sky_drop(self) -> Array:
-        """(H, W) metres that each ray would descend at the angle where the sky begins."""
-        return np.maximum(self._away / math.tan(math.radians(FAR_DEG)), 1e-9)
 
     @property
     def _away(self) -> Array:

@@ -65,7 +65,7 @@ class Compass:
     bias_deg: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_rate(self)
+        check_positive(self, *self.__dataclass_fields__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,12 +88,7 @@ class Barometer:
     drift_time_s: float = 200.0
 
     def __post_init__(self) -> None:
-        _check_rate(self)
-
-
-def _check_rate(sensor: Compass | Barometer) -> None:
-    check_positive(sensor, *sensor.__dataclass_fields__)
-    steps_between(sensor.rate_hz)
+        check_positive(self, *self.__dataclass_fields__)
 
 
 def steps_between(rate_hz: float) -> int:

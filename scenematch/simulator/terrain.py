@@ -81,14 +81,12 @@ def draw_river(canvas: Canvas, rng: np.random.Generator) -> Image:
     swing = rng.uniform(26.0, 44.0) * np.sin(along / rng.uniform(70.0, 110.0) + rng.uniform(0, 6))
     # It keeps away from the centre, where the square and the park are.
     line = np.column_stack([along, swing + 0.12 * along + rng.choice([-1, 1]) * rng.uniform(45.0, 95.0)])
-    points = [np.rint(canvas.px(line) * 16.0).astype(np.int32)]
     water = np.zeros(canvas.shape, np.uint8)
     bank, path, shore, deep = (104, 118, 72), (172, 160, 136), (120, 112, 94), (58, 76, 76)
     for extra, colour in ((13.0, bank), (6.0, path), (2.0, shore), (0.0, deep)):
-        thick = round((width + extra) / canvas.gsd)
-        cv2.polylines(canvas.rgb, points, False, canvas.tint(colour, 4.0), thick, cv2.LINE_AA, 4)
-    cv2.polylines(canvas.busy, points, False, (255,), round((width + 9.0) / canvas.gsd), cv2.LINE_8, 4)
-    cv2.polylines(water, points, False, (255,), round(width / canvas.gsd), cv2.LINE_8, 4)
+        canvas.stroke(canvas.rgb, line, canvas.tint(colour, 4.0), width + extra, cv2.LINE_AA)
+    canvas.stroke(canvas.busy, line, (255,), width + 9.0)
+    canvas.stroke(water, line, (255,), width)
     canvas.material[water > 0] = WATER
     # Shallows along the banks are lighter than the middle.
     depth = np.clip(cv2.distanceTransform(water, cv2.DIST_L2, 3) * canvas.gsd / 7.0, 0.0, 1.0)

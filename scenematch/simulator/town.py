@@ -20,7 +20,7 @@ from engine.orthomap import OrthoMap
 from scenematch.simulator.blocks import fill_blocks
 from scenematch.simulator.canvas import ASPHALT, CANOPY, CROP, PAVING, ROOF, WATER, Canvas, Colour
 from scenematch.simulator.conditions import CONDITIONS, Condition, apply_season, condition_by_name
-from scenematch.simulator.light import Array, Float32, Image, Light, illuminate
+from scenematch.simulator.light import Array, Float32, Image, illuminate
 from scenematch.simulator.optics import Sensor
 from scenematch.simulator.render import Glint, World, transformer
 from scenematch.simulator.terrain import draw_river, hills, raise_by_ground
@@ -103,15 +103,13 @@ def _streets(canvas: Canvas) -> tuple[list[float], list[float], list[tuple[Array
     crossings = np.zeros(canvas.shape, np.uint8)
     for extra, colour, material in ((5.0, (148, 145, 138), PAVING), (0.0, (92, 93, 96), ASPHALT)):
         for line, width in roads:
-            points = [np.rint(canvas.px(line) * 16).astype(np.int32)]
-            thick = round((width + extra) / canvas.gsd)
-            shade = canvas.tint(colour, 5.0)
-            cv2.polylines(canvas.rgb, points, False, shade, thick, cv2.LINE_AA, 4)
-            for raster, value in ((canvas.material, material), (canvas.busy, 255)):
-                cv2.polylines(raster, points, False, (value,), thick, cv2.LINE_8, 4)
+            canvas.stroke(canvas.rgb, line, canvas.tint(colour, 5.0), width + extra, cv2.LINE_AA)
+            canvas.stroke(canvas.material, line, (material,), width + extra)
+            canvas.stroke(canvas.busy, line, (255,), width + extra)
             if material == ASPHALT:
                 one = np.zeros_like(crossings)
-                cv2.polylines(one, points, False, (1,), thick + round(7 / canvas.gsd), cv2.LINE_8, 4)
+                reach_px = round(width / canvas.gsd) + round(7 / canvas.gsd)
+                canvas.stroke(one, line, (1,), reach_px * canvas.gsd)
                 cv2.add(crossings, one, crossings)
     for line, width in roads:
         _markings(canvas, line, width, crossings)
@@ -189,12 +187,6 @@ def _georeference(width_px: int, height_px: int, gsd: float) -> Array:
     return np.array([[gsd, 0.0, corner[0]], [0.0, -gsd, corner[1]]], dtype=np.float64)
 
 
-def _check_size(width_px: int, height_px: int, gsd: float) -> None:
-    if width_px < 16 or height_px < 16 or not 0.1 <= gsd <= 5.0:
-        got = f"{width_px} x {height_px} at {gsd}"
-        raise OptionError(f"town: expected 16 px or more at 0.1 to 5 m/px, got {got}")
-
-
 def _lamp_light(canvas: Canvas, roads: list[tuple[Array, float]]) -> Float32:
     """Light (H, W) in [0, 1] of lamps every 27 m on alternating sides, on everything lower than a lamp."""
     pools = np.zeros(canvas.shape, np.float32)
@@ -251,23 +243,18 @@ def _rebuilt(drawn: _Drawn, changed: float, rng: np.random.Generator) -> _Drawn:
 
 
 def _draw(
-    rng: np.random.Generator,
-    size: tuple[int, int],
-    gsd: float,
-    light: Light,
-    relief_m: float,
-    river_rng: np.random.Generator | None,
-    hill_rng: np.random.Generator,
+    canvas: Canvas, relief_m: float, river_rng: np.random.Generator | None, hill_rng: np.random.Generator
 ) -> _Drawn:
     """Streets, blocks and cars on a canvas, and the hills below them."""
-    canvas = Canvas(rng, size, gsd, light)
     river = None if river_rng is None else draw_river(canvas, river_rng)
     edges_u, edges_v, roads = _streets(canvas)
     fill_blocks(canvas, edges_u, edges_v)
     canvas.texture()
     then, today = _park_cars(canvas, roads)
     lamps = _lamp_light(canvas, roads) * (canvas.height < LAMP_M)
-    ground = raise_by_ground(canvas, hills(size, gsd, relief_m, hill_rng), river) if relief_m else None
+    ground = None
+    if relief_m:
+        ground = raise_by_ground(canvas, hills(canvas.shape, canvas.gsd, relief_m, hill_rng), river)
     height, material = canvas.height, canvas.material
     return _Drawn(canvas, _Day(then, height, material), _Day(today, height, material), ground, lamps)
 
@@ -321,36 +308,27 @@ def build_town(
     Raises:
         OptionError: an argument is out of range.
     """
-    _check_size(width_px, height_px, gsd_m_per_px)
+    if width_px < 16 or height_px < 16 or not 0.1 <= gsd_m_per_px <= 5.0:
+        got = f"{width_px} x {height_px} at {gsd_m_per_px}"
+        raise OptionError(f"town: expected 16 px or more at 0.1 to 5 m/px, got {got}")
     if not 0.0 <= relief_m <= MAX_RELIEF_M:
         raise OptionError(f"relief_m: expected 0 to {MAX_RELIEF_M:g}, got {relief_m}")
     if not 0.0 <= changed <= 1.0:
         raise OptionError(f"changed: expected 0 to 1, got {changed}")
-    days = condition_by_name(condition), condition_by_name(map_condition)
-    return _built(seed, (width_px, height_px), gsd_m_per_px, days, (relief_m, river, changed))
-
-
-def _built(
-    seed: int,
-    map_px: tuple[int, int],
-    gsd: float,
-    days: tuple[Condition, Condition],
-    site: tuple[float, bool, float],
-) -> Town:
-    """The town from checked arguments: days of the frames and the map, relief, river and changed share."""
-    (width, height), (today, surveyed), (relief_m, river, changed) = map_px, days, site
-    fine = max(1, round(gsd / 0.265))
-    margin = math.ceil(MARGIN_M / gsd)
-    size = ((height + 2 * margin) * fine, (width + 2 * margin) * fine)
+    today, surveyed = condition_by_name(condition), condition_by_name(map_condition)
+    fine = max(1, round(gsd_m_per_px / 0.265))
+    margin = math.ceil(MARGIN_M / gsd_m_per_px)
+    size = ((height_px + 2 * margin) * fine, (width_px + 2 * margin) * fine)
     rng, water_rng = generator(seed, 0x70), generator(seed, 0x71) if river else None
-    drawn = _draw(rng, size, gsd / fine, today.light, relief_m, water_rng, generator(seed, 0x72))
+    canvas = Canvas(rng, size, gsd_m_per_px / fine, today.light)
+    drawn = _draw(canvas, relief_m, water_rng, generator(seed, 0x72))
     if changed:
         drawn = _rebuilt(drawn, changed, generator(seed, 0x75))
     inner = (slice(margin * fine, -margin * fine),) * 2
     then, heights = _lit(drawn, drawn.then, surveyed, generator(seed, 0x73))
     ortho, surface = MAP_SENSOR.develop(_shrink(then[inner], fine), rng), _shrink(heights[inner], fine)
-    to_crs = _georeference(width, height, gsd)
+    to_crs = _georeference(width_px, height_px, gsd_m_per_px)
     first = -margin - 0.5 + 0.5 / fine
     fine_to_crs = np.column_stack([to_crs[:, :2] / fine, to_crs @ (first, first, 1.0)])
     world = _world(drawn, today, fine_to_crs, generator(seed, 0x74))
-    return Town(ortho, surface, to_crs, CRS_EPSG, gsd, world, today)
+    return Town(ortho, surface, to_crs, CRS_EPSG, gsd_m_per_px, world, today)

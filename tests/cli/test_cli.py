@@ -215,7 +215,8 @@ def test_a_budget_that_cannot_be_met_refuses_and_says_so(flight, tmp_path, capsy
 def test_demo_prints_table_one_in_80_columns_and_keeps_every_run(tmp_path, capsys):
     out = tmp_path / "demo"
     assert run(["demo", "--frames=2", f"--out={out}"]) == 0
-    printed = capsys.readouterr().out
+    printed, said = capsys.readouterr()
+    assert Path(said.partition("next: open ")[2].partition(";")[0]).is_file()  # the report that it names
     assert max(map(len, printed.splitlines())) <= 80
     for row in ("NCC, as published", "NCC, paper's recipe", "SIFT, scenematch"):
         assert row in printed

@@ -16,14 +16,12 @@ from scenematch.cli.options import (
     MAP,
     OUTPUT,
     CameraOptions,
-    DeviceOption,
     ForceOption,
     JsonOption,
     MapOptions,
-    MethodOption,
+    MatchingOptions,
     RerunOption,
     SettingsOption,
-    StartOption,
     SurfaceOption,
     flag,
     live_view,
@@ -42,20 +40,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class LinkOptions:
-    """The autopilot."""
+    """The autopilot.
 
-    connect: Annotated[
-        str | None,
-        option(
-            "--connect",
-            "LINK",
-            "udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
-            INPUT,
-        ),
-    ] = None
-    firmware: Annotated[
-        str | None, option("--firmware", "ardupilot|px4", "Firmware of the autopilot (default: ardupilot).", INPUT)
-    ] = None
+    Attributes:
+        connect: udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.
+        firmware: Firmware of the autopilot (default: ardupilot).
+    """
+
+    connect: Annotated[str | None, option("--connect", "LINK", INPUT)] = None
+    firmware: Annotated[str | None, option("--firmware", "ardupilot|px4", INPUT)] = None
 
     def link(self, settings: Settings) -> MavlinkSettings:
         """How to reach it and what to send."""
@@ -65,54 +58,28 @@ class LinkOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions(CameraOptions):
-    """The camera, or recorded pictures."""
+    """The camera, or recorded pictures.
 
-    frames: Annotated[
-        Path | None, option("--frames", "DIR|VIDEO", "Recorded pictures, replayed in real time.", INPUT)
-    ] = None
-    telemetry: Annotated[
-        Path | None,
-        option(
-            "--telemetry",
-            "FILE",
-            "telemetry.csv that times the replay (default: the video's own timestamps).",
-            INPUT,
-        ),
-    ] = None
-    camera_source: Annotated[
-        str | None,
-        option("--camera-source", "N|URL|exec:CMD", "A camera, a stream, or a command that writes JPEGs.", INPUT),
-    ] = None
+    Attributes:
+        frames: Recorded pictures, replayed in real time.
+        telemetry: telemetry.csv that times the replay (default: the video's own timestamps).
+        camera_source: A camera, a stream, or a command that writes JPEGs.
+    """
 
-
-@dataclass(frozen=True, kw_only=True)
-class MatchingOptions:
-    """How frames are matched."""
-
-    start: StartOption = None
-    method: MethodOption = None
-    device: DeviceOption = None
-
-    def bridge_settings(self, settings: Settings) -> BridgeSettings:
-        """The options combined with the settings."""
-        how = settings.track(method=self.method, device=self.device, start=self.start)
-        made: BridgeSettings = table(
-            settings,
-            "bridge",
-            method=how.method,
-            device=how.device,
-            start=how.start,
-            matcher=how.matcher_options(),
-            navigator=how.navigator,
-        )
-        return made
+    frames: Annotated[Path | None, option("--frames", "DIR|VIDEO", INPUT)] = None
+    telemetry: Annotated[Path | None, option("--telemetry", "FILE", INPUT)] = None
+    camera_source: Annotated[str | None, option("--camera-source", "N|URL|exec:CMD", INPUT)] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class OptionalMapOptions:
-    """The map, needed only to send fixes."""
+    """The map, needed only to send fixes.
 
-    map: Annotated[Path | None, option("--map", "FILE", "GeoTIFF, or a picture with a world file.", MAP)] = None
+    Attributes:
+        map: GeoTIFF, or a picture with a world file.
+    """
+
+    map: Annotated[Path | None, option("--map", "FILE", MAP)] = None
     surface: SurfaceOption = None
 
     def map_input(self, settings: Settings) -> MapInput:
@@ -124,15 +91,24 @@ class OptionalMapOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class OtherWork:
-    """What to do instead of sending fixes."""
+    """What to do instead of sending fixes.
 
-    out: Annotated[
-        Path | None,
-        option("--write-params", "FILE", "Write the autopilot's parameters for these fixes, then exit.", OUTPUT),
-    ] = None
-    measure_delay: Annotated[bool, flag("--measure-delay", "Measure the camera's latency, then exit.", OUTPUT)] = (
-        False
-    )
+    Attributes:
+        out: Write the autopilot's parameters for these fixes, then exit.
+        measure_delay: Measure the camera's latency, then exit.
+    """
+
+    out: Annotated[Path | None, option("--write-params", "FILE", OUTPUT)] = None
+    measure_delay: Annotated[bool, flag("--measure-delay", OUTPUT)] = False
+
+
+def _bridge_settings(matching: MatchingOptions, settings: Settings) -> BridgeSettings:
+    """How a bridge matches frames: the options combined with the settings."""
+    how = matching.track_settings(settings)
+    matcher = how.matcher_options()
+    same = {name: getattr(how, name) for name in ("method", "device", "start", "navigator")}
+    made: BridgeSettings = table(settings, "bridge", **same, matcher=matcher)
+    return made
 
 
 @with_options
@@ -142,10 +118,7 @@ def mavlink(
     matching: MatchingOptions,
     site: OptionalMapOptions,
     other: OtherWork,
-    supervise: Annotated[
-        bool,
-        flag("--supervise", "Keep a loaded standby process that takes over if the worker dies.", EXPERT),
-    ] = False,
+    supervise: Annotated[bool, flag("--supervise", EXPERT)] = False,
     settings: SettingsOption = None,
     rerun: RerunOption = None,
     force: ForceOption = False,
@@ -157,6 +130,9 @@ def mavlink(
     sends fixes until the pictures end. --write-params only writes the parameter file with which ArduPilot or PX4
     uses these fixes. --measure-delay measures the camera's latency: tilt the vehicle to and fro by hand while it
     compares the rotation in the pictures with the autopilot's attitude.
+
+    Options:
+        supervise: Keep a loaded standby process that takes over if the worker dies.
     """
     given, hint = read_settings(settings), ""
     if other.out is not None:
@@ -193,7 +169,7 @@ def _bridge(
         camera_source=pictures.camera_source,
         **table(given, "input").of(BridgeFiles),
     )
-    link, how = autopilot.link(given), matching.bridge_settings(given)
+    link, how = autopilot.link(given), _bridge_settings(matching, given)
     status = run_mavlink_bridge(files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {link.connect}")
     flown = console.options(
@@ -242,31 +218,10 @@ def ros(
     site: MapOptions,
     lens: CameraOptions,
     matching: MatchingOptions,
-    ros_arguments: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="NAME:=VALUE", help="ROS remaps; for ROS 2 after --ros-args, which also takes parameters."
-        ),
-    ] = None,
-    version: Annotated[int, option("--ros", "1|2", "rospy or rclpy.", INPUT)] = 2,
-    image: Annotated[
-        str | None,
-        option(
-            "--image-topic",
-            "NAME",
-            "Image topic, raw or compressed; set other topics by --settings ros.topics.imu=NAME.",
-            INPUT,
-        ),
-    ] = None,
-    firmware: Annotated[
-        str | None,
-        option(
-            "--firmware",
-            "none|ardupilot|px4",
-            "Autopilot behind MAVROS that receives the poses (default: none).",
-            INPUT,
-        ),
-    ] = None,
+    ros_arguments: Annotated[list[str] | None, typer.Argument(metavar="NAME:=VALUE")] = None,
+    version: Annotated[int, option("--ros", "1|2", INPUT)] = 2,
+    image: Annotated[str | None, option("--image-topic", "NAME", INPUT)] = None,
+    firmware: Annotated[str | None, option("--firmware", "none|ardupilot|px4", INPUT)] = None,
     settings: SettingsOption = None,
     rerun: RerunOption = None,
     as_json: JsonOption = False,
@@ -275,6 +230,12 @@ def ros(
 
     Subscribes to images, attitude and height; publishes poses, fixes, diagnostics and the searched window. Leave a
     topic out by giving it an empty name.
+
+    Options:
+        ros_arguments: ROS remaps; for ROS 2 after --ros-args, which also takes parameters.
+        version: rospy or rclpy.
+        image: Image topic, raw or compressed; set other topics by --settings ros.topics.imu=NAME.
+        firmware: Autopilot behind MAVROS that receives the poses (default: none).
     """
     from dataclasses import replace
 
@@ -292,7 +253,7 @@ def ros(
     )
     if image is not None:
         node = replace(node, topics=replace(node.topics, image=image))
-    how = matching.bridge_settings(given)
+    how = _bridge_settings(matching, given)
     status = run_ros_bridge(node, how, live_view=live_view(rerun), progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"ROS {version} on {node.topics.image}")
     flown = console.options(map=site.map, surface=site.surface)

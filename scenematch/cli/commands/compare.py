@@ -23,10 +23,7 @@ from scenematch.cli.options import (
 def compare(
     flight: FlightOptions,
     out: OutOption,
-    runs: Annotated[
-        list[str] | None,
-        option("--run", "METHOD[/PROFILE]|FILE", "One run; repeat for more (default: the paper's Table I)."),
-    ] = None,
+    runs: Annotated[list[str] | None, option("--run", "METHOD[/PROFILE]|FILE")] = None,
     start: StartOption = None,
     settings: SettingsOption = None,
     force: ForceOption = False,
@@ -36,6 +33,9 @@ def compare(
 
     Tracks the flight once per run, each into its own folder, and compares the runs in one table and on one page.
     --settings applies to all runs; a run's own file takes precedence.
+
+    Options:
+        runs: One run; repeat for more (default: the paper's Table I).
     """
     from scenematch.runs.comparison import compare as compare_runs
     from scenematch.runs.comparison import parse_runs

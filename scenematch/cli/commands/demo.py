@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 from scenematch.cli import console, tables
-from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, option, use_threads
+from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, option, use_threads, with_options
 
 
+@with_options
 def demo(
-    out: Annotated[Path, option("--out", "DIR", "Report folder.", OUTPUT)] = Path("demo-report"),
-    frames: Annotated[int | None, option("--frames", "N", "Fly only the first N frames.", min=2)] = None,
-    seed: Annotated[int, option("--seed", "N", "Number of the generated town and flight.", min=0)] = 1,
+    out: Annotated[Path, option("--out", "DIR", OUTPUT)] = Path("demo-report"),
+    frames: Annotated[int | None, option("--frames", "N", min=2)] = None,
+    seed: Annotated[int, option("--seed", "N", min=0)] = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -20,6 +21,11 @@ def demo(
 
     Generates a town and the paper's flight over it, tracks it by NCC and SIFT, each with the paper's recipe and
     with this engine's, and prints the results beside the paper's Table I. Needs no data.
+
+    Options:
+        out: Report folder.
+        frames: Fly only the first N frames.
+        seed: Number of the generated town and flight.
     """
     from scenematch.runs.demo import run_demo
 
@@ -31,5 +37,5 @@ def demo(
         tables.print_paper_table(results, seed)
     console.say(f"report: {out.resolve()}")
     console.next_step(
-        "check --map MAP --frames FRAMES", as_json=as_json, hint=f"open {out}/ncc-scenematch/report.html"
+        "check --map MAP --frames FRAMES", as_json=as_json, hint=f"open {out}/ncc-engine/report.html"
     )

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from scenematch.cli import console
-from scenematch.cli.options import OUTPUT, JsonOption, flag
+from scenematch.cli.options import OUTPUT, JsonOption, flag, with_options
 
 _DISTRIBUTION = "scenematch-engine"  # "scenematch" on PyPI is another project
 _DEVELOPERS = ("test", "bench", "docs", "dev")
@@ -28,13 +28,14 @@ _HEAD = """\
 """
 
 
-def doctor(
-    settings: Annotated[bool, flag("--settings", "Print a settings file with every setting.", OUTPUT)] = False,
-    as_json: JsonOption = False,
-) -> None:
+@with_options
+def doctor(settings: Annotated[bool, flag("--settings", OUTPUT)] = False, as_json: JsonOption = False) -> None:
     """Show versions, devices and missing packages.
 
     --settings prints the file that other commands take as --settings FILE: every setting with unit and default.
+
+    Options:
+        settings: Print a settings file with every setting.
     """
     if settings:
         from scenematch.runs.settings import documented_settings

@@ -9,17 +9,14 @@ import typer
 
 from engine.errors import OptionError
 from scenematch.cli import console, tables
-from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, after_track, option
+from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, after_track, option, with_options
 
 
+@with_options
 def evaluate(
-    runs: Annotated[list[Path], typer.Argument(metavar="DIR", help="Output folders of track.")],
-    truth: Annotated[
-        Path | None, option("--truth", "FILE", "truth.csv, log or photographs (default: the one that track used).")
-    ] = None,
-    out: Annotated[
-        Path | None, option("--out", "FILE", "Page that compares several runs (default: comparison.html).", OUTPUT)
-    ] = None,
+    runs: Annotated[list[Path], typer.Argument(metavar="DIR")],
+    truth: Annotated[Path | None, option("--truth", "FILE")] = None,
+    out: Annotated[Path | None, option("--out", "FILE", OUTPUT)] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -27,6 +24,11 @@ def evaluate(
 
     For one run: prints the errors and rewrites summary.json and report.html in its folder. For several: draws one
     page with all tracks on one map and one time axis, and a table.
+
+    Options:
+        runs: Output folders of track.
+        truth: truth.csv, log or photographs (default: the one that track used).
+        out: Page that compares several runs (default: comparison.html).
     """
     from scenematch.runs.evaluation import evaluate as evaluate_track
     from scenematch.runs.evaluation import recorded_files

@@ -8,25 +8,27 @@ from typing import Annotated
 import typer
 
 from scenematch.cli import console
-from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, option
+from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, option, with_options
 
 
+@with_options
 def export(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of track.")],
-    kind: Annotated[str, option("--format", "gpx|geojson|tum", "What is written.")],
-    out: Annotated[
-        Path | None, option("--out", "FILE", "File to write (default: track.FORMAT in DIR).", OUTPUT)
-    ] = None,
-    truth: Annotated[
-        Path | None,
-        option("--truth", "FILE", "Export this reference at the times of the fixes instead of the track."),
-    ] = None,
+    directory: Annotated[Path, typer.Argument(metavar="DIR")],
+    kind: Annotated[str, option("--format", "gpx|geojson|tum")],
+    out: Annotated[Path | None, option("--out", "FILE", OUTPUT)] = None,
+    truth: Annotated[Path | None, option("--truth", "FILE")] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Export a finished track as GPX, GeoJSON or TUM.
 
     Refused frames leave gaps. Times of day are written only if the frames' timestamps are UTC.
+
+    Options:
+        directory: Output folder of track.
+        kind: What is written.
+        out: File to write (default: track.FORMAT in DIR).
+        truth: Export this reference at the times of the fixes instead of the track.
     """
     from scenematch.runs.track_export import export_track
 

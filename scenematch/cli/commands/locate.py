@@ -11,12 +11,10 @@ import typer
 from scenematch.cli import console
 from scenematch.cli.options import (
     CameraOptions,
-    DeviceOption,
     JsonOption,
     MapOptions,
-    MethodOption,
+    MatchingOptions,
     SettingsOption,
-    StartOption,
     option,
     read_settings,
     with_options,
@@ -28,28 +26,34 @@ if TYPE_CHECKING:
 
 @with_options
 def locate(
-    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="One picture.")],
+    image: Annotated[Path, typer.Argument(metavar="IMAGE")],
     site: MapOptions,
     lens: CameraOptions,
-    height_agl_m: Annotated[float | None, option("--height-agl", "M", "Metres above the ground.")] = None,
-    heading_deg: Annotated[float | None, option("--heading", "DEG", "Degrees clockwise from true north.")] = None,
-    roll_deg: Annotated[float | None, option("--roll", "DEG", "Degrees, right side down.")] = None,
-    pitch_deg: Annotated[float | None, option("--pitch", "DEG", "Degrees, nose up.")] = None,
-    start: StartOption = None,
-    method: MethodOption = None,
-    device: DeviceOption = None,
+    *,
+    height_agl_m: Annotated[float | None, option("--height-agl", "M")] = None,
+    heading_deg: Annotated[float | None, option("--heading", "DEG")] = None,
+    roll_deg: Annotated[float | None, option("--roll", "DEG")] = None,
+    pitch_deg: Annotated[float | None, option("--pitch", "DEG")] = None,
+    matching: MatchingOptions,
     settings: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find one picture on the map.
 
     Prints the fix and exits with 0, or prints why there is none and exits with 1.
+
+    Options:
+        image: One picture.
+        height_agl_m: Metres above the ground.
+        heading_deg: Degrees clockwise from true north.
+        roll_deg: Degrees, right side down.
+        pitch_deg: Degrees, nose up.
     """
     from engine.values import Fix
     from scenematch.runs.single_image import locate_image
 
     given = read_settings(settings)
-    how = given.track(method=method, device=device, start=start)
+    how = matching.track_settings(given)
     result = locate_image(
         image,
         site.map_input(given),
@@ -75,30 +79,16 @@ def locate(
 
 
 def _fix_facts(fix: Fix, as_json: bool) -> dict[str, Any]:
-    facts = {
-        "status": "fix",
-        "lat_deg": fix.lat_deg,
-        "lon_deg": fix.lon_deg,
-        "east_m": fix.east_m,
-        "north_m": fix.north_m,
-        "up_m": fix.up_m,
-        "sigma_m": fix.sigma_m,
-        "score": fix.score,
-        "method": fix.method,
-        "map_xy_px": list(fix.map_xy_px),
-    }
+    places = ("lat_deg", "lon_deg", "east_m", "north_m", "up_m", "sigma_m")
+    names = (*places, "score", "method", "map_xy_px")
+    facts = {"status": "fix"} | {name: getattr(fix, name) for name in names}
     if as_json:
         facts["covariance_m2"] = fix.covariance_m2.tolist()
         facts["attitude"] = None if fix.attitude is None else asdict(fix.attitude)
-        facts["attitude_sigma_deg"] = None if fix.attitude_sigma_deg is None else list(fix.attitude_sigma_deg)
+        facts["attitude_sigma_deg"] = fix.attitude_sigma_deg
     return facts
 
 
 def _no_fix_facts(refusal: NoFix) -> dict[str, Any]:
-    return {
-        "status": "no_fix",
-        "reason": refusal.reason.value,
-        "detail": refusal.detail,
-        "score": refusal.score,
-        "method": refusal.method,
-    }
+    facts = {"status": "no_fix", "reason": refusal.reason.value, "detail": refusal.detail}
+    return facts | {"score": refusal.score, "method": refusal.method}

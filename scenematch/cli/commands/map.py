@@ -28,22 +28,22 @@ from scenematch.cli.options import (
 MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")]
 
 
+@with_options
 def info(
     map_path: MapArgument,
     surface: SurfaceOption = None,
-    map_bounds: Annotated[
-        str | None,
-        option(
-            "--map-bounds", "W,S,E,N", "Bounds of a picture without georeference, in degrees or in --map-crs.", MAP
-        ),
-    ] = None,
-    map_crs: Annotated[str | None, option("--map-crs", "EPSG:N", "CRS, if the map names none.", MAP)] = None,
+    map_bounds: Annotated[str | None, option("--map-bounds", "W,S,E,N", MAP)] = None,
+    map_crs: Annotated[str | None, option("--map-crs", "EPSG:N", MAP)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show size, ground sample distance, CRS and bounds.
 
     For a picture without georeference --map-bounds and --map-crs say where it lies; other commands take them as
     --settings input.map_bounds=W,S,E,N and --settings input.map_crs=EPSG:N.
+
+    Options:
+        map_bounds: Bounds of a picture without georeference, in degrees or in --map-crs.
+        map_crs: CRS, if the map names none.
     """
     from scenematch.runs.map_input import MapInput
 
@@ -53,27 +53,17 @@ def info(
     console.next_step(f"map audit {place} --out audit", as_json=as_json)
 
 
+@with_options
 def audit(
     map_path: MapArgument,
     out: OutOption,
     surface: SurfaceOption = None,
-    camera: Annotated[
-        Path | None,
-        option("--camera", "FILE", "Calibration file (default: 300 x 300 px with a 60 degree field of view)."),
-    ] = None,
-    height_agl_m: Annotated[
-        float | None, option("--height-agl", "M", "Metres above the ground (default: 150).")
-    ] = None,
-    route: Annotated[
-        Path | None, option("--route", "FILE", "GeoJSON LineString, or a QGroundControl .plan.")
-    ] = None,
-    around: Annotated[str | None, option("--around", "LAT,LON,RADIUS_M", "Audit only this circle.")] = None,
-    corridor_m: Annotated[
-        float | None, option("--corridor-m", "M", "Audit only this distance to either side of the route.")
-    ] = None,
-    other: Annotated[
-        Path | None, option("--other", "FILE", "Map of the same ground at another date, to find stale areas.")
-    ] = None,
+    camera: Annotated[Path | None, option("--camera", "FILE")] = None,
+    height_agl_m: Annotated[float | None, option("--height-agl", "M")] = None,
+    route: Annotated[Path | None, option("--route", "FILE")] = None,
+    around: Annotated[str | None, option("--around", "LAT,LON,RADIUS_M")] = None,
+    corridor_m: Annotated[float | None, option("--corridor-m", "M")] = None,
+    other: Annotated[Path | None, option("--other", "FILE")] = None,
     settings: SettingsOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -83,20 +73,24 @@ def audit(
     Writes matchability.tif (probability of a fix by NCC), audit.png and summary.json. With --route it also
     predicts availability along the route and lists poor stretches. Audit a huge map in part: around a place, along
         the route, or both.
+
+    Options:
+        camera: Calibration file (default: 300 x 300 px with a 60 degree field of view).
+        height_agl_m: Metres above the ground (default: 150).
+        route: GeoJSON LineString, or a QGroundControl .plan.
+        around: Audit only this circle.
+        corridor_m: Audit only this distance to either side of the route.
+        other: Map of the same ground at another date, to find stale areas.
     """
     from scenematch.runs.map_audit import AuditFiles, audit_map
     from scenematch.runs.map_input import MapInput
 
     given = read_settings(settings)
+    site = MapInput(map_path, surface=surface, **table(given, "input").of(MapInput))
     files = AuditFiles(
-        map=MapInput(map_path, surface=surface, **table(given, "input").of(MapInput)),
-        camera=camera,
-        route=route,
-        other=other,
-        height_agl_m=height_agl_m,
-        around=around,
+        map=site, camera=camera, route=route, other=other, height_agl_m=height_agl_m, around=around,
         corridor_m=corridor_m,
-    )
+    )  # fmt: skip
     result = audit_map(files, out, table(given, "audit"), force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json(result.summary)
@@ -109,37 +103,31 @@ def audit(
 
 @dataclass(frozen=True, kw_only=True)
 class WantedMap:
-    """What is fetched."""
+    """What is fetched.
 
-    around: Annotated[
-        str, option("--around", "LAT,LON|DIR", "Centre of the map, or a folder of photographs with positions.")
-    ]
-    source: Annotated[str, option("--source", "URL", "Tiles as https://host/{z}/{x}/{y}.png, a WMS or a WMTS.")]
-    radius_m: Annotated[
-        float | None,
-        option(
-            "--radius-m",
-            "M",
-            "Minimum distance from the centre to each edge (default: what the photographs cover).",
-        ),
-    ] = None
-    gsd_m_per_px: Annotated[
-        float | None,
-        option("--gsd-m-per-px", "M", "Coarsest resolution (default: 0.5, or what the photographs need)."),
-    ] = None
-    layer: Annotated[str | None, option("--layer", "NAME", "Layer, if a WMS or WMTS has several.")] = None
-    surface: Annotated[
-        str | None,
-        option("--surface", "FILE|URL", "Surface model to fetch too; {lat} and {lon} become N48 and E016."),
-    ] = None
+    Attributes:
+        around: Centre of the map, or a folder of photographs with positions.
+        source: Tiles as https://host/{z}/{x}/{y}.png, a WMS or a WMTS.
+        radius_m: Minimum distance from the centre to each edge (default: what the photographs cover).
+        gsd_m_per_px: Coarsest resolution (default: 0.5, or what the photographs need).
+        layer: Layer, if a WMS or WMTS has several.
+        surface: Surface model to fetch too; {lat} and {lon} become N48 and E016.
+    """
+
+    around: Annotated[str, option("--around", "LAT,LON|DIR")]
+    source: Annotated[str, option("--source", "URL")]
+    radius_m: Annotated[float | None, option("--radius-m", "M")] = None
+    gsd_m_per_px: Annotated[float | None, option("--gsd-m-per-px", "M")] = None
+    layer: Annotated[str | None, option("--layer", "NAME")] = None
+    surface: Annotated[str | None, option("--surface", "FILE|URL")] = None
 
 
 @with_options
 def fetch(
     what: WantedMap,
-    out: Annotated[Path, option("--out", "FILE", "The map, a GeoTIFF.", OUTPUT)],
+    out: Annotated[Path, option("--out", "FILE", OUTPUT)],
     settings: SettingsOption = None,
-    dry_run: Annotated[bool, flag("--dry-run", "Show what would be fetched, then exit.", EXPERT)] = False,
+    dry_run: Annotated[bool, flag("--dry-run", EXPERT)] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -147,6 +135,10 @@ def fetch(
 
     Sends one request at a time. If interrupted, run the same command again to resume. The server's terms decide
     what you may fetch, keep and use.
+
+    Options:
+        out: The map, a GeoTIFF.
+        dry_run: Show what would be fetched, then exit.
     """
     from scenematch.runs.map_fetch import fetch_map
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,65 +23,58 @@ from scenematch.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from scenematch.runs.live_viewing import LiveViewTarget
     from scenematch.runs.simulation import WorldSettings
-
-_FLIGHT = {
-    "map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames",
-    "telemetry": "telemetry.csv",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions:
-    """What is flown over."""
+    """What is flown over.
 
-    seed: Annotated[int, option("--seed", "N", "Number of the generated town and flight.", min=0)] = 1
-    condition: Annotated[
-        str | None, option("--condition", "NAME", "Light, season and weather in the frames (default: noon).")
-    ] = None
-    relief_m: Annotated[float, option("--relief-m", "H", "Height of the town's hills.")] = 0.0
-    map: Annotated[Path | None, option("--map", "FILE", "Fly over this map instead of a generated town.", MAP)] = (
-        None
-    )
+    Attributes:
+        seed: Number of the generated town and flight.
+        condition: Light, season and weather in the frames (default: noon).
+        relief_m: Height of the town's hills.
+        map: Fly over this map instead of a generated town.
+        camera_pitch_deg: Pitch of the camera: -90 straight down, -45 oblique.
+    """
+
+    seed: Annotated[int, option("--seed", "N", min=0)] = 1
+    condition: Annotated[str | None, option("--condition", "NAME")] = None
+    relief_m: Annotated[float, option("--relief-m", "H")] = 0.0
+    map: Annotated[Path | None, option("--map", "FILE", MAP)] = None
     surface: SurfaceOption = None
-    camera_pitch_deg: Annotated[
-        float, option("--camera-pitch-deg", "P", "Pitch of the camera: -90 straight down, -45 oblique.")
-    ] = -90.0
+    camera_pitch_deg: Annotated[float, option("--camera-pitch-deg", "P")] = -90.0
 
     def world(self) -> WorldSettings:
         """The options in the form that the run takes."""
         from scenematch.runs.simulation import WorldSettings
 
-        return WorldSettings(**{each.name: getattr(self, each.name) for each in fields(self)})
+        return WorldSettings(**asdict(self))
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoopOptions:
-    """How the loop is closed, if it is."""
+    """How the loop is closed, if it is.
 
-    closed_loop: Annotated[bool, flag("--closed-loop", "Steer by the engine's fixes, with GPS off.")] = False
-    minutes: Annotated[
-        float | None, option("--minutes", "M", "With --closed-loop: minutes to fly (default: 5).")
-    ] = None
-    method: Annotated[
-        str | None, option("--method", "auto|ncc|sift", "With --closed-loop: matching method (default: auto).")
-    ] = None
-    fault: Annotated[
-        str | None, option("--fault", "none|killed|shifted|frozen", "With --closed-loop: fault to inject.")
-    ] = None
+    Attributes:
+        closed_loop: Steer by the engine's fixes, with GPS off.
+        minutes: With --closed-loop: minutes to fly (default: 5).
+        method: With --closed-loop: matching method (default: auto).
+        fault: With --closed-loop: fault to inject.
+    """
 
-    def given(self) -> dict[str, Any]:
-        """The loop's options as given; None for each that was not."""
-        return {"minutes": self.minutes, "method": self.method, "fault": self.fault}
+    closed_loop: Annotated[bool, flag("--closed-loop")] = False
+    minutes: Annotated[float | None, option("--minutes", "M")] = None
+    method: Annotated[str | None, option("--method", "auto|ncc|sift")] = None
+    fault: Annotated[str | None, option("--fault", "none|killed|shifted|frozen")] = None
 
 
 @with_options
 def simulate(
-    out: Annotated[Path, option("--out", "DIR", "Flight folder, created by this run.", OUTPUT)],
+    out: Annotated[Path, option("--out", "DIR", OUTPUT)],
     town: WorldOptions,
     loop: LoopOptions,
-    frames: Annotated[int | None, option("--frames", "N", "Fly only the first N frames.", min=1)] = None,
+    frames: Annotated[int | None, option("--frames", "N", min=1)] = None,
     rerun: RerunOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -91,34 +83,35 @@ def simulate(
 
     Writes a flight folder that track can read. With --closed-loop the vehicle steers by the engine's fixes, and
     the folder also holds the track, the estimate, figures and a summary.
+
+    Options:
+        out: Flight folder, created by this run.
+        frames: Fly only the first N frames.
     """
+    from scenematch.runs.inputs import FOLDER_LAYOUT
+
     use_threads()
     world = town.world()
+    given: dict[str, Any] = {"minutes": loop.minutes, "method": loop.method, "fault": loop.fault}
     if loop.closed_loop:
+        from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
+
         if frames is not None:
             raise OptionError("frames: expected without `closed_loop`, which has `minutes`")
-        facts = _fly_closed_loop(out, world, loop.given(), live_view(rerun), force)
+        settings = ClosedLoopSettings(**{name: value for name, value in given.items() if value is not None})
+        shown = live_view(rerun)
+        facts = fly_closed_loop(out, world, settings, force=force, live_view=shown, progress=console.PROGRESS)
     else:
         from scenematch.runs.arguments import check_unused
         from scenematch.runs.simulation import simulate as simulate_flight
 
-        check_unused(loop.given() | {"rerun": rerun}, "closed_loop")
+        check_unused(given | {"rerun": rerun}, "closed_loop")
         facts = simulate_flight(out, world, frames=frames, force=force, progress=console.PROGRESS)
     console.facts(facts, as_json, title=f"simulated flight {town.seed}")
-    flight = {name: out / file for name, file in _FLIGHT.items()}
+    flight = {name: out / file for name, file in FOLDER_LAYOUT.items() if name != "truth"}
     if not loop.closed_loop:
         console.next_step(f"track {console.options(**flight, out=f'{out}-track')}", as_json=as_json)
         return
-    shown = f"export {console.quoted(out)} --format geojson"
-    following = shown if facts["availability"] else f"check {console.options(**flight)}"
+    export = f"export {console.quoted(out)} --format geojson"
+    following = export if facts["availability"] else f"check {console.options(**flight)}"
     console.next_step(following, as_json=as_json, hint=f"open {out / 'report.html'}")
-
-
-def _fly_closed_loop(
-    out: Path, world: WorldSettings, loop: Mapping[str, Any], shown: LiveViewTarget, force: bool
-) -> dict[str, Any]:
-    """The figures of a closed-loop flight; a setting that is None takes its default."""
-    from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
-
-    settings = ClosedLoopSettings(**{name: value for name, value in loop.items() if value is not None})
-    return fly_closed_loop(out, world, settings, force=force, live_view=shown, progress=console.PROGRESS)

@@ -32,16 +32,9 @@ def track(
     correct: CorrectOption = None,
     start: StartOption = None,
     method: MethodOption = None,
-    profile: Annotated[
-        str | None,
-        option(
-            "--profile", "engine|paper", "paper: the paper's own recipe for ncc or sift (default: engine).", EXPERT
-        ),
-    ] = None,
+    profile: Annotated[str | None, option("--profile", "engine|paper", EXPERT)] = None,
     device: DeviceOption = None,
-    budget_ms: Annotated[
-        float | None, option("--budget-ms", "MS", "Longest time per frame; later answers are refused.", EXPERT)
-    ] = None,
+    budget_ms: Annotated[float | None, option("--budget-ms", "MS", EXPERT)] = None,
     settings: SettingsOption = None,
     rerun: RerunOption = None,
     force: ForceOption = False,
@@ -51,6 +44,10 @@ def track(
 
     Writes track.csv (one row per frame), summary.json and report.html into the output folder. Without --start the
     flight begins at the telemetry's first position, or anywhere on the map if it has none.
+
+    Options:
+        profile: paper: the paper's own recipe for ncc or sift (default: engine).
+        budget_ms: Longest time per frame; later answers are refused.
     """
     from scenematch.runs.tracking import track as track_flight
 
