@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -39,8 +38,7 @@ def test_it_grows_uncertain_while_nobody_watches(monkeypatch):
 
 def test_it_outlives_a_process_that_is_killed(tmp_path):
     path = tmp_path / "cache" / "last-fix"
-    there = {**os.environ, "PYTHONPATH": str(ROOT)}
-    subprocess.run([sys.executable, "-c", SCRIPT, str(path)], env=there, check=False)
+    subprocess.run([sys.executable, "-c", SCRIPT, str(path)], cwd=ROOT, check=False)
     prior = LastFix(path).prior(15.0)
     assert (prior.lat_deg, prior.lon_deg) == (48.2, 16.37)
 
