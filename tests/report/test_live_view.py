@@ -32,6 +32,7 @@ from rosbags.typesys import Stores, get_typestore
 from scenematch.report import live_view
 from scenematch.report.live_shapes import FIX_RGB, SIGMAS, ellipsoid
 from tests.support import browser
+from tests.support.commands import refusal
 
 FRAMES = 6
 DARK = 4  # a frame that shows nothing
@@ -275,42 +276,25 @@ class SilentNode:
 # -------------------------------------------------------------------------------------------- what is refused
 
 
-def refusal(capsys, *more):
-    """The exit code of a track with a wish, and its one line."""
-    command = ["track", "--map", "m.tif", "--camera", "c.yaml", "--frames", "f", "--out", "no-such-folder"]
-    code = run([*command, *more])
-    return code, capsys.readouterr().err.strip().splitlines()
-
-
 def test_what_cannot_be_watched_is_refused_in_one_line_before_any_work(tmp_path, capsys, monkeypatch):
+    def refused(view, code=2):
+        command = ["track", "--map", "m.tif", "--camera", "c.yaml", "--frames", "f", "--out", "no-such-folder"]
+        return refusal(capsys, [*command, "--rerun", view], code)
+
     there = tmp_path / "there.rrd"
     there.touch()
-    assert refusal(capsys, "--rerun", str(there)) == (
-        2,
-        [f"scenematch: --rerun: {there} exists; choose another file"],
-    )
-    code, (line,) = refusal(capsys, "--rerun", "view.rec")
-    assert (code, line) == (2, "scenematch: --rerun: expected a file that ends in .rrd, got view.rec")
+    assert refused(there) == f"--rerun: {there} exists; choose another file\n"
+    assert refused("view.rec") == "--rerun: expected a file that ends in .rrd, got view.rec\n"
     for address in ("here:port", ":9876", "here:70000"):
-        code, (line,) = refusal(capsys, "--rerun", address)
-        assert (code, line) == (2, f"scenematch: --rerun: expected HOST:PORT, got {address!r}")
+        assert refused(address) == f"--rerun: expected HOST:PORT, got {address!r}\n"
     with socket.socket() as taken:  # bound, and nobody listens
         taken.bind(("127.0.0.1", 0))
-        code, (line,) = refusal(capsys, "--rerun", f"127.0.0.1:{taken.getsockname()[1]}")
-    assert code == 1
+        line = refused(f"127.0.0.1:{taken.getsockname()[1]}", code=1)
     assert "no viewer listens" in line
     assert "rerun --bind 127.0.0.1" in line
     monkeypatch.setitem(sys.modules, "rerun", None)
-    code, (line,) = refusal(capsys, "--rerun", "view.rrd")
-    assert (code, line) == (
-        1,
-        "scenematch: expected rerun-sdk to be installed, got none: pip install 'scenematch-engine[live]'",
-    )
-
-
-def test_a_simulated_flight_that_nobody_flies_has_no_view(capsys):
-    assert run(["simulate", "--out", "x", "--rerun", "a.rrd"]) == 2
-    assert "--rerun: expected with --closed-loop only" in capsys.readouterr().err
+    missing = "expected rerun-sdk to be installed, got none: pip install 'scenematch-engine[live]'\n"
+    assert refused("view.rrd", code=1) == missing
 
 
 # ---------------------------------------------------------------------------------------------- the viewer
