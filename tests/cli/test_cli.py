@@ -138,16 +138,19 @@ def test_evaluate_reproduces_the_summary(done, tmp_path, capsys):
     assert json.loads((folder / "summary.json").read_text(encoding="utf-8")) == before
 
 
-def test_evaluate_takes_another_truth(done, flight, tmp_path, capsys):
+def test_a_truth_of_other_times_is_named_with_both_and_counts_no_false_fix(done, flight, tmp_path, capsys):
     folder = Path(shutil.copytree(done, tmp_path / "again"))
-    late = tmp_path / "late.csv"
-    late.write_text((flight / "truth.csv").read_text(encoding="utf-8"), encoding="utf-8")
-    for row in range(FRAMES):
-        set_cell(late, row, "timestamp_ns", str(10**15 + row * 10**8))
-    assert run(["evaluate", str(folder), f"--truth={late}", "--json"]) == 0
+    late = Path(shutil.copy(flight / "truth.csv", tmp_path / "late.csv"))
+    stamps = [int(row["timestamp_ns"]) for row in cells(late)]
+    for row, stamp in enumerate(stamps):
+        set_cell(late, row, "timestamp_ns", str(1_700_000_000_000_000_000 + stamp))
+    assert run(["evaluate", str(folder), f"--truth={late}"]) == 0
     printed = capsys.readouterr()
-    assert json.loads(printed.out)["scored_fixes"] == 0
-    assert str(late) in printed.err
+    when = f"{stamps[0] / 1e9:.1f} to {stamps[-1] / 1e9:.1f} s"
+    assert f"no fix is scored: expected a truth at the times of the fixes, {when}" in printed.err
+    assert f"got 2023-11-14T22:13:21Z to 2023-11-14T22:13:25Z in {late}" in printed.err
+    assert "false fixes" not in printed.out
+    assert json.loads((folder / "summary.json").read_text(encoding="utf-8"))["scored_fixes"] == 0
 
 
 def test_start_comes_before_the_telemetry(flight, tmp_path):
