@@ -46,13 +46,10 @@ def test_it_outlives_a_process_that_is_killed(tmp_path):
 def test_it_is_forgotten_after_a_minute_and_when_the_computer_starts_again(tmp_path, monkeypatch):
     memory = LastFix(tmp_path / "last-fix")
     memory.keep(FIX)
-    later_s = time.monotonic() + 61.0
-    with monkeypatch.context() as patch:
-        patch.setattr(last_fix.time, "monotonic", lambda: later_s)
-        assert memory.prior(15.0) is None
-    with monkeypatch.context() as patch:
-        patch.setattr(last_fix.time, "monotonic", lambda: 1.0)  # a clock that began anew
-        assert memory.prior(15.0) is None
+    for now_s in (time.monotonic() + 61.0, 1.0):  # a clock that began anew
+        with monkeypatch.context() as patch:
+            patch.setattr(last_fix.time, "monotonic", lambda now_s=now_s: now_s)
+            assert memory.prior(15.0) is None
     boot = tmp_path / "boot_id"
     boot.write_text("0f0e0d0c-0b0a-0908-0706-050403020100\n", encoding="ascii")
     monkeypatch.setattr(last_fix, "_BOOT_ID", boot)

@@ -111,13 +111,22 @@ def test_an_abstract_socket_is_found(monkeypatch):
         assert heard(ear) == ["READY=1", "STOPPING=1"]
 
 
-def test_a_status_is_told_as_one_line_now_and_then(manager, monkeypatch):
-    shown, clock = Shown(), iter([0.0, 4.9, 5.0, 5.1, 10.0])
+@pytest.fixture
+def progress():
+    """Keeps what is shown as its lines."""
+    shown = Progress()
+    shown.lines = []
+    shown.message = shown.lines.append
+    return shown
+
+
+def test_a_status_is_told_as_one_line_now_and_then(manager, progress, monkeypatch):
+    clock = iter([0.0, 4.9, 5.0, 5.1, 10.0])
     monkeypatch.setattr(service.time, "monotonic", lambda: next(clock))
-    report = status_reporter(lambda: "autopilot heard; sent 5", shown)
+    report = status_reporter(lambda: "autopilot heard; sent 5", progress)
     for _ in range(4):
         report()
-    assert shown.lines == ["autopilot heard; sent 5"] * 2
+    assert progress.lines == ["autopilot heard; sent 5"] * 2
     assert heard(manager) == ["STATUS=autopilot heard; sent 5"] * 2
 
 
@@ -183,24 +192,13 @@ def test_a_bridge_that_starts_again_in_the_air_warms_up_briefly(flight, tmp_path
     assert briefly == [(False, False), (True, False), (False, False)]  # a recorded flight starts on the ground
 
 
-class Shown(Progress):
-    """Keeps what is shown."""
-
-    def __init__(self):
-        self.lines = []
-
-    def message(self, text):
-        self.lines.append(text)
-
-
-def test_a_ros_bridge_reports_as_the_other_does(manager, flight, monkeypatch):
+def test_a_ros_bridge_reports_as_the_other_does(manager, flight, progress, monkeypatch):
     monkeypatch.setenv("WATCHDOG_USEC", "1000")
     monkeypatch.setattr(SceneMatcher, "warmup", lambda *_, **__: None)
     monkeypatch.setattr(service, "_STATUS_PERIOD_S", 0.0)
     types = get_typestore(Stores.ROS1_NOETIC).types
-    maker, shown, published = MessageFactory(types.__getitem__, True), Shown(), []
-    flown = FlightFiles.in_folder(flight)
-    black = np.zeros((flown.camera.load(None).height_px, flown.camera.load(None).width_px), np.uint8)
+    maker, published = MessageFactory(types.__getitem__, True), []
+    flown, black = FlightFiles.in_folder(flight), np.zeros((300, 300), np.uint8)
 
     def spin(handlers, every_second, seconds):
         handlers["/down"][1](maker.image(10**9, "", black))
@@ -215,9 +213,9 @@ def test_a_ros_bridge_reports_as_the_other_does(manager, flight, monkeypatch):
         publish=lambda output, message: published.append(output),
     )  # fmt: skip
     ros = RosSettings(map=flown.map, camera=flown.camera, topics=RosTopics(image="/down"))
-    run_ros_bridge(ros, BridgeSettings(method="ncc"), node=node, progress=shown)
+    run_ros_bridge(ros, BridgeSettings(method="ncc"), node=node, progress=progress)
     line = "1 pictures; published 0; not published: no_height 1, unusable 1"
-    assert shown.lines[-1] == line
+    assert progress.lines[-1] == line
     assert heard(manager) == ["READY=1", "WATCHDOG=1", f"STATUS={line}", "STOPPING=1"]
 
 

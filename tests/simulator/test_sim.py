@@ -64,15 +64,11 @@ def test_supersampling_and_a_rotated_raster_do_not_move_the_picture(sim_town):
     where = tuple(sim_town.pixel_to_crs @ (450.0, 500.0, 1.0))
     attitude = Attitude(3.0, -4.0, 110.0)
     coarse, fine = (render_frame(sim_town.world, CAMERA, where, 150.0, attitude, supersample=n) for n in (1, 3))
-    half = sim_town.world
-    flipped = World(
-        np.ascontiguousarray(half.rgb[::-1, ::-1]),
-        np.ascontiguousarray(half.sides[::-1, ::-1]),
-        np.ascontiguousarray(half.height_m[::-1, ::-1]),
-        half.pixel_to_crs
-        @ np.array([[-1, 0, half.rgb.shape[1] - 1], [0, -1, half.rgb.shape[0] - 1], [0, 0, 1.0]]),
-        half.crs_epsg,
-    )
+    world = sim_town.world
+    rasters = (np.ascontiguousarray(raster[::-1, ::-1]) for raster in (world.rgb, world.sides, world.height_m))
+    last_y, last_x = np.array(world.height_m.shape) - 1
+    turn = np.array([[-1.0, 0.0, last_x], [0.0, -1.0, last_y], [0.0, 0.0, 1.0]])
+    flipped = World(*rasters, world.pixel_to_crs @ turn, world.crs_epsg)
     turned = render_frame(flipped, CAMERA, where, 150.0, attitude, supersample=3)
     assert np.abs(turned.astype(int) - fine).mean() < 1.0
     shift, response = cv2.phaseCorrelate(coarse[..., 1].astype(np.float64), fine[..., 1].astype(np.float64))
