@@ -21,6 +21,7 @@ from scenematch.runs.checks import check_pictures
 from scenematch.runs.evaluation import recorded_files
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.record import RunRecord
+from tests.support.commands import refusal
 from tests.support.photos import gimbal, photograph
 from tests.support.videos import write_video
 
@@ -95,10 +96,9 @@ def test_a_map_with_a_place_of_its_own_refuses_another(map_file):
 
 
 def test_the_command_line_names_its_options(shot, capsys):
-    assert run(["map", "info", str(shot)]) == 1
-    assert "give --map-bounds (west, south, east, north)" in capsys.readouterr().err
-    assert run(["map", "info", str(shot), "--map-bounds", "1,2,3"]) == 2
-    assert "--map-bounds: expected W,S,E,N in degrees or in --map-crs, got '1,2,3'" in capsys.readouterr().err
+    assert "give --map-bounds (west, south, east, north)" in refusal(capsys, ["map", "info", shot], 1)
+    line = refusal(capsys, ["map", "info", shot, "--map-bounds", "1,2,3"])
+    assert line == "--map-bounds: expected W,S,E,N in degrees or in --map-crs, got '1,2,3'\n"
     bounds = ["--map-bounds", "16.0,48.0,16.001,48.0005018", "--map-crs", "EPSG:3857"]
     assert run(["map", "info", str(shot), *bounds]) == 0
 
@@ -209,8 +209,7 @@ def test_a_live_camera_that_gives_no_picture_is_not_waited_for_without_end(monke
 def test_the_delay_of_a_camera_needs_to_know_its_lens(capsys):
     pytest.importorskip("pymavlink", reason="pymavlink is not installed")
     command = ["bridge", "mavlink", "--measure-delay", "--connect=udpin:127.0.0.1:0", "--camera-source=0"]
-    assert run(command) == 2
-    assert "--camera: expected a calibration, or --hfov-deg" in capsys.readouterr().err
+    assert refusal(capsys, command).startswith("--camera: expected a calibration, or --hfov-deg")
 
 
 def test_a_bridge_that_plays_pictures_takes_a_field_of_view_or_their_own(tmp_path):
@@ -221,11 +220,16 @@ def test_a_bridge_that_plays_pictures_takes_a_field_of_view_or_their_own(tmp_pat
         BridgeFiles(map=MapInput("m.tif"), frames=tmp_path).load_camera()
 
 
+def subtitles(heights_m):
+    """A cue each 40 ms."""
+    cue = "{n}\n00:00:00,{ms:03d} --> 00:00:00,{ms:03d}\n[latitude: 48.1] [longitude: 16.2] [rel_alt: {h}]\n\n"
+    return "".join(cue.format(n=k + 1, ms=40 * k, h=height_m) for k, height_m in enumerate(heights_m))
+
+
 def test_a_video_with_subtitles_and_a_field_of_view(tmp_path):
     path = tmp_path / "DJI_0001.mp4"
     write_video(path, [40 * k for k in range(3)], codec="mp4v")
-    cue = "{n}\n00:00:00,{ms:03d} --> 00:00:00,{ms:03d}\n[latitude: 48.1] [longitude: 16.2] [rel_alt: 80.0]\n\n"
-    (tmp_path / "DJI_0001.SRT").write_text("".join(cue.format(n=k + 1, ms=40 * k) for k in range(3)))
+    (tmp_path / "DJI_0001.SRT").write_text(subtitles([80.0] * 3))
     files = FlightFiles.from_flat(map="m.tif", frames=path, hfov_deg=70.0)
     assert files.telemetry == tmp_path / "DJI_0001.SRT"
     assert [row.height_agl_m for row in files.open_flight().rows] == [80.0] * 3
@@ -236,9 +240,7 @@ def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
     """Of a video with a log: pictures, stamps, heights and corrections are those of the frames that are left."""
     path = tmp_path / "DJI_0002.avi"
     write_video(path, [30 * k for k in range(8)])
-    cue = "{n}\n00:00:00,{ms:03d} --> 00:00:00,{ms:03d}\n[latitude: 48.1] [longitude: 16.2] [rel_alt: {h}]\n\n"
-    cues = (cue.format(n=k + 1, ms=40 * k, h=80.0 + k * k) for k in range(8))
-    (tmp_path / "DJI_0002.SRT").write_text("".join(cues))
+    (tmp_path / "DJI_0002.SRT").write_text(subtitles([80.0 + k * k for k in range(8)]))
     late = Corrections(offset_s=0.04)  # by one frame, which only all of the rows can say
     named = {"map": "m.tif", "frames": path, "hfov_deg": 70.0}
     whole, part = FlightFiles.from_flat(**named), FlightFiles.from_flat(**named, every=3, corrections=late)
@@ -287,9 +289,8 @@ def test_without_the_request_another_size_is_refused_and_the_request_named(photo
     flight = files.open_flight()
     with pytest.raises(CalibrationError, match=r"0\.jpg: camera: calibrated for 640 x 480, .*`scale_calibration`"):
         check_pictures(flight, files.load_camera(flight))
-    arguments = ["locate", str(photos / "0.jpg"), "--map", str(map_file), "--camera", str(calibration)]
-    assert run(arguments) == 1
-    assert "resized without cropping, add --settings input.scale_calibration" in capsys.readouterr().err
+    line = refusal(capsys, ["locate", photos / "0.jpg", "--map", map_file, "--camera", calibration], 1)
+    assert "resized without cropping, add --settings input.scale_calibration" in line
 
 
 def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
