@@ -23,7 +23,6 @@ from scenematch.report.verdict import MEANINGS, verdict_of
 from scenematch.runs.evaluation import evaluate
 from scenematch.runs.settings import TrackSettings
 from scenematch.runs.tracking import track
-from tests.support.browser import missing, open_browser
 from tests.support.runs import bare_runs
 
 FRAMES = 6
@@ -296,15 +295,6 @@ def test_a_track_without_a_single_fix_has_a_page(page_of, count):
 
 
 # --------------------------------------------------------------------------------------------- the browser
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """A headless Chromium."""
-    if missing():
-        pytest.skip(missing())
-    with open_browser() as opened:
-        yield opened
 
 
 PICTURES = "return [...document.querySelectorAll('#pictures image')].map(i => i.getAttribute('href'))"
