@@ -18,7 +18,7 @@ from scenematch.simulator import (
 )
 from scenematch.simulator.flight import DRONE_SENSOR
 from scenematch.simulator.optics import Sensor
-from tests.support.patches import CAMERA, ORIGIN, TO_CRS, centre_of_bright, patch_world, project
+from tests.support.patches import CAMERA, ORIGIN, TO_CRS, TO_GRID, centre_of_bright, patch_world, project
 
 LEVEL = Attitude(0.0, 0.0, 0.0)
 IDEAL = Sensor(
@@ -68,9 +68,7 @@ def test_each_row_of_a_rolling_shutter_is_seen_from_where_the_camera_then_is(row
     sway, optics = ExposureMotion((30.0, -20.0, 4.0), (20.0, -10.0, 40.0)), Optics(readout_ms=60.0)
     seen = centre_of_bright(snap(world, CAMERA, optics, sway, Attitude(2.0, -1.0, 5.0), grid=tuple(position)))
     after_s = (seen[1] / 299.0 - 0.5) * 0.06
-    # East and north of the camera at that moment, on a grid that is turned by 1.08 degrees.
-    turn = np.radians(1.08)
-    way = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ sway.velocity_mps[:2] * after_s
+    way = TO_GRID @ sway.velocity_mps[:2] * after_s  # of the camera until that moment
     then = Attitude(2.0 + 20.0 * after_s, -1.0 - 10.0 * after_s, 5.0 + 40.0 * after_s)
     grid = TO_CRS @ (600, row, 1.0)
     expected = project(CAMERA, grid, 0.0, position + way, 150.0 + 4.0 * after_s, then)
