@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 
 from scenematch.simulator.quadrotor import STEP_S, IdealImu, hovering
-from scenematch.simulator.sensors import (
-    Barometer,
-    Compass,
-    Imu,
-    Instruments,
-    SensorSuite,
-    steps_between,
-)
+from scenematch.simulator.sensors import Barometer, Compass, Imu, Instruments, SensorSuite, steps_between
 
 STILL = hovering(np.array([10.0, -20.0, 120.0]), 359.5)
 NOTHING = IdealImu(np.zeros(3), np.zeros(3))

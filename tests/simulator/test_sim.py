@@ -11,14 +11,7 @@ from pyproj import Proj
 
 from engine.geo import enu_from_body
 from engine.values import Attitude
-from scenematch.simulator import (
-    FlightStyle,
-    SensorNoise,
-    World,
-    build_town,
-    plan_flight,
-    render_frame,
-)
+from scenematch.simulator import FlightStyle, SensorNoise, World, build_town, plan_flight, render_frame
 from scenematch.simulator.light import LIGHTS, sun_visibility
 from scenematch.simulator.render import grid_from_enu
 from scenematch.simulator.vehicle import COURSE_STEP_S, fly_waypoints, leg_accelerations

@@ -8,14 +8,7 @@ import pytest
 
 from engine.camera import Camera
 from engine.values import Attitude
-from scenematch.simulator import (
-    ExposureMotion,
-    FlightStyle,
-    Optics,
-    plan_flight,
-    render_frame,
-    take_picture,
-)
+from scenematch.simulator import ExposureMotion, FlightStyle, Optics, plan_flight, render_frame, take_picture
 from scenematch.simulator.flight import DRONE_SENSOR
 from scenematch.simulator.optics import Sensor
 from tests.support.patches import CAMERA, ORIGIN, TO_CRS, TO_GRID, centre_of_bright, patch_world, project
