@@ -68,7 +68,7 @@ def test_a_flight_is_tracked_in_three_lines_and_nothing_is_printed(flight, tmp_p
     files = FlightFiles.in_folder(str(flight))
     summary = track(files, "out", TrackSettings(method="sift"))
     assert (summary["frames"], summary["fixes"]) == (FRAMES, FRAMES)
-    assert summary["rms_m"] < 5.0
+    assert summary["rms_m"] < 2.0
     assert {"track.csv", "summary.json", "report.html"} <= {path.name for path in (tmp_path / "out").iterdir()}
     assert capfd.readouterr() == ("", "")
 
