@@ -36,6 +36,11 @@ from scenematch.simulator.sensors import Instruments, SensorSuite
 from tests.support.fixes import a_fix
 
 SUITE = SensorSuite()
+ADDITIVE = {
+    "position_m": POSITION, "velocity_mps": VELOCITY, "accel_bias_mps2": ACCEL, "gyro_bias_rps": GYRO,
+    "baro_drift_m": 15, "compass_bias_rad": COMPASS,
+}  # fmt: skip
+"""Where each part of the state but the attitude lies in an error."""
 FIX_SIGMA_M, FIX_LATENCY_S = 1.5, 0.11
 SAMPLE = IdealImu(np.array([0.4, -0.3, -9.6]), np.array([0.2, -0.1, 0.3]))
 
@@ -58,30 +63,17 @@ def some_belief() -> FilterState:
 
 def moved(estimate: FilterState, error: np.ndarray) -> FilterState:
     """The truth where the estimate is off by an error."""
-    return replace(
-        estimate,
-        position_m=estimate.position_m + error[POSITION],
-        velocity_mps=estimate.velocity_mps + error[VELOCITY],
-        enu_from_body=rotation(error[TURN]) @ estimate.enu_from_body,
-        accel_bias_mps2=estimate.accel_bias_mps2 + error[ACCEL],
-        gyro_bias_rps=estimate.gyro_bias_rps + error[GYRO],
-        baro_drift_m=estimate.baro_drift_m + error[15],
-        compass_bias_rad=estimate.compass_bias_rad + error[COMPASS],
-    )
+    sums = {name: getattr(estimate, name) + error[part] for name, part in ADDITIVE.items()}
+    return replace(estimate, enu_from_body=rotation(error[TURN]) @ estimate.enu_from_body, **sums)
 
 
 def apart(truth: FilterState, estimate: FilterState) -> np.ndarray:
-    """The error (17,) of a estimate."""
-    return np.concatenate(
-        [
-            truth.position_m - estimate.position_m,
-            truth.velocity_mps - estimate.velocity_mps,
-            rotation_vector(truth.enu_from_body @ estimate.enu_from_body.T),
-            truth.accel_bias_mps2 - estimate.accel_bias_mps2,
-            truth.gyro_bias_rps - estimate.gyro_bias_rps,
-            [truth.baro_drift_m - estimate.baro_drift_m, truth.compass_bias_rad - estimate.compass_bias_rad],
-        ]
-    )
+    """The error (17,) of an estimate."""
+    error = np.empty(STATES)
+    for name, part in ADDITIVE.items():
+        error[part] = getattr(truth, name) - getattr(estimate, name)
+    error[TURN] = rotation_vector(truth.enu_from_body @ estimate.enu_from_body.T)
+    return error
 
 
 def fix_at(east_m, north_m, up_m=None, sigma_m=0.5) -> Fix:
