@@ -12,7 +12,7 @@ from docs.site_roles import on_page_content
 from engine.options import AssumedErrors, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, SiftOptions
 from engine.values import Reason
 from scenematch.files.track import COLUMNS
-from tests.cli.test_json import LEAVES
+from tests.support.commands import LEAVES
 from tests.support.paths import ROOT
 
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -185,12 +185,12 @@ def test_columns_of_the_track_are_listed():
 
 def test_every_command_has_its_section():
     stated = set(re.findall(r"^## (.+)$", read("docs/command-line.md"), re.MULTILINE))
-    assert stated == {" ".join(words) for words, _ in LEAVES}
+    assert stated == {" ".join(words) for words in LEAVES}
 
 
 def command_options():
     """Options by command, without those that the page tells once for all."""
-    for name, command in LEAVES:
+    for name, command in LEAVES.items():
         words = {word for option in command.params for word in (*option.opts, *option.secondary_opts)}
         options = {word for word in words if word.startswith("--")}
         yield " ".join(name), sorted(options - {"--help", "--json", "--force"})

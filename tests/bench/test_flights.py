@@ -16,9 +16,8 @@ from bench.live.standin import State
 
 
 def test_a_fault_is_scored_by_the_first_fix_after_its_end():
-    lines = report(
-        [(1.0, 0.1, 10.0), (17.0, 9.0, 10.0), (20.5, 0.3, 10.0), (36.0, 0.4, 20.0)], "begun", FAULTS
-    ).splitlines()
+    scored = [(1.0, 0.1, 10.0), (17.0, 9.0, 10.0), (20.5, 0.3, 10.0), (36.0, 0.4, 20.0)]
+    lines = report(scored, "begun", FAULTS).splitlines()
     assert "| 4 | 4.51 | 0.35 | 9.00 | 1 | 10, 20 |" in lines
     assert "| bridge killed 3 s | 2.50 | 0.30 | 14.5 |" in lines
     assert "| worker killed | 1.00 | 0.40 | 9.0 |" in lines

@@ -20,15 +20,8 @@ def test_without_cuda_it_says_so_in_one_line(capsys, monkeypatch):
 def test_the_table_has_a_row_for_every_task(capsys):
     gpu.main(["--device", "cpu", "--quick"])
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
-    assert [row[0].strip("| ") for row in rows] == [
-        "task",
-        "NCC 228 in 425",
-        "NCC surfaces, 1",
-        "SIFT of 1",
-        "locate, ncc",
-        "locate, sift",
-        "whole map, ncc",
-    ]
+    tasks = ["NCC 228 in 425", "NCC surfaces, 1", "SIFT of 1", "locate, ncc", "locate, sift", "whole map, ncc"]
+    assert [row[0].strip("| ") for row in rows] == ["task", *tasks]
     assert {len(row) for row in rows} == {len(gpu.COLUMNS)}
     assert [row[5] for row in rows[1:]] == ["0e+00 px, 0e+00", "0e+00", "100.0% shared", *["0e+00 m"] * 3]
 

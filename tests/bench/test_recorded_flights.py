@@ -1,12 +1,12 @@
 """Where the vehicle of a recorded flight was: a video with its subtitles, and a folder."""
 
-import cv2
-import numpy as np
 import pytest
 
 from engine.errors import TelemetryError
+from tests.support.videos import write_video
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+from bench.live.flights.recorded import recorded
 
 RATE_HZ, NORTH_MPS = 25.0, 9.0
 CUE = (
@@ -17,21 +17,16 @@ CUE = (
 
 def video(folder, gimbal, size=(32, 32), shade=1):
     """Three seconds due north, each frame a shade brighter, with a cue each: positions to 0.1 m, as DJI's."""
-    path = folder / "DJI_0001.mp4"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), RATE_HZ, size)
-    cues = []
+    path, cues = folder / "DJI_0001.mp4", []
+    write_video(path, [shade * k for k in range(75)], size=size, rate_hz=RATE_HZ, codec="mp4v")
     for k in range(75):
-        writer.write(np.full((*size[::-1], 3), shade * k, np.uint8))
         lat_deg = 48.1 + NORTH_MPS * k / RATE_HZ / 111_200.0
         cues.append(CUE.format(n=k + 1, s=k // 25, ms=k % 25 * 40, lat=lat_deg, gimbal=gimbal))
-    writer.release()
     (folder / "DJI_0001.SRT").write_text("".join(cues))
     return path
 
 
 def test_it_flies_the_positions_and_the_velocity_of_the_subtitles(tmp_path):
-    from bench.live.flights.recorded import recorded
-
     motion, place, duration_s = recorded(video(tmp_path, "[gb_yaw: 30.0 gb_pitch: -90.0 gb_roll: 0.0]"))
     assert (place.lat_deg, duration_s) == (pytest.approx(48.1), pytest.approx(74 / RATE_HZ))
     for time_s in (0.0, 1.0, 2.5):
@@ -42,8 +37,6 @@ def test_it_flies_the_positions_and_the_velocity_of_the_subtitles(tmp_path):
 
 
 def test_subtitles_without_a_heading_are_refused(tmp_path):
-    from bench.live.flights.recorded import recorded
-
     with pytest.raises(TelemetryError, match="expected subtitles beside it with position, rel_alt and gimbal"):
         recorded(video(tmp_path, ""))
 
@@ -63,8 +56,6 @@ def folder(path, truth, telemetry):
 
 
 def test_a_truth_without_heights_above_ground_is_flown_at_the_telemetrys(tmp_path):
-    from bench.live.flights.recorded import recorded
-
     heading, height, altitude = {"heading_deg": 30.0}, {"height_agl_m": 150.0}, {"alt_amsl_m": 200.0}
     motion, _, _ = recorded(folder(tmp_path, heading | altitude, height))
     assert [motion(time_s).height_m for time_s in (0.0, 0.5, 2.0)] == [150.0] * 3

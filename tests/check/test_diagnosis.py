@@ -30,13 +30,9 @@ PLACES = np.concatenate([[[0.0, 0.0]], np.cumsum(0.5 * (VELOCITY[1:] + VELOCITY[
 
 
 def series(**changes):
-    nothing = np.full((N, 2), np.nan)
-    return replace(
-        TelemetrySeries(
-            TIME_S, ANGLES, np.full(N, 120.0), VELOCITY, nothing, np.full(N, np.nan), mount_rotation(), 260.0
-        ),
-        **changes,
-    )
+    places, sigmas = np.full((N, 2), np.nan), np.full(N, np.nan)
+    right = TelemetrySeries(TIME_S, ANGLES, np.full(N, 120.0), VELOCITY, places, sigmas, mount_rotation(), 260.0)
+    return replace(right, **changes)
 
 
 def seen(noise=True, outliers=2):
@@ -51,9 +47,31 @@ def seen(noise=True, outliers=2):
     return out
 
 
-def cause_of(**changes):
-    found = findings(series(**changes), seen(), 1.0)
-    return [finding.cause for finding in found]
+def with_headings(headings_deg):
+    return series(angles_deg=np.column_stack([ANGLES[:, :2], headings_deg]))
+
+
+def causes(telemetry, sightings):
+    return [finding.cause for finding in findings(telemetry, sightings, 1.0)]
+
+
+def seen_off(sightings, forward_m, right_m):
+    """The same of a camera whose optical centre is off: places move with the heading."""
+    moved = []
+    for one in sightings:
+        heading = np.radians(one.attitude.heading_deg)
+        ahead, aside = np.array([np.sin(heading), np.cos(heading)]), np.array([np.cos(heading), -np.sin(heading)])
+        moved.append(replace(one, en_m=one.en_m + forward_m * ahead + right_m * aside))
+    return moved
+
+
+def assert_is_off(found, forward_m, right_m):
+    """By focal length over height it is so many pixels of the picture."""
+    assert found.cause == "mount"
+    assert found.value == pytest.approx(np.degrees(np.arctan2(np.hypot(forward_m, right_m), 120.0)), abs=1.0)
+    column, row = (int(word) for word in found.cure.split() if word[0] in "+-")
+    assert column == pytest.approx(-right_m * 260.0 / 120.0, abs=4.0)
+    assert row == pytest.approx(forward_m * 260.0 / 120.0, abs=4.0)
 
 
 def test_what_fits_is_not_doubted():
@@ -63,18 +81,8 @@ def test_what_fits_is_not_doubted():
 
 @pytest.mark.parametrize(("forward_m", "right_m"), [(-6.0, 7.0), (0.0, 9.0), (14.0, 3.0)])
 def test_an_optical_centre_that_is_off_is_named_with_its_pixels(forward_m, right_m):
-    """Places are off with the heading: by focal length over height it is so many pixels of the picture."""
-    off = []
-    for one in seen(outliers=0):
-        heading = np.radians(one.attitude.heading_deg)
-        ahead, aside = np.array([np.sin(heading), np.cos(heading)]), np.array([np.cos(heading), -np.sin(heading)])
-        off.append(replace(one, en_m=one.en_m + forward_m * ahead + right_m * aside))
-    (found,) = findings(series(), off, 1.0)
-    assert found.cause == "mount"
-    assert found.value == pytest.approx(np.degrees(np.arctan2(np.hypot(forward_m, right_m), 120.0)), abs=1.0)
-    column, row = (int(word) for word in found.cure.split() if word[0] in "+-")
-    assert column == pytest.approx(-right_m * 260.0 / 120.0, abs=4.0)
-    assert row == pytest.approx(forward_m * 260.0 / 120.0, abs=4.0)
+    (found,) = findings(series(), seen_off(seen(outliers=0), forward_m, right_m), 1.0)
+    assert_is_off(found, forward_m, right_m)
 
 
 def on_lines(headings_deg, outliers):
@@ -90,15 +98,8 @@ def on_lines(headings_deg, outliers):
 def test_an_optical_centre_that_is_far_off_is_named_by_the_few_turns_of_straight_lines(outliers):
     """At each turn places move by many sigmas, which alone would be an outlier."""
     telemetry, shown = on_lines(np.where(np.arange(N) // 30 % 2, 160.0, 20.0), outliers)
-    moved = []
-    for one in shown:
-        heading = np.radians(one.attitude.heading_deg)
-        moved.append(replace(one, en_m=one.en_m + 25.0 * np.array([np.sin(heading), np.cos(heading)])))
-    (found,) = (one for one in findings(telemetry, moved, 1.0) if one.cause == "mount")
-    assert found.value == pytest.approx(np.degrees(np.arctan2(25.0, 120.0)), abs=1.0)
-    column, row = (int(word) for word in found.cure.split() if word[0] in "+-")
-    assert column == pytest.approx(0.0, abs=4.0)
-    assert row == pytest.approx(25.0 * 260.0 / 120.0, abs=4.0)
+    (found,) = (one for one in findings(telemetry, seen_off(shown, 25.0, 0.0), 1.0) if one.cause == "mount")
+    assert_is_off(found, 25.0, 0.0)
 
 
 @pytest.mark.parametrize("outliers", [1, 2])
@@ -122,7 +123,7 @@ def test_false_sightings_over_a_straight_line_are_no_optical_centre(outliers):
     ],
 )
 def test_an_attitude_that_is_wrong_is_named(angles, cause):
-    assert cause_of(angles_deg=np.asarray(angles, float)) == [cause]
+    assert causes(series(angles_deg=np.asarray(angles, float)), seen()) == [cause]
 
 
 def test_an_offset_has_its_value_within_three_sigma():
@@ -152,14 +153,14 @@ def test_a_camera_that_is_turned_is_no_compass_error(turn_deg):
     ("height", "cause"), [(140.0, "height"), (100.0, "height"), (120.0 / 0.3048, "height_feet"), (330.0, "height")]
 )
 def test_a_height_that_is_wrong_is_named(height, cause):
-    assert cause_of(height_m=np.full(N, height)) == [cause]
+    assert causes(series(height_m=np.full(N, height)), seen()) == [cause]
 
 
 def test_a_height_that_is_scaled_is_told_from_one_that_is_shifted():
     true = 60.0 + TIME_S * 2.0
     poses = [replace(one, height_agl_m=float(true[one.index])) for one in seen(outliers=0)]
-    assert findings(series(height_m=true * 1.2), poses, 1.0)[0].cause == "focal"
-    assert findings(series(height_m=true + 25.0), poses, 1.0)[0].cause == "height"
+    assert causes(series(height_m=true * 1.2), poses)[0] == "focal"
+    assert causes(series(height_m=true + 25.0), poses)[0] == "height"
 
 
 @pytest.mark.parametrize("shift_s", [-1.5, 0.5, 2.0])
@@ -189,15 +190,9 @@ def test_a_map_that_other_positions_contradict_is_named():
     assert findings(series(**reference), seen(), 5.0) == []  # within what the map states
 
 
-@pytest.mark.parametrize(
-    "angles",
-    [
-        np.column_stack([ANGLES[:, :2], np.zeros(N)]),  # a heading that is stuck
-        np.column_stack([ANGLES[:, :2], RNG.uniform(0, 360, N)]),
-    ],
-)
-def test_what_no_single_change_explains_is_said_not_to_fit(angles):
-    assert cause_of(angles_deg=angles) == ["attitude"]
+@pytest.mark.parametrize("headings_deg", [np.zeros(N), RNG.uniform(0, 360, N)], ids=["stuck", "random"])
+def test_what_no_single_change_explains_is_said_not_to_fit(headings_deg):
+    assert causes(with_headings(headings_deg), seen()) == ["attitude"]
 
 
 def test_what_is_not_known_is_not_said_to_fit():
@@ -214,7 +209,7 @@ def test_a_yaw_in_radians_that_was_wrapped_as_degrees_is_recognised():
         replace(one, attitude=replace(one.attitude, heading_deg=one.attitude.heading_deg - 100.0))
         for one in seen()
     ]
-    assert [found.cause for found in findings(series(angles_deg=angles), poses, 1.0)] == ["radians"]
+    assert causes(series(angles_deg=angles), poses) == ["radians"]
 
 
 @pytest.fixture(scope="module")
@@ -224,9 +219,11 @@ def over_a_town():
     plan = plan_flight(town=town, frames=6)
     site, camera, first = site_of(town), plan.camera, plan.truth_rows()[0]
     start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=15.0)
-    return list(
-        plan.iter_frames()
-    ), lambda frames: diagnose(frames, frames.__getitem__, site, camera, start=start).findings
+
+    def found_in(frames):
+        return diagnose(frames, frames.__getitem__, site, camera, start=start).findings
+
+    return list(plan.iter_frames()), found_in
 
 
 def test_pictures_say_it_by_themselves(over_a_town):
@@ -258,7 +255,7 @@ def radians_near_north(turning):
         replace(one, attitude=replace(one.attitude, heading_deg=float(true[one.index] + RNG.normal(0.0, 0.5))))
         for one in seen(outliers=0)
     ]
-    return series(angles_deg=np.column_stack([ANGLES[:, :2], np.radians(true)])), poses
+    return with_headings(np.radians(true)), poses
 
 
 @pytest.mark.parametrize("turning", [3, 6, 9, 13])
@@ -271,21 +268,26 @@ def test_headings_in_radians_are_named_where_most_of_them_are_near_north(turning
                        "velocity": (0, 15)}  # fmt: skip
 
 
+def in_words(telemetry, poses):
+    """What is said of the pictures."""
+    found = findings(telemetry, poses, 1.0)
+    known, off = is_known(telemetry, poses), contradictions(telemetry, poses)
+    return as_rows(Diagnosis(found, 16, 16, known, off))[-1][1]
+
+
 def test_the_share_that_contradicts_and_the_field_are_said():
     wrong, poses = radians_near_north(6)
-    found = Diagnosis(findings(wrong, poses, 1.0), 16, 16, is_known(wrong, poses), contradictions(wrong, poses))
-    assert as_rows(found)[-1][1].endswith("; 6 of 16 (38%) contradict the heading")
+    assert in_words(wrong, poses).endswith("; 6 of 16 (38%) contradict the heading")
     wrong, poses = radians_near_north(1)  # one picture may be placed wrong
-    found = Diagnosis(findings(wrong, poses, 1.0), 16, 16, is_known(wrong, poses), contradictions(wrong, poses))
-    assert found.findings == []
-    assert as_rows(found)[-1][1].endswith("they agree with the attitude, height, velocity, but 1 of 16 (6%) "
-                                          "contradicts the heading")  # fmt: skip
+    assert causes(wrong, poses) == []
+    stated = "they agree with the attitude, height, velocity, but 1 of 16 (6%) contradicts the heading"
+    assert in_words(wrong, poses).endswith(stated)
 
 
 def test_a_field_that_no_change_mends_is_suspected_by_its_name():
     headings = ANGLES[:, 2].copy()
     headings[::4] = RNG.uniform(0.0, 360.0, len(headings[::4]))
-    (found,) = findings(series(angles_deg=np.column_stack([ANGLES[:, :2], headings])), seen(outliers=0), 1.0)
+    (found,) = findings(with_headings(headings), seen(outliers=0), 1.0)
     assert found.cause == "attitude"
     assert found.text.startswith("heading of the telemetry and of the pictures differ")
 
@@ -293,20 +295,17 @@ def test_a_field_that_no_change_mends_is_suspected_by_its_name():
 def test_heights_that_are_coarse_are_not_wrong():
     """Steps of 5 m with an offset below 4 %, which no single picture contradicts."""
     poses = [replace(one, height_agl_m=120.0 + 4.0 * (-1) ** k) for k, one in enumerate(seen(outliers=0))]
-    assert findings(series(height_m=np.full(N, 116.5)), poses, 1.0) == []
-    assert [f.cause for f in findings(series(height_m=np.full(N, 110.0)), poses, 1.0)] == ["height"]
+    assert causes(series(height_m=np.full(N, 116.5)), poses) == []
+    assert causes(series(height_m=np.full(N, 110.0)), poses) == ["height"]
     exact = [replace(one, height_agl_m=120.0) for one in poses]
-    assert [f.cause for f in findings(series(height_m=np.full(N, 115.8)), exact, 1.0)] == ["height"]
+    assert causes(series(height_m=np.full(N, 115.8)), exact) == ["height"]
 
 
 def test_positions_of_what_the_middle_shows_are_no_shifted_map():
     """Of a camera that is tilted, where the telemetry knows of no tilt."""
     tilted = [replace(one, attitude=Attitude(5.0, 0.0, 0.0)) for one in seen(outliers=0)]
-    shown = PLACES + np.array(
-        [-120.0 * np.tan(np.radians(5.0)), 0.0]
-    )  # right side down: the nadir camera looks left
+    left_m = 120.0 * np.tan(np.radians(5.0))  # right side down: the nadir camera looks left
     angles = np.column_stack([np.full((N, 2), np.nan), np.zeros(N)])
-    known = {"reference_m": shown, "reference_sigma_m": np.full(N, 1.0)}
-    assert findings(series(angles_deg=angles, **known), tilted, 1.0) == []
-    known["reference_m"] = shown + np.array([0.0, 30.0])
-    assert [f.cause for f in findings(series(angles_deg=angles, **known), tilted, 1.0)] == ["map"]
+    telemetry = series(angles_deg=angles, reference_m=PLACES - (left_m, 0.0), reference_sigma_m=np.full(N, 1.0))
+    assert causes(telemetry, tilted) == []
+    assert causes(replace(telemetry, reference_m=PLACES - (left_m, -30.0)), tilted) == ["map"]

@@ -8,6 +8,7 @@ import tomllib
 import pytest
 
 from scenematch.cli.app import run
+from tests.support.commands import file_options
 from tests.support.paths import ROOT
 
 OF_DESKS = ("matplotlib",)
@@ -23,14 +24,6 @@ print("CODES", json.dumps([run(line) for line in {lines}]))
 """
 
 
-@pytest.fixture
-def files(flight):
-    return [
-        f"--map={flight / 'map.tif'}", f"--surface={flight / 'dsm.tif'}", f"--camera={flight / 'camera.yaml'}",
-        f"--frames={flight / 'frames'}", f"--telemetry={flight / 'telemetry.csv'}",
-    ]  # fmt: skip
-
-
 def run_without(lines):
     """Exit codes of commands in a new interpreter that has none of these packages, and what they said."""
     program = PROGRAM.format(absent=OF_DESKS, lines=[[str(word) for word in line] for line in lines])
@@ -39,8 +32,8 @@ def run_without(lines):
 
 
 @pytest.mark.slow
-def test_a_vehicle_needs_no_extra_of_a_desk(flight, files, tmp_path):
-    picture, out = sorted((flight / "frames").iterdir())[0], tmp_path / "out"
+def test_a_vehicle_needs_no_extra_of_a_desk(flight, tmp_path):
+    files, picture, out = file_options(flight), flight / "frames" / "000000.jpg", tmp_path / "out"
     truth = (flight / "truth.csv").read_text(encoding="utf-8").splitlines()[1].split(",")
     lines = [
         ["doctor"],
@@ -55,19 +48,18 @@ def test_a_vehicle_needs_no_extra_of_a_desk(flight, files, tmp_path):
         ["bridge", "mavlink", "--connect=udpout:127.0.0.1:9", *files, "--settings=bridge.seconds=0.1"],
     ]
     codes, stated = run_without(lines)
-    assert dict(zip([" ".join(map(str, line[:2])) for line in lines], codes, strict=True)) == {
-        " ".join(map(str, line[:2])): 0 for line in lines
-    }, stated
+    names = [" ".join(map(str, line[:2])) for line in lines]
+    assert dict(zip(names, codes, strict=True)) == dict.fromkeys(names, 0), stated
     assert "Traceback" not in stated
     assert (out / "report.html").is_file()
 
 
-def test_a_flight_is_tracked_without_an_extra_of_a_desk(files, tmp_path, monkeypatch):
+def test_a_flight_is_tracked_without_an_extra_of_a_desk(flight, tmp_path, monkeypatch):
     for name in OF_DESKS:
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setattr("engine.matching.matcher.SceneMatcher.warmup", lambda *_: None)
     out = tmp_path / "out"
-    assert run(["track", *files, f"--out={out}", "--method=ncc"]) == 0
+    assert run(["track", *file_options(flight), f"--out={out}", "--method=ncc"]) == 0
     assert (out / "report.html").is_file()
 
 

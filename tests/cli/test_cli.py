@@ -21,17 +21,17 @@ from scenematch.cli import console
 from scenematch.cli.app import run
 from scenematch.files.geotiff import write_geotiff
 from scenematch.runs import tracking as track_module
+from tests.support.commands import FILES, file_options, refusal
 
 COLUMNS = (
     "timestamp_ns,frame,status,reason,lat_deg,lon_deg,east_m,north_m,up_m,sigma_east_m,sigma_north_m,"
     "covariance_en_m2,score,method,window_width_px,window_height_px,latency_ms,deadline_met"
 )
 FRAMES = 6  # of `flight`
-FILES = {"map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames",
-         "telemetry": "telemetry.csv"}  # fmt: skip
 WRITTEN = {"track.csv", "summary.json", "notes.csv", "report.html"}
 pytestmark = pytest.mark.usefixtures("bare_runs")  # but for `done`, which is drawn before it
-SCRIPT = Path(sys.executable).with_name("scenematch")
+SCRIPT = str(Path(sys.executable).with_name("scenematch"))
+NARROW = os.environ | {"COLUMNS": "30", "TERM": "dumb"}
 
 
 @pytest.fixture
@@ -49,26 +49,12 @@ def done(flight, tmp_path_factory):
 
 
 def track(folder, out, *more, **replaced):
-    files = FILES | replaced
-    options = [f"--{name}={folder / file}" for name, file in files.items() if file is not None]
-    return ["track", *options, "--method=ncc", f"--out={out}", *map(str, more)]
-
-
-def error_line(capsys, arguments, code):
-    """The one line that a refused command leaves on standard error."""
-    assert run([str(argument) for argument in arguments]) == code
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.endswith("\n")
-    assert printed.err.count("\n") == 1, printed.err
-    assert printed.err.startswith("scenematch: ")
-    assert "\x1b" not in printed.err
-    return printed.err
+    return ["track", *file_options(folder, **replaced), "--method=ncc", f"--out={out}", *map(str, more)]
 
 
 def refused(capsys, folder, out, code, *words, more=(), **replaced):
     """A track is refused in one line that has these words, and no output folder is made."""
-    line = error_line(capsys, track(folder, out, *more, **replaced), code)
+    line = refusal(capsys, track(folder, out, *more, **replaced), code)
     for word in words:
         assert str(word) in line
     assert not out.exists()
@@ -152,31 +138,29 @@ def test_evaluate_reproduces_the_summary(done, tmp_path, capsys):
     assert json.loads((folder / "summary.json").read_text(encoding="utf-8")) == before
 
 
-def test_evaluate_takes_another_truth(done, flight, tmp_path, capsys):
+def test_a_truth_of_other_times_is_named_with_both_and_counts_no_false_fix(done, flight, tmp_path, capsys):
     folder = Path(shutil.copytree(done, tmp_path / "again"))
-    late = tmp_path / "late.csv"
-    late.write_text((flight / "truth.csv").read_text(encoding="utf-8"), encoding="utf-8")
-    for row in range(FRAMES):
-        set_cell(late, row, "timestamp_ns", str(10**15 + row * 10**8))
-    assert run(["evaluate", str(folder), f"--truth={late}", "--json"]) == 0
+    late = Path(shutil.copy(flight / "truth.csv", tmp_path / "late.csv"))
+    stamps = [int(row["timestamp_ns"]) for row in cells(late)]
+    for row, stamp in enumerate(stamps):
+        set_cell(late, row, "timestamp_ns", str(1_700_000_000_000_000_000 + stamp))
+    assert run(["evaluate", str(folder), f"--truth={late}"]) == 0
     printed = capsys.readouterr()
-    assert json.loads(printed.out)["scored_fixes"] == 0
-    assert str(late) in printed.err
+    when = f"{stamps[0] / 1e9:.1f} to {stamps[-1] / 1e9:.1f} s"
+    assert f"no fix is scored: expected a truth at the times of the fixes, {when}" in printed.err
+    assert f"got 2023-11-14T22:13:21Z to 2023-11-14T22:13:25Z in {late}" in printed.err
+    assert "false fixes" not in printed.out
+    assert json.loads((folder / "summary.json").read_text(encoding="utf-8"))["scored_fixes"] == 0
 
 
-def test_start_comes_before_the_telemetry(copy, tmp_path):
-    truth = cells(copy / "truth.csv")[0]
-    lines = (copy / "telemetry.csv").read_text(encoding="utf-8").splitlines(keepends=True)
-    (copy / "telemetry.csv").write_text("".join(lines[:2]), encoding="utf-8")
-    for later in sorted((copy / "frames").iterdir())[1:]:
-        later.unlink()
+def test_start_comes_before_the_telemetry(flight, tmp_path):
+    truth, out = cells(flight / "truth.csv")[0], tmp_path / "out"
     # So far from the truth, and so sure of it, that nothing but the start itself can lead astray.
     lat = float(truth["lat_deg"]) + 0.002
-    out = tmp_path / "out"
-    assert run(track(copy, out, f"--start={lat},{truth['lon_deg']},1")) == 0
-    assert cells(out / "track.csv")[0]["status"] == "no_fix" or (
-        abs(float(cells(out / "track.csv")[0]["lat_deg"]) - lat) < 0.001
-    )
+    given = [f"--start={lat},{truth['lon_deg']},1", f"--settings=input.every={FRAMES}"]
+    assert run(track(flight, out, *given)) == 0
+    (row,) = cells(out / "track.csv")
+    assert row["status"] == "no_fix" or abs(float(row["lat_deg"]) - lat) < 0.001
 
 
 def test_a_flight_without_truth_is_tracked_and_not_scored(copy, tmp_path, capsys):
@@ -262,15 +246,13 @@ def test_a_map_that_lies_badly_makes_a_fix_doubtful(flight, capsys):
         assert run([*base, *option]) == 0
         variances.append(np.diag(json.loads(capsys.readouterr().out)["covariance_m2"]))
     np.testing.assert_allclose(variances[1] - variances[0], 9.0, rtol=1e-4)
-    line = error_line(capsys, [*base[:-1], "--settings=input.map_sigma_m=0"], 2)
-    assert "--settings input.map_sigma_m: expected a number above 0" in line
 
 
 def test_a_start_off_the_map_and_a_picture_that_is_missing_are_refused(flight, tmp_path, capsys):
     refused(capsys, flight, tmp_path / "out", 2, "--start", more=["--start=10,10"])
     missing, files = flight / "none.jpg", [f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
-    assert "--start" in error_line(capsys, ["locate", flight / "frames/000000.jpg", *files, "--start=10,10"], 2)
-    assert str(missing) in error_line(capsys, ["locate", missing, *files], 1)
+    assert "--start" in refusal(capsys, ["locate", flight / "frames/000000.jpg", *files, "--start=10,10"], 2)
+    assert str(missing) in refusal(capsys, ["locate", missing, *files], 1)
 
 
 def test_map_info(flight, capsys):
@@ -287,7 +269,9 @@ def test_doctor(capsys):
     assert run(["doctor"]) == 0
     assert "torch" in capsys.readouterr().out
     assert run(["doctor", "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    printed = capsys.readouterr()
+    facts = json.loads(printed.out)
+    assert printed.err == ""
     assert facts["missing"] == "nothing"
     assert facts["numba"] == metadata.version("numba")
 
@@ -333,7 +317,7 @@ def test_version(capsys):
     ],
 )
 def test_wrong_usage(arguments, words, capsys):
-    line = error_line(capsys, arguments, 2)
+    line = refusal(capsys, arguments, 2)
     for word in words:
         assert word in line
     assert not Path("never-made").exists()
@@ -341,14 +325,14 @@ def test_wrong_usage(arguments, words, capsys):
 
 def test_an_output_folder_is_not_overwritten(done, flight, tmp_path, capsys):
     before = (done / "track.csv").read_bytes()
-    line = error_line(capsys, track(flight, done), 2)
+    line = refusal(capsys, track(flight, done), 2)
     assert "--out" in line
     assert "--force" in line
     assert (done / "track.csv").read_bytes() == before
     file = tmp_path / "file"
     file.touch()
-    assert str(file) in error_line(capsys, track(flight, file), 2)
-    assert str(file) in error_line(capsys, track(flight, file / "deeper", "--force"), 2)
+    assert str(file) in refusal(capsys, track(flight, file), 2)
+    assert str(file) in refusal(capsys, track(flight, file / "deeper", "--force"), 2)
 
 
 def test_force_replaces_results_and_touches_nothing_else(done, flight, tmp_path):
@@ -418,15 +402,15 @@ def test_telemetry_without_what_the_method_needs(copy, tmp_path, capsys):
 
 
 def test_evaluate_of_what_is_no_finished_track(done, tmp_path, capsys):
-    assert str(tmp_path) in error_line(capsys, ["evaluate", tmp_path], 1)
+    assert str(tmp_path) in refusal(capsys, ["evaluate", tmp_path], 1)
     folder = Path(shutil.copytree(done, tmp_path / "again"))
-    for content in ("[]", "{}", "{", '{"settings": []}', '{"settings": {"map": "x"}}'):
+    for content in ("", "5", "[]", '{"settings": []}', '{"settings": {"map": 1', "[" * 100_000):
         (folder / "summary.json").write_text(content, encoding="utf-8")
-        assert "summary.json" in error_line(capsys, ["evaluate", folder], 1)
+        assert "summary.json" in refusal(capsys, ["evaluate", folder], 1)
     (folder / "summary.json").unlink()
-    assert "summary.json" in error_line(capsys, ["evaluate", folder], 1)
+    assert "summary.json" in refusal(capsys, ["evaluate", folder], 1)
     edit(folder / "track.csv", "fix", "perhaps")
-    assert "track.csv" in error_line(capsys, ["evaluate", folder], 1)
+    assert "track.csv" in refusal(capsys, ["evaluate", folder], 1)
 
 
 def test_an_output_folder_that_cannot_be_made(flight, tmp_path, capsys, monkeypatch):
@@ -434,7 +418,7 @@ def test_an_output_folder_that_cannot_be_made(flight, tmp_path, capsys, monkeypa
         raise PermissionError(13, "Permission denied", str(self))
 
     monkeypatch.setattr(Path, "mkdir", deny)
-    line = error_line(capsys, track(flight, tmp_path / "out"), 1)
+    line = refusal(capsys, track(flight, tmp_path / "out"), 1)
     assert f"{tmp_path / 'out'}: Permission denied" in line
 
 
@@ -449,7 +433,7 @@ def test_an_error_in_the_middle_of_a_flight_names_the_frame_and_keeps_the_rows(
     original = track_module.Navigator.update
     monkeypatch.setattr(track_module.Navigator, "update", failing)
     out = tmp_path / "out"
-    line = error_line(capsys, track(flight, out), 1)
+    line = refusal(capsys, track(flight, out), 1)
     assert "000002.jpg" in line
     assert "sigma_m" in line
     assert len(cells(out / "track.csv")) == 2
@@ -469,13 +453,10 @@ def test_an_interrupted_run_keeps_its_rows(flight, tmp_path, capsys, monkeypatch
 
     original = track_module.track_row
     monkeypatch.setattr(track_module, "track_row", interrupting)
-    assert "interrupted" in error_line(capsys, track(flight, out), 130)
+    assert "interrupted" in refusal(capsys, track(flight, out), 130)
     assert len(cells(out / "track.csv")) == 3
     assert not (out / "summary.json").exists()
-    assert "summary.json" in error_line(capsys, ["evaluate", out], 1)
-
-
-NARROW = {"COLUMNS": "30", "TERM": "dumb"}
+    assert "summary.json" in refusal(capsys, ["evaluate", out], 1)
 
 
 def test_the_learned_method_says_what_is_wrong_with_its_weights(flight, tmp_path, capsys):
@@ -488,37 +469,35 @@ def test_the_learned_method_says_what_is_wrong_with_its_weights(flight, tmp_path
     more = (*learned, f"--settings=learned.weights={flight}/camera.yaml")
     refused(capsys, flight, out, 2, option, "camera.yaml", more=more)
     locate = ["locate", next(flight.joinpath("frames").iterdir()), f"--map={flight}/map.tif", *learned]
-    assert wanted in error_line(capsys, [*locate, f"--camera={flight}/camera.yaml"], 2)
+    assert wanted in refusal(capsys, [*locate, f"--camera={flight}/camera.yaml"], 2)
+
+
+def refused_by_script(*arguments):
+    """The line that the console script leaves in a narrow pipe."""
+    done = subprocess.run([SCRIPT, *arguments], env=NARROW, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done.stderr
+    return done.stderr
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_the_console_script_in_a_narrow_pipe(flight, tmp_path):
-    environment = os.environ | NARROW
     gone = flight / ("a-folder-with-a-rather-long-name/" * 3 + "map.tif")
-    command = [str(SCRIPT), *track(flight, tmp_path / "out", map=gone)]
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert (result.returncode, result.stdout) == (1, "")
-    assert result.stderr.count("\n") == 1
-    assert str(gone) in result.stderr
+    assert str(gone) in refused_by_script(*track(flight, tmp_path / "out", map=gone))
 
 
 @pytest.mark.slow
 def test_the_decoders_own_words_stay_off_standard_error(flight, tmp_path):
     (tmp_path / "flight.mp4").write_bytes(b"no video at all")
-    command = [str(SCRIPT), *track(flight, tmp_path / "out", frames=tmp_path / "flight.mp4")]
-    result = subprocess.run(command, env=os.environ | NARROW, capture_output=True, text=True, check=False)
-    assert (result.returncode, result.stdout, result.stderr.count("\n")) == (1, "", 1), result.stderr
+    refused_by_script(*track(flight, tmp_path / "out", frames=tmp_path / "flight.mp4"))
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_the_console_script_under_ctrl_c(tmp_path):
     out = tmp_path / "demo"
-    command = [str(SCRIPT), "demo", f"--out={out}"]
-    with subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | NARROW
-    ) as process:
+    command, pipe = [SCRIPT, "demo", f"--out={out}"], subprocess.PIPE
+    with subprocess.Popen(command, stderr=pipe, stdout=pipe, text=True, env=NARROW) as process:
         assert process.stderr.readline().startswith("drawing")
         for _ in range(60):  # as a user does it: C code may swallow the first
             process.send_signal(signal.SIGINT)

@@ -8,24 +8,14 @@ import sys
 
 import numpy as np
 import pytest
-from typer.main import get_command
 
-from scenematch.cli.app import app, run
+from scenematch.cli.app import run
 from scenematch.files.geotiff import write_geotiff
+from tests.support.commands import COMMANDS
 from tests.support.paths import ROOT
 
 HEAVY = ("torch", "numba", "numpy", "cv2", "rasterio", "pyproj", "matplotlib", "kornia", "PIL", "rich")
 MATCHING = ("torch", "kornia", "matplotlib")
-
-
-def commands(group, path=()):
-    """Every command by its words, groups too."""
-    yield path
-    for name, command in getattr(group, "commands", {}).items():
-        yield from commands(command, (*path, name))
-
-
-COMMANDS = list(commands(get_command(app)))
 
 
 def loaded_after(lines):

@@ -3,26 +3,14 @@
 import json
 
 import pytest
-from typer.main import get_command
 
-from scenematch.cli.app import app, run
-
-
-def leaves(command, path=()):
-    """Every command that can be run, by its words."""
-    if not hasattr(command, "commands"):
-        yield path, command
-        return
-    for name, each in command.commands.items():
-        yield from leaves(each, (*path, name))
+from scenematch.cli.app import run
+from tests.support.commands import LEAVES
 
 
-LEAVES = list(leaves(get_command(app)))
-
-
-@pytest.mark.parametrize("command", [pytest.param(command, id=" ".join(words)) for words, command in LEAVES])
-def test_every_command_takes_json(command):
-    assert any("--json" in option.opts for option in command.params)
+@pytest.mark.parametrize("words", LEAVES, ids=" ".join)
+def test_every_command_takes_json(words):
+    assert any("--json" in option.opts for option in LEAVES[words].params)
 
 
 def spoken(capsys, arguments, code):

@@ -6,18 +6,17 @@ import re
 import shlex
 
 import pytest
-from typer.main import get_command
 
 from scenematch.cli import console
-from scenematch.cli.app import app, run
-from tests.cli.test_json import LEAVES
+from scenematch.cli.app import run
+from tests.support.commands import COMMANDS, LEAVES, file_options
 
 pytestmark = pytest.mark.usefixtures("bare_runs")
 
 
-@pytest.mark.parametrize("command", [pytest.param(command, id=" ".join(words)) for words, command in LEAVES])
-def test_every_command_says_what_is_next(command):
-    assert "console.next_step(" in inspect.getsource(inspect.unwrap(command.callback))
+@pytest.mark.parametrize("words", LEAVES, ids=" ".join)
+def test_every_command_says_what_is_next(words):
+    assert "console.next_step(" in inspect.getsource(inspect.unwrap(LEAVES[words].callback))
 
 
 def next_of(capsys, arguments, code=0):
@@ -31,7 +30,7 @@ def next_of(capsys, arguments, code=0):
 
 def parsed(words):
     """The command that these words call, with its options; fails where there is no such one."""
-    command = get_command(app)
+    command = COMMANDS[()]
     while hasattr(command, "commands"):
         command, words = command.commands[words[0]], words[1:]
     known = {option for parameter in command.params for option in parameter.opts}
@@ -48,8 +47,7 @@ def flight(tmp_path_factory):
 
 def files_of(flight):
     """Options of a flight's files, as a command says them again."""
-    names = {"map": "map.tif", "camera": "camera.yaml", "frames": "frames", "telemetry": "telemetry.csv"}
-    return [word for option, name in names.items() for word in (f"--{option}", str(flight / name))]
+    return [word for option in file_options(flight, surface=None) for word in option.split("=")]
 
 
 def test_from_a_flight_to_its_export_by_what_is_said(flight, tmp_path, capsys, monkeypatch):
@@ -110,13 +108,6 @@ def test_a_path_with_two_spaces_stays_as_it_is(capsys):
     assert shlex.split(said)[2:] == ["track", "--map", "two  spaces/a map.tif", "--log-offset-s", "2"]
     console.say("one\n  line ")
     assert capsys.readouterr().err == "one line\n"
-
-
-def test_a_program_is_told_nothing(capsys):
-    assert run(["doctor", "--settings", "--json"]) == 0
-    printed = capsys.readouterr()
-    assert json.loads(printed.out)
-    assert "next:" not in printed.err
 
 
 def test_a_run_without_a_fix_is_followed_by_check_of_the_same_files(flight, tmp_path, capsys):

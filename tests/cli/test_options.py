@@ -6,10 +6,9 @@ from engine.errors import OptionError
 from scenematch.cli.app import run
 from scenematch.cli.options import FlightOptions, flight_options, live_view
 from scenematch.runs.settings import Settings
-from tests.cli.test_json import LEAVES
+from tests.support.commands import LEAVES
 
 MAX_COMMANDS, MAX_OPTIONS = 14, 150
-COMMANDS = {" ".join(words): command for words, command in LEAVES}
 
 
 def options(command):
@@ -17,13 +16,13 @@ def options(command):
 
 
 def test_there_are_few():
-    assert len(COMMANDS) <= MAX_COMMANDS
-    assert sum(len(options(command)) for command in COMMANDS.values()) <= MAX_OPTIONS
+    assert len(LEAVES) <= MAX_COMMANDS
+    assert sum(len(options(command)) for command in LEAVES.values()) <= MAX_OPTIONS
 
 
 def test_an_option_that_several_commands_have_is_of_one_kind():
     names = {}
-    for command in COMMANDS.values():
+    for command in LEAVES.values():
         for option in options(command):
             names.setdefault(option.name, set()).update(option.opts)
     spelled = {name: found for name, found in names.items() if len(found) > 1}

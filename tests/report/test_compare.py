@@ -13,19 +13,11 @@ from scenematch.runs.comparison import DEFAULT_RUNS, parse_runs
 from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.settings import TrackSettings
 from scenematch.runs.tracking import track
-
-
-@pytest.fixture(scope="module")
-def flight(flight_in, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("compare") / "flight"
-    flight_in(folder, frames=4)
-    return folder
+from tests.support.commands import file_options, refusal
 
 
 def command(flight, out, *more):
-    names = {"map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames"}
-    files = [f"--{option}={flight / name}" for option, name in names.items()]
-    return ["compare", *files, f"--telemetry={flight / 'telemetry.csv'}", f"--out={out}", *more]
+    return ["compare", *file_options(flight), f"--out={out}", *more]
 
 
 @pytest.mark.slow
@@ -41,7 +33,7 @@ def test_each_run_is_what_track_makes_of_it(flight, tmp_path, capsys):
     for name, summary in table.items():
         assert name in printed
         assert summary == json.loads((out / name / "summary.json").read_text(encoding="utf-8"))
-        assert len(read_track(out / name / "track.csv")) == summary["frames"] == 4
+        assert len(read_track(out / name / "track.csv")) == summary["frames"] == 6
     assert f"{table['ncc']['rms_m']:.2f}" in printed
     track(FlightFiles.in_folder(flight), tmp_path / "alone", TrackSettings(method="ncc"), report=False)
     alone, beside = (read_track(path / "track.csv") for path in (tmp_path / "alone", out / "ncc"))
@@ -49,8 +41,7 @@ def test_each_run_is_what_track_makes_of_it(flight, tmp_path, capsys):
     page = (out / "comparison.html").read_text(encoding="utf-8")
     assert all(f"Share of all frames by {what}" in page for what in ("error", "latency"))
 
-    assert run(command(flight, out, "--run=ncc")) == 2
-    assert "--force" in capsys.readouterr().err
+    assert "--force" in refusal(capsys, command(flight, out, "--run=ncc"))
     assert run(command(flight, out, "--run=sift", "--force", "--json")) == 0
     assert list(json.loads(capsys.readouterr().out)) == ["sift"]
 
@@ -60,27 +51,25 @@ def test_nothing_is_flown_or_made_before_every_run_is_found_possible(flight, tmp
     rows = [line.split(",") for line in (flight / "telemetry.csv").read_text(encoding="utf-8").splitlines()]
     column = rows[0].index("heading_deg")
     text = "\n".join(",".join(cells[:column] + cells[column + 1 :]) for cells in rows)
-    blind = flight / "blind.csv"
+    blind = tmp_path / "blind.csv"
     blind.write_text(text, encoding="utf-8")
     (tmp_path / "far.toml").write_text('method = "sift"\nstart = "0,0"\n', encoding="utf-8")
     out = tmp_path / "out"
     two = ["--run=sift", "--run=ncc"]
-    assert run([*command(flight, out, *two), f"--telemetry={blind}"]) == 1
-    assert "telemetry: ncc needs height_agl_m and heading_deg" in capsys.readouterr().err
+    line = refusal(capsys, [*command(flight, out, *two), f"--telemetry={blind}"], 1)
+    assert "telemetry: ncc needs height_agl_m and heading_deg" in line
     beyond = "\n".join([text.splitlines()[0] + ",heading_deg", *(f"{row}," for row in text.splitlines()[1:])])
     blind.write_text(beyond + "10\n", encoding="utf-8")  # a heading for the last frame alone
     assert run([*command(flight, out, *two, f"--run={tmp_path / 'far.toml'}"), f"--telemetry={blind}"]) == 2
     said = capsys.readouterr().err
-    assert "3 of 4 frames lack heading_deg, so ncc will refuse them; sift and auto do not need it" in said
-    assert run([*command(flight, out, *two), f"--camera={flight / 'none.yaml'}"]) == 1
-    assert "no such file" in capsys.readouterr().err
-    assert run(command(flight, out, "--run=ncc", f"--run={tmp_path / 'far.toml'}")) == 2
-    assert "--start: expected a place on the map" in capsys.readouterr().err
+    assert "5 of 6 frames lack heading_deg, so ncc will refuse them; sift and auto do not need it" in said
+    assert "no such file" in refusal(capsys, [*command(flight, out, *two), f"--camera={flight / 'none.yaml'}"], 1)
+    line = refusal(capsys, command(flight, out, "--run=ncc", f"--run={tmp_path / 'far.toml'}"))
+    assert line.startswith("--start: expected a place on the map")
     assert not out.exists()
     out.mkdir()
     (out / "sift").write_text("mine", encoding="utf-8")
-    assert run(command(flight, out, "--run=ncc", "--run=sift", "--force")) == 2
-    assert "sift is a file" in capsys.readouterr().err
+    assert "sift is a file" in refusal(capsys, command(flight, out, "--run=ncc", "--run=sift", "--force"))
     assert [path.name for path in out.iterdir()] == ["sift"]
 
 
@@ -89,23 +78,10 @@ def test_when_the_frames_of_a_log_were_taken_is_said_as_to_track(flight, tmp_pat
     monkeypatch.setattr("scenematch.runs.comparison.compare", lambda files, *_, **__: compared.append(files) or {})
     monkeypatch.setattr("scenematch.cli.tables.print_comparison", lambda *_: None)
     log, stamps = tmp_path / "flight.ulg", tmp_path / "stamps.csv"
-    options = [
-        f"--frames={tmp_path / 'flight.bag'}",
-        f"--telemetry={log}",
-        f"--settings=input.frame_stamps={stamps}",
-    ]
-    assert (
-        run(
-            command(
-                flight,
-                tmp_path,
-                *options,
-                "--settings=input.log_offset_s=-1.5",
-                "--settings=input.image_topic=/down",
-            )
-        )
-        == 0
-    )
+    settings = {"frame_stamps": stamps, "log_offset_s": -1.5, "image_topic": "/down"}
+    options = [f"--frames={tmp_path / 'flight.bag'}", f"--telemetry={log}"]
+    options += [f"--settings=input.{name}={value}" for name, value in settings.items()]
+    assert run(command(flight, tmp_path, *options)) == 0
     assert (compared[0].clock(), compared[0].image_topic) == (LogClock(stamps, -1.5), "/down")
     assert run(command(flight, tmp_path)) == 0
     assert (compared[1].has_clock, compared[1].image_topic) == (False, None)

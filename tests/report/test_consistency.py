@@ -11,7 +11,6 @@ from engine.geo import LocalFrame
 from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
 from scenematch.report.consistency import motion_consistency
-from scenematch.report.metrics import summarise
 
 FRAME = LocalFrame(48.2, 16.3)
 STEP_S = 0.5
@@ -64,15 +63,3 @@ def test_steps_without_a_velocity_or_too_long_do_not_count():
     for stated in (None, [], bare, telemetry[:-1]):
         assert motion_consistency(rows, stated, FRAME) is None
     assert motion_consistency([*refused, *refused][:1], telemetry[4:5], FRAME) is None
-
-
-def test_stated_sigmas_are_summed_up_without_truth():
-    sigmas = [(0.1 * k, 0.05 * k) for k in range(1, 21)]
-    rows = [
-        TrackRow(timestamp_ns=k, frame=str(k), status="fix", sigma_east_m=east, sigma_north_m=north)
-        for k, (east, north) in enumerate(sigmas)
-    ]
-    summary = summarise([*rows, TrackRow(timestamp_ns=99, frame="99", status="no_fix")])
-    assert summary["stated_sigma_median_m"] == pytest.approx(1.05)
-    assert summary["stated_sigma_p95_m"] == pytest.approx(np.percentile([east for east, _ in sigmas], 95))
-    assert summarise([])["stated_sigma_median_m"] is None

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import defaultdict
 from functools import cache
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ from rosbags.typesys import Stores, get_typestore
 from scenematch.report import live_view
 from scenematch.report.live_shapes import FIX_RGB, SIGMAS, ellipsoid
 from tests.support import browser
+from tests.support.commands import refusal
 
 FRAMES = 6
 DARK = 4  # a frame that shows nothing
@@ -115,6 +117,9 @@ def test_a_fixed_frame_has_all_that_is_promised_and_a_refused_one_does_not_show_
     for frame, row in enumerate(track):
         for entity in ("world/fixes", "plots/sigma_m"):
             assert (frame in rows[entity]) == row.fixed, entity
+        for logged in rows["world/fixes"].get(frame, []):
+            (place,) = logged["Points3D:positions"]
+            assert place == pytest.approx([row.east_m, row.north_m, row.up_m], abs=1e-3)
         for entity in (*live_view.PICTURES, *live_view.PLACES):
             (logged,) = rows[entity][frame]
             assert has_content(logged) == (row.fixed and entity != "matches"), (entity, frame)
@@ -128,14 +133,6 @@ def test_sift_shows_its_matches(flown):
     fixed = [frame for frame in range(FRAMES) if frame != DARK]
     assert all(has_content(rows["matches"][frame][0]) for frame in fixed)
     assert not any(has_content(rows["surface"][frame][0]) for frame in fixed)
-
-
-def test_places_are_those_of_the_track(runs):
-    rows = rows_of(runs / "ncc.rrd")
-    for frame, row in enumerate(read_track(runs / "ncc-on" / "track.csv")):
-        if row.fixed:
-            (place,) = rows["world/fixes"][frame][0]["Points3D:positions"]
-            assert place == pytest.approx([row.east_m, row.north_m, row.up_m], abs=1e-3)
 
 
 def test_the_frame_is_the_picture_that_was_taken(runs):
@@ -251,66 +248,38 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
             Connection("udpin", "127.0.0.1", 0), quiet, MavlinkOptions(), watch=stated.append
         )
     else:
-        made = RosBridge(SilentNode(), sim_site, quiet, RosOptions(), watch=stated.append)
+        messages = MessageFactory(get_typestore(Stores.ROS2_HUMBLE).types.__getitem__, False)
+        node = SimpleNamespace(
+            messages=messages, now_ns=lambda: 1, has_subscribers=lambda output: False, publish=lambda *_: None
+        )
+        made = RosBridge(node, sim_site, quiet, RosOptions(), watch=stated.append)
     made.deliver(answer)
     made.close()
     assert stated == [answer]
 
 
-class SilentNode:
-    """A node to which nobody listens."""
-
-    messages = MessageFactory(get_typestore(Stores.ROS2_HUMBLE).types.__getitem__, False)
-
-    def now_ns(self):
-        return 1
-
-    def has_subscribers(self, output):
-        return False
-
-    def publish(self, output, message):
-        pass
-
-
 # -------------------------------------------------------------------------------------------- what is refused
 
 
-def refusal(capsys, *more):
-    """The exit code of a track with a wish, and its one line."""
-    command = ["track", "--map", "m.tif", "--camera", "c.yaml", "--frames", "f", "--out", "no-such-folder"]
-    code = run([*command, *more])
-    return code, capsys.readouterr().err.strip().splitlines()
-
-
 def test_what_cannot_be_watched_is_refused_in_one_line_before_any_work(tmp_path, capsys, monkeypatch):
+    def refused(view, code=2):
+        command = ["track", "--map", "m.tif", "--camera", "c.yaml", "--frames", "f", "--out", "no-such-folder"]
+        return refusal(capsys, [*command, "--rerun", view], code)
+
     there = tmp_path / "there.rrd"
     there.touch()
-    assert refusal(capsys, "--rerun", str(there)) == (
-        2,
-        [f"scenematch: --rerun: {there} exists; choose another file"],
-    )
-    code, (line,) = refusal(capsys, "--rerun", "view.rec")
-    assert (code, line) == (2, "scenematch: --rerun: expected a file that ends in .rrd, got view.rec")
+    assert refused(there) == f"--rerun: {there} exists; choose another file\n"
+    assert refused("view.rec") == "--rerun: expected a file that ends in .rrd, got view.rec\n"
     for address in ("here:port", ":9876", "here:70000"):
-        code, (line,) = refusal(capsys, "--rerun", address)
-        assert (code, line) == (2, f"scenematch: --rerun: expected HOST:PORT, got {address!r}")
+        assert refused(address) == f"--rerun: expected HOST:PORT, got {address!r}\n"
     with socket.socket() as taken:  # bound, and nobody listens
         taken.bind(("127.0.0.1", 0))
-        code, (line,) = refusal(capsys, "--rerun", f"127.0.0.1:{taken.getsockname()[1]}")
-    assert code == 1
+        line = refused(f"127.0.0.1:{taken.getsockname()[1]}", code=1)
     assert "no viewer listens" in line
     assert "rerun --bind 127.0.0.1" in line
     monkeypatch.setitem(sys.modules, "rerun", None)
-    code, (line,) = refusal(capsys, "--rerun", "view.rrd")
-    assert (code, line) == (
-        1,
-        "scenematch: expected rerun-sdk to be installed, got none: pip install 'scenematch-engine[live]'",
-    )
-
-
-def test_a_simulated_flight_that_nobody_flies_has_no_view(capsys):
-    assert run(["simulate", "--out", "x", "--rerun", "a.rrd"]) == 2
-    assert "--rerun: expected with --closed-loop only" in capsys.readouterr().err
+    missing = "expected rerun-sdk to be installed, got none: pip install 'scenematch-engine[live]'\n"
+    assert refused("view.rrd", code=1) == missing
 
 
 # ---------------------------------------------------------------------------------------------- the viewer

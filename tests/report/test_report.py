@@ -48,9 +48,9 @@ def straight(seconds=10, **known):
 
 def test_counts_without_truth():
     rows = [
-        fix_at(0, 0, 0, latency_ms=10.0),
-        fix_at(0, 0, 1, latency_ms=20.0, method="sift"),
-        fix_at(0, 0, 2, latency_ms=30.0, deadline_met=False),
+        fix_at(0, 0, 0, (1.0, 0.5), latency_ms=10.0),
+        fix_at(0, 0, 1, (0.5, 2.0), latency_ms=20.0, method="sift"),
+        fix_at(0, 0, 2, (3.0, 1.0), latency_ms=30.0, deadline_met=False),
         refusal_at(3, "late", latency_ms=140.0, deadline_met=False),
         refusal_at(4, "late"),
         refusal_at(5, "ambiguous"),
@@ -65,19 +65,15 @@ def test_counts_without_truth():
         "methods": {"ncc": 2, "sift": 1},
         "latency_ms": {"p50": 25.0, "p95": pytest.approx(123.5), "p99": pytest.approx(136.7), "max": 140.0},
         "deadlines_missed": 2,
-        "stated_sigma_median_m": 1.0,
-        "stated_sigma_p95_m": 1.0,
+        "stated_sigma_median_m": 2.0,  # of the larger of each
+        "stated_sigma_p95_m": pytest.approx(2.9),
     }
 
 
 def test_an_empty_track_has_a_summary():
     summary = summarise([], straight())
-    assert (summary["frames"], summary["availability"], summary["rms_m"], summary["method"]) == (
-        0,
-        None,
-        None,
-        None,
-    )
+    assert summary["frames"] == 0
+    assert {summary[key] for key in ("availability", "rms_m", "method", "stated_sigma_median_m")} == {None}
     assert summary["latency_ms"] == {"p50": None, "p95": None, "p99": None, "max": None}
 
 
@@ -91,11 +87,8 @@ def test_errors_are_fix_less_truth_east_and_north():
 
 def test_accuracy_of_known_errors():
     offsets = [3.0, -4.0, 0.0, 12.0]
-    rows = [fix_at(7.0 * t + offset, 3.0 * t, t) for t, offset in enumerate(offsets)] + [
-        refusal_at(5),
-        fix_at(0, 0, 50),
-    ]
-    summary = summarise(rows, straight(), frame=HERE)
+    rows = [fix_at(7.0 * t + offset, 3.0 * t, t) for t, offset in enumerate(offsets)]
+    summary = summarise([*rows, refusal_at(5), fix_at(0, 0, 50)], straight(), frame=HERE)
     assert summary["rms_m"] == pytest.approx(math.sqrt((9 + 16 + 0 + 144) / 4), abs=1e-5)
     assert summary["median_m"] == pytest.approx(3.5, abs=1e-5)
     assert summary["r95_m"] == pytest.approx(np.percentile([3, 4, 0, 12], 95), abs=1e-5)

@@ -19,7 +19,6 @@ from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.reporting import report
 from scenematch.runs.settings import TrackSettings
 from scenematch.runs.tracking import track
-from tests.support.browser import missing, open_browser
 from tests.support.contrast import SCRIPT
 from tests.support.runs import bare_runs
 
@@ -28,14 +27,6 @@ pytestmark = pytest.mark.slow
 PAGES = ("nust", "gazebo-a1-evening", "closed-loop", "runs")
 WIDTHS = {"desk": 1400, "phone": 390}
 EVERY = 12  # frame of a shared flight that is followed
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if missing():
-        pytest.skip(missing())
-    with open_browser() as opened:
-        yield opened
 
 
 def thinned(source, target):
@@ -61,10 +52,8 @@ def followed(flight, out, method="ncc", **given):
 
 
 @pytest.fixture(scope="module")
-def pages(shared, tmp_path_factory):
-    """The pages by name."""
-    if missing():
-        pytest.skip(missing())
+def pages(shared, browser, tmp_path_factory):
+    """The pages by name; none are made where no browser shows them."""
     folder = tmp_path_factory.mktemp("pages")
     nust, evening = shared / "nust", shared / "gazebo-a1-evening"
     with bare_runs():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -39,8 +38,7 @@ def test_it_grows_uncertain_while_nobody_watches(monkeypatch):
 
 def test_it_outlives_a_process_that_is_killed(tmp_path):
     path = tmp_path / "cache" / "last-fix"
-    there = {**os.environ, "PYTHONPATH": str(ROOT)}
-    subprocess.run([sys.executable, "-c", SCRIPT, str(path)], env=there, check=False)
+    subprocess.run([sys.executable, "-c", SCRIPT, str(path)], cwd=ROOT, check=False)
     prior = LastFix(path).prior(15.0)
     assert (prior.lat_deg, prior.lon_deg) == (48.2, 16.37)
 
@@ -48,13 +46,10 @@ def test_it_outlives_a_process_that_is_killed(tmp_path):
 def test_it_is_forgotten_after_a_minute_and_when_the_computer_starts_again(tmp_path, monkeypatch):
     memory = LastFix(tmp_path / "last-fix")
     memory.keep(FIX)
-    later_s = time.monotonic() + 61.0
-    with monkeypatch.context() as patch:
-        patch.setattr(last_fix.time, "monotonic", lambda: later_s)
-        assert memory.prior(15.0) is None
-    with monkeypatch.context() as patch:
-        patch.setattr(last_fix.time, "monotonic", lambda: 1.0)  # a clock that began anew
-        assert memory.prior(15.0) is None
+    for now_s in (time.monotonic() + 61.0, 1.0):  # a clock that began anew
+        with monkeypatch.context() as patch:
+            patch.setattr(last_fix.time, "monotonic", lambda now_s=now_s: now_s)
+            assert memory.prior(15.0) is None
     boot = tmp_path / "boot_id"
     boot.write_text("0f0e0d0c-0b0a-0908-0706-050403020100\n", encoding="ascii")
     monkeypatch.setattr(last_fix, "_BOOT_ID", boot)

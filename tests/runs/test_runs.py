@@ -9,21 +9,17 @@ import pytest
 
 import scenematch.runs
 from engine import OptionError, TelemetryError
-from engine.errors import BackendError, MissingExtraError, require
+from engine.errors import BackendError, MissingExtraError
 from scenematch import (
-    AuditFiles,
     BridgeFiles,
     BridgeSettings,
     CameraInput,
     FlightFiles,
-    LiveViewTarget,
     MapInput,
     MavlinkSettings,
     Progress,
     TrackSettings,
     WorldSettings,
-    audit_map,
-    compare,
     evaluate,
     export_track,
     locate_image,
@@ -34,7 +30,6 @@ from scenematch import (
 )
 from scenematch.check import Diagnosis, Finding
 from scenematch.check.findings import Contradiction
-from scenematch.cli.tables import print_summary
 from scenematch.files.ros.bags import import_rosbags
 from scenematch.files.track import read_track
 from scenematch.files.truth import read_truth
@@ -73,7 +68,7 @@ def test_a_flight_is_tracked_in_three_lines_and_nothing_is_printed(flight, tmp_p
     files = FlightFiles.in_folder(str(flight))
     summary = track(files, "out", TrackSettings(method="sift"))
     assert (summary["frames"], summary["fixes"]) == (FRAMES, FRAMES)
-    assert summary["rms_m"] < 5.0
+    assert summary["rms_m"] < 2.0
     assert {"track.csv", "summary.json", "report.html"} <= {path.name for path in (tmp_path / "out").iterdir()}
     assert capfd.readouterr() == ("", "")
 
@@ -91,34 +86,9 @@ def test_one_frame_in_two_is_tracked_and_scored_again(flight, tmp_path):
     assert (tmp_path / "out" / "report.html").read_bytes() == page  # with the pictures of the same frames
 
 
-def test_a_truth_of_other_times_is_named_with_both_and_counts_no_false_fix(flight, tmp_path, capsys):
-    progress, out = Recorded(), tmp_path / "out"
-    summary = track(FlightFiles.in_folder(str(flight)), out, report=False)
-    first, *rows = (flight / "truth.csv").read_text().splitlines()
-    stamps = [int(row.split(",")[0]) for row in rows]
-    later = [
-        f"{1_700_000_000_000_000_000 + t},{row.split(',', 1)[1]}" for t, row in zip(stamps, rows, strict=True)
-    ]
-    (tmp_path / "truth.csv").write_text("\n".join([first, *later]) + "\n", encoding="utf-8")
-    again = evaluate(out, tmp_path / "truth.csv", progress=progress)
-    assert (summary["scored_fixes"], again["scored_fixes"]) == (FRAMES, 0)
-    last = progress.messages[-1]
-    assert last.startswith(
-        f"no fix is scored: expected a truth at the times of the fixes, {stamps[0] / 1e9:.1f} to "
-    )
-    assert "got 2023-11-14T22:13:21Z to 2023-11-14T22:13:22Z in " in last
-    print_summary(again, False, "track", out)
-    assert "false fixes" not in capsys.readouterr().out
-
-
 def test_progress_is_shown_what_a_run_does(flight, tmp_path):
     progress = Recorded()
-    files = FlightFiles.from_flat(
-        map=flight / "map.tif",
-        camera=flight / "camera.yaml",
-        frames=flight / "frames",
-        telemetry=flight / "telemetry.csv",
-    )
+    files = FlightFiles.in_folder(flight)
     (flight / "frames" / "spare.jpg").write_bytes((flight / "frames" / "000000.jpg").read_bytes())
     track(files, tmp_path / "out", report=False, progress=progress)
     (flight / "frames" / "spare.jpg").unlink()
@@ -154,24 +124,18 @@ def refused(call, *arguments, **named):
 
 def test_errors_name_arguments(flight, tmp_path):
     files = FlightFiles.in_folder(flight)
-    assert refused(TrackSettings, start="here").startswith("start: expected LAT,LON[,SIGMA_M]")
     assert refused(TrackSettings, budget_ms=-1.0) == "budget_ms: expected milliseconds above 0, got -1"
-    assert refused(TrackSettings, method="orb") == "method: expected one of ncc, sift, auto, learned, got 'orb'"
-    assert refused(FlightFiles, map="m.tif", frames="f.mp4").startswith("camera: expected a calibration")
-    clock = refused(FlightFiles, map="m.tif", frames="f", camera="c.yaml", log_offset_s=1.0)
-    assert clock.startswith("frame_stamps, log_offset_s: expected a log as telemetry")
     assert refused(track, files, flight) == (
         f"out: {flight} exists; choose another folder, or add `force` to replace its results"
     )
     far = TrackSettings(start="0,0")
-    assert refused(track, files, tmp_path / "out", far).startswith("start: expected a place on the map")
+    off_it = refused(track, files, tmp_path / "out", far)
+    assert off_it.startswith("start: expected a place on the map")
+    assert "swapped" not in off_it
     place = next(iter(read_truth(flight / "truth.csv")))
     swapped = TrackSettings(start=f"{place.lon_deg},{place.lat_deg}")
     assert refused(track, files, tmp_path / "out", swapped).endswith("; are latitude and longitude swapped?")
-    assert "swapped" not in refused(track, files, tmp_path / "out", far)
-    assert refused(compare, files, tmp_path / "out", {"far": far}).startswith("start: expected a place on the map")
     assert refused(export_track, tmp_path, "shp").startswith("kind: expected one of gpx")
-    assert refused(WorldSettings, surface="dsm.tif") == "surface: expected with `map` only, got dsm.tif"
     assert not (tmp_path / "out").exists()
 
 
@@ -234,8 +198,6 @@ def ulog():
         ("rosbags", "rosbags", "bags", import_rosbags),
         ("rosbags.highlevel", "rosbags", "bags", import_rosbags),
         ("pyulog", "pyulog", "logs", ulog),
-        ("matplotlib", "matplotlib", "desk", lambda: audit_map(AuditFiles(map=MapInput("m.tif")), "audit")),
-        ("rerun", "rerun-sdk", "live", lambda: LiveViewTarget("view.rrd").check()),
     ],
 )
 def test_a_missing_extra_is_always_the_same_error(module, package, extra, use, monkeypatch):
@@ -246,10 +208,6 @@ def test_a_missing_extra_is_always_the_same_error(module, package, extra, use, m
     assert str(caught.value) == (
         f"expected {package} to be installed, got none: pip install 'scenematch-engine[{extra}]'"
     )
-
-
-def test_what_is_installed_is_imported():
-    assert require("json", "none").loads("1") == 1
 
 
 @pytest.mark.parametrize("is_wrong", [True, False])

@@ -25,12 +25,8 @@ shared = LastFix()
 end_on_sigterm()
 try:
     become_worker()
-except KeyboardInterrupt:
-    print("table", flush=True)
-    sys.exit(3)
-prior, begun_s = shared.prior(15.0), time.monotonic()
-shared.keep(SimpleNamespace(lat_deg=48.0, lon_deg=16.0, sigma_m=0.5))
-try:
+    prior, begun_s = shared.prior(15.0), time.monotonic()
+    shared.keep(SimpleNamespace(lat_deg=48.0, lon_deg=16.0, sigma_m=0.5))
     print(os.getpid(), "none" if prior is None else round(prior.lat_deg), begun_s, flush=True)
     time.sleep(300.0)
 except KeyboardInterrupt:
@@ -41,8 +37,7 @@ except KeyboardInterrupt:
 
 @pytest.fixture
 def supervisor():
-    there = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen([sys.executable, "-c", SCRIPT], stdout=subprocess.PIPE, text=True, env=there) as process:
+    with subprocess.Popen([sys.executable, "-c", SCRIPT], stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         yield process
         process.kill()
 
@@ -81,10 +76,8 @@ def test_sigterm_between_the_fork_and_the_wait_is_not_lost(by):
     """To the supervisor, which does not know its worker yet, or to the worker, which has not its handlers yet."""
     early = "import os, signal\nfork = os.fork\ndef early():\n    pid = fork()\n"
     early += f"    if pid:\n        os.kill({by}, signal.SIGTERM)\n    return pid\nos.fork = early\n"
-    there = {**os.environ, "PYTHONPATH": str(ROOT)}
-    ended = subprocess.run(
-        [sys.executable, "-c", early + SCRIPT], capture_output=True, text=True, env=there, timeout=60
-    )
+    command = [sys.executable, "-c", early + SCRIPT]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
     assert ended.stdout.endswith("table\n")
     assert ended.returncode == 3
 

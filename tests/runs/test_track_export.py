@@ -80,10 +80,9 @@ def test_evo_reports_the_rms_of_the_summary(finished):
 def test_a_run_of_before_is_exported_without_what_it_did_not_note(finished, tmp_path):
     for name in ("track.csv", "summary.json"):
         (tmp_path / name).write_bytes((finished / name).read_bytes())
-    lines = (finished / "notes.csv").read_text().splitlines()
-    (tmp_path / "notes.csv").write_text("\n".join(",".join(line.split(",")[:7]) + "," for line in lines[1:]))
     head = "frame,state,window_x0_px,window_y0_px,heading_deg,stage,confidence,detail"
-    (tmp_path / "notes.csv").write_text(f"{head}\n{(tmp_path / 'notes.csv').read_text()}\n")
+    lines = [line.split(",") for line in (finished / "notes.csv").read_text().splitlines()[1:]]
+    (tmp_path / "notes.csv").write_text("\n".join([head, *(",".join([*line[:7], ""]) for line in lines), ""]))
     stated = export_track(tmp_path, "tum")
     assert stated["left_out"] == 0
     text = (tmp_path / "track.tum").read_text()

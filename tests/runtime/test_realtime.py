@@ -33,9 +33,8 @@ def permitted(realtime: Realtime) -> bool:
 
 def run(code: str) -> str:
     """What a process of its own prints: memory that is locked stays so."""
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
-    ).stdout
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True).stdout
 
 
 @linux
@@ -129,22 +128,14 @@ def test_another_system_is_refused(monkeypatch):
         set_realtime()
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"priority": 0}, {"priority": 99}, {"nice": 0}, {"nice": -21}, {"cores": (-1,)}, {"cores": (10_000,)}],
-)
-def test_numbers_out_of_range_are_refused(wrong):
-    with pytest.raises(OptionError, match=rf"^{next(iter(wrong))}: expected"):
-        Realtime(**wrong)
+@pytest.mark.parametrize("priority", [0, 99])
+def test_priorities_out_of_range_are_refused(priority):
+    with pytest.raises(OptionError, match=r"^priority: expected"):
+        Realtime(priority=priority)
 
 
-def test_the_settings_of_a_bridge_say_how_it_is_scheduled():
-    assert BridgeSettings().scheduling() is None
+def test_a_bridge_is_scheduled_as_usual_unless_told():
     assert BridgeSettings(nice=None, cores=()).scheduling() is None
-    with pytest.raises(OptionError, match=r"^nice: expected with `realtime` only"):
-        BridgeSettings(nice=-5)
-    with pytest.raises(OptionError, match=r"^cores: expected with `realtime` only"):
-        BridgeSettings(cores=(0,))
 
 
 @pytest.mark.parametrize(("busy", "said"), [(0.5, 0), (0.99, 1)])

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import ast
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
-from tests.support.towns import drawn_town
+from tests.support.commands import file_options
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 ENGINE = ROOT / "engine"
 SAY = "\nimport sys; print('TORCH', 'torch' in sys.modules)"
 FLIGHT = """
@@ -49,29 +45,20 @@ for method in sys.argv[1:]:
 
 
 def run(program, *words):
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, "-c", program + SAY, *words],
-        capture_output=True, text=True, check=True, env=environment,
-    )  # fmt: skip
+    command = [sys.executable, "-c", program + SAY, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     return done.stdout.split()
 
 
-def imported(path: Path, *, at_top: bool) -> Iterator[str]:
-    """Modules that a file imports when it runs, everywhere or at its top; those for types alone are not run."""
-
-    def walk(node: ast.AST) -> Iterator[str]:
+def imported(node: ast.AST) -> Iterator[str]:
+    """Modules that this code imports when it runs; those for types alone are not run."""
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        yield node.module or ""
+    elif not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
         for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
-                continue
-            if isinstance(child, ast.Import):
-                yield from (alias.name for alias in child.names)
-            elif isinstance(child, ast.ImportFrom):
-                yield child.module or ""
-            elif not (at_top and isinstance(child, ast.FunctionDef | ast.ClassDef)):
-                yield from walk(child)
-
-    return walk(ast.parse(path.read_text()))
+            yield from imported(child)
 
 
 def test_one_module_imports_torch():
@@ -79,20 +66,14 @@ def test_one_module_imports_torch():
         str(path.relative_to(ENGINE))
         for path in ENGINE.rglob("*.py")
         if "torch" in path.read_text()  # few are worth parsing
-        and any(name.split(".")[0] == "torch" for name in imported(path, at_top=False))
+        and any(name.split(".")[0] == "torch" for name in imported(ast.parse(path.read_text())))
     }
     assert found == {"runtime/tensors.py"}
 
 
 def test_modules_of_the_way_load_no_torch():
-    names = (
-        "engine.matching.matcher",
-        "engine.navigation.navigator",
-        "engine.navigation.live",
-        "engine.matching.auto",
-    )
-    names += ("scenematch.runs.tracking", "scenematch.runs.mavlink_bridge", "scenematch.report.page")
-    assert run("".join(f"import {name}\n" for name in names)) == ["TORCH", "False"]
+    product = "from scenematch.runs import mavlink_bridge, tracking\nfrom scenematch.report import page"
+    assert run(f"import engine.navigation.live\n{product}") == ["TORCH", "False"]
 
 
 def test_a_flight_on_the_cpu_loads_no_torch():
@@ -101,16 +82,10 @@ def test_a_flight_on_the_cpu_loads_no_torch():
 
 
 @pytest.mark.slow
-def test_tracking_loads_no_torch(tmp_path):
-    folder = tmp_path / "flight"
-    write_flight(folder, plan_flight(town=drawn_town(), frames=3))
+def test_tracking_loads_no_torch(flight, tmp_path):
     program = "import sys; from scenematch.cli.app import run; assert run(sys.argv[1:]) == 0"
-    given = {
-        "map": folder / "map.tif", "surface": folder / "dsm.tif", "camera": folder / "camera.yaml",
-        "frames": folder / "frames", "telemetry": folder / "telemetry.csv", "out": tmp_path / "out",
-    }  # fmt: skip
-    words = ["--method=auto", "--device=cpu", *(f"--{name}={value}" for name, value in given.items())]
-    assert run(program, "track", *words)[-2:] == ["TORCH", "False"]
+    words = ["track", *file_options(flight), "--method=auto", "--device=cpu", f"--out={tmp_path / 'out'}"]
+    assert run(program, *words)[-2:] == ["TORCH", "False"]
     assert (tmp_path / "out" / "report.html").exists()
 
 

@@ -102,7 +102,7 @@ class Browser:
     def press(self, key: str) -> None:
         """A key of the keyboard, by its name in the DOM."""
         for kind in ("keyDown", "keyUp"):
-            codes = {"ArrowLeft": 37, "ArrowRight": 39, "Tab": 9, "Home": 36, "End": 35}
+            codes = {"ArrowLeft": 37, "ArrowRight": 39, "End": 35}
             event = {"type": kind, "key": key, "code": key, "windowsVirtualKeyCode": codes[key]}
             self.driver.execute_cdp_cmd("Input.dispatchKeyEvent", event)
 
@@ -116,12 +116,9 @@ class Browser:
         sent = (e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent")
         return [url for url in sent if not url.startswith(("data:", "chrome:"))]
 
-    def save(self, path: Path, element: str | None = None) -> None:
-        """A picture of the window, or of one element."""
-        if element is None:
-            self.driver.save_screenshot(str(path))
-        else:
-            self.driver.find_element("css selector", element).screenshot(str(path))
+    def save(self, path: Path) -> None:
+        """A picture of the window."""
+        self.driver.save_screenshot(str(path))
 
 
 @contextmanager

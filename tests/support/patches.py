@@ -15,6 +15,8 @@ GSD = 0.25
 SIZE = 1200
 CAMERA = Camera.from_fov(300, 300, 60.0)
 ORIGIN = transformer(EPSG).transform(16.45, 48.25)
+CONVERGENCE = np.radians(1.08)  # east of the central meridian true north leans to the left of grid north
+TO_GRID = np.array([[np.cos(CONVERGENCE), -np.sin(CONVERGENCE)], [np.sin(CONVERGENCE), np.cos(CONVERGENCE)]])
 TO_CRS = np.array([[GSD, 0.0, ORIGIN[0] - SIZE / 2 * GSD], [0.0, -GSD, ORIGIN[1] + SIZE / 2 * GSD]])
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from engine import OrthoMap
 from scenematch.simulator import Town, build_town
@@ -51,3 +52,16 @@ def site_of(town, *, surface=True):
     gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)
     heights = town.surface_m if surface else None
     return OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=heights)
+
+
+def under_map(town, raster):
+    """A raster of a town's world where its map lies, (H, 2, W, 2): four pixels to one of the map's.
+
+    The middle of the map's first pixel is the corner of four.
+    """
+    first = town.pixel_to_crs[:, 2] - town.world.pixel_to_crs[:, 2]
+    corner = np.linalg.inv(town.world.pixel_to_crs[:, :2]) @ first
+    np.testing.assert_allclose(corner % 1.0, 0.5, atol=1e-5)
+    x, y = np.floor(corner).astype(int)
+    height, width = town.surface_m.shape
+    return raster[y : y + 2 * height, x : x + 2 * width].reshape(height, 2, width, 2)

@@ -1,0 +1,130 @@
+"""What cannot be simulated is refused by the name of the argument."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from engine.camera import Camera
+from engine.errors import MapError, OptionError, ShapeError
+from engine.values import Attitude
+from scenematch.runs.simulation import WorldSettings
+from scenematch.simulator import (
+    Condition,
+    FlightStyle,
+    Optics,
+    SensorNoise,
+    World,
+    build_town,
+    plan_flight,
+    render_frame,
+    take_picture,
+    world_from_map,
+)
+from scenematch.simulator.faults import Fault
+from scenematch.simulator.flight import DRONE_SENSOR, paper_camera
+from scenematch.simulator.light import LIGHTS
+from scenematch.simulator.loop import LoopOptions
+from scenematch.simulator.pilot import Gains, plan_rounds, plan_route
+from scenematch.simulator.quadrotor import Airframe, Wind
+from scenematch.simulator.render import Glint
+from scenematch.simulator.sensors import Barometer, Compass, Imu, steps_between
+from tests.support.patches import CAMERA, EPSG, ORIGIN, TO_CRS, patch_world
+
+LEVEL = Attitude(0.0, 0.0, 0.0)
+BENT = Camera(300, 300, CAMERA.matrix, distortion=np.array([0.1, 0, 0, 0, 0]))
+WIDE = Camera(300, 300, np.array([[60, 0, 149.5], [0, 60, 149.5], [0, 0, 1]]), "equidistant", np.zeros(4))
+SMALL = np.zeros((3, 3), np.float32)
+
+
+@cache
+def world():
+    return patch_world(600, 600, 30.0)
+
+
+def seen(height_agl_m=150.0, attitude=LEVEL, camera=CAMERA):
+    return render_frame(world(), camera, ORIGIN, height_agl_m, attitude)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: seen(height_agl_m=25.0), "height_agl_m: expected above the highest"),
+        (lambda: seen(attitude=Attitude(0.0, 76.0, 0.0)), "attitude"),
+        (lambda: seen(camera=BENT), "camera: expected a pinhole"),
+        (lambda: seen(camera=paper_camera(-10.0)), "attitude: expected a camera that looks at the ground"),
+        (lambda: take_picture(world(), WIDE, ORIGIN, 150.0, LEVEL, np.random.default_rng(1), sensor=DRONE_SENSOR),
+         "camera: expected a lens"),
+        (lambda: Optics(exposure_ms=-1.0), "exposure_ms: expected 0 or more, got -1"),
+        (lambda: Optics(gain=0.0), "gain: expected"),
+        (lambda: Optics(exposure_samples=0), "exposure_samples"),
+        (lambda: WorldSettings(camera_pitch_deg=-20.0), "camera_pitch_deg: expected -90 .* to -30, got -20"),
+        (lambda: build_town(-1), "seed: expected 0 or more, got -1"),
+        (lambda: build_town(width_px=8), "town: expected 16 px"),
+        (lambda: build_town(condition="storm"), "condition: expected one of noon, evening, .*, got 'storm'"),
+        (lambda: build_town(relief_m=-1.0), "relief_m: expected 0 to"),
+        (lambda: build_town(changed=1.5), r"changed: expected 0 to 1, got 1\.5"),
+        (lambda: Condition(light=LIGHTS["noon"], snow=1.5), r"snow: expected 0 to 1, got 1\.5"),
+        (lambda: Condition(light=LIGHTS["noon"], visibility_m=0.0), "visibility_m: expected above 0"),
+        (lambda: SensorNoise(tilt_sd_deg=-1.0), "tilt_sd_deg: expected 0 or more, got -1"),
+        (lambda: SensorNoise(height_sd_m=math.nan), "height_sd_m"),
+        (lambda: FlightStyle(cruise_mps=0.0), "cruise_mps: expected a number above 0"),
+        (lambda: FlightStyle(acceleration_mps2=2.0), "peak_tilt_deg"),
+        (lambda: Airframe(mass_kg=-1.0), "mass_kg"),
+        (lambda: Airframe(max_thrust_n=10.0), "max_thrust_n"),
+        (lambda: Wind(gust_time_s=0.0), "gust_time_s"),
+        (lambda: Wind(mean_east_mps=math.nan), "wind"),
+        (lambda: Gains(velocity_per_s=0.0), "velocity_per_s"),
+        (lambda: plan_route(np.zeros((1, 2))), "waypoints_m"),
+        (lambda: plan_route(np.zeros((3, 2))), "waypoints_m"),
+        (lambda: plan_rounds((4.0, 50.0), 60.0), "half_m"),
+        (lambda: Fault(kind="lost"), "fault"),
+        (lambda: Fault(start_s=-1.0), "start_s"),
+        (lambda: Fault(duration_s=0.0), "duration_s"),
+        (lambda: Fault(shift_m=math.inf), "shift_m"),
+        (lambda: LoopOptions(frame_rate_hz=0.0), "rate_hz"),
+        (lambda: LoopOptions(hold_sigma_m=-1.0), "hold_sigma_m"),
+        *((lambda rate_hz=rate_hz: steps_between(rate_hz), "rate_hz") for rate_hz in (0.0, -1.0, 101.0, math.nan)),
+        *((lambda sensor=sensor, name=name: sensor(**{name: -1.0}), name)
+          for sensor in (Imu, Compass, Barometer) for name in sensor.__dataclass_fields__),
+    ],
+)  # fmt: skip
+def test_an_option_that_cannot_be_is_refused(make, words):
+    with pytest.raises(OptionError, match=words):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"frames": 0}, "frames"),
+        ({"rate_hz": 0.0}, "rate_hz"),
+        ({"style": FlightStyle(height_agl_m=400.0)}, "town: expected a map larger"),
+    ],
+)
+def test_a_flight_that_cannot_be_is_refused(sim_town, options, words):
+    with pytest.raises(OptionError, match=words):
+        plan_flight(town=sim_town, **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda one: World(one.rgb[1:], one.sides, one.height_m, TO_CRS, EPSG), "world: expected"),
+        (lambda one: World(one.rgb, one.sides, one.height_m, TO_CRS[:, :2], EPSG), "pixel_to_crs"),
+        (lambda one: replace(one, ground_m=SMALL), "ground_m: expected"),
+        (lambda one: replace(one, glint=Glint(LIGHTS["noon"], SMALL.astype(np.uint8))), "water: expected"),
+    ],
+)
+def test_rasters_of_a_world_fit_together(make, words):
+    with pytest.raises(ShapeError, match=words):
+        make(world())
+
+
+def test_a_world_of_no_map_is_refused(tmp_path):
+    with pytest.raises(MapError, match="does not exist"):
+        world_from_map(tmp_path / "none.tif")
