@@ -332,8 +332,8 @@ class Tracks:
 def _gain(track: Track, match: Match, ratio: float, best: float) -> float:
     """What a match that agrees with a track adds to its log-odds.
 
-    A wrong match of repeated structure recurs as long as the frame shows the same ground, and a wrong attitude moves
-    all matches that rest on it alike.
+    A wrong match of repeated structure recurs as long as the frame shows the same ground, and a wrong attitude
+    moves all matches that rest on it alike.
 
     Args:
         track: at the match's frame.
