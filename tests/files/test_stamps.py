@@ -2,9 +2,6 @@
 
 import csv
 import datetime
-import json
-import sqlite3
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -41,13 +38,9 @@ def stamps(path):
 def test_the_unit_is_recognised_and_said_in_one_line(tmp_path, truth_ns, per_s, word):
     given = [ns / 10**9 if per_s == 1 else ns * per_s // 10**9 for ns in truth_ns]
     found = open_telemetry(table(tmp_path / "t.csv", given))
-    wanted = truth_ns
-    assert [row.timestamp_ns for row in found.rows] == pytest.approx(wanted, abs=0, rel=1e-15)
-    if word is None:
-        assert found.remarks == []
-    else:
-        assert len(found.remarks) == 1
-        assert f"t.csv: timestamp_ns is taken as {word}" in found.remarks[0]
+    assert [row.timestamp_ns for row in found.rows] == pytest.approx(truth_ns, abs=0, rel=1e-15)
+    said = [] if word is None else [f"t.csv: timestamp_ns is taken as {word}"]
+    assert [remark.split(":")[:2] for remark in found.remarks] == [line.split(":") for line in said]
 
 
 @pytest.mark.parametrize(
@@ -74,9 +67,8 @@ def test_dates_as_python_writes_them(tmp_path):
 
 
 def test_dates_without_a_zone_are_utc_and_said(tmp_path):
-    with closing(sqlite3.connect(":memory:")) as database:  # another program's way to write a date
-        query = "SELECT strftime('%Y-%m-%d %H:%M:%f', ?, 'unixepoch')"
-        given = [database.execute(query, (ns / 1e9,)).fetchone()[0] for ns in UTC_NS]
+    moments = [datetime.datetime.fromtimestamp(ns / 1e9, datetime.UTC) for ns in UTC_NS]
+    given = [moment.strftime("%Y-%m-%d %H:%M:%S.%f")[:-3] for moment in moments]  # as a database writes them
     found = open_telemetry(table(tmp_path / "t.csv", given))
     assert [row.timestamp_ns for row in found.rows] == UTC_NS
     assert found.remarks == ["t.csv: timestamp_ns holds dates without a time zone, taken as UTC"]
@@ -160,4 +152,4 @@ def test_a_flight_says_how_it_was_read(tmp_path):
         Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "frames" / f"{k}.jpg")
     flight = open_flight(tmp_path / "frames", table(tmp_path / "telemetry.csv", [0, 33, 67]))
     assert list(flight.remarks) == ["telemetry.csv: timestamp_ns is taken as milliseconds: rows are 33.5 apart"]
-    assert json.dumps([row.timestamp_ns for row in flight.rows]) == "[0, 33000000, 67000000]"
+    assert [row.timestamp_ns for row in flight.rows] == [0, 33_000_000, 67_000_000]
