@@ -70,22 +70,6 @@ def test_the_settings_name_them(tmp_path):
     assert options_from_mapping(TrackSettings, nested(recorded)) == settings
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ('altitude = "alt"', "telemetry_columns: expected one of timestamp_ns, "),
-        ('frame = " "', "telemetry_columns.frame: expected the name of a column, got an empty one"),
-        ("frame = 3", "telemetry_columns.frame: expected a quoted string, got 3"),
-    ],
-)
-def test_settings_that_name_nothing_are_refused(tmp_path, line, words):
-    path = tmp_path / "settings.toml"
-    path.write_text(f"[telemetry_columns]\n{line}\n", encoding="utf-8")
-    with pytest.raises(OptionError) as caught:
-        load_settings(path)
-    assert words in str(caught.value)
-
-
 def test_a_run_reads_them_by_its_settings(tmp_path):
     (tmp_path / "frames").mkdir()
     for k in range(2):

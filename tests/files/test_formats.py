@@ -36,20 +36,12 @@ from scenematch.files.track import COLUMNS, TrackRow, TrackWriter, read_track, t
 from scenematch.files.truth import interpolate_truth, read_truth, write_truth
 from tests.support.fixes import a_fix
 from tests.support.paths import SHARED
+from tests.support.refusals import refusal
 from tests.support.videos import write_video
 
 FLIGHTS = {"gazebo-a1": (627, 0), "gazebo-a2": (591, 0), "caliterra": (37, 0), "nust": (271, 1081)}
 
 HEADER = "timestamp_ns,frame,height_agl_m,heading_deg,lat_deg,lon_deg\n"
-
-
-def refusal(call, *arguments, error=TelemetryError, **options):
-    """The one line with which a call refuses its input."""
-    with pytest.raises(error) as caught:
-        call(*arguments, **options)
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
 
 
 @pytest.fixture
