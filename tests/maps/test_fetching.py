@@ -14,20 +14,15 @@ from pyproj import Transformer
 from rasterio.enums import Resampling
 from rasterio.transform import Affine
 
-from engine import Fix, OrthoMap
+from engine import OrthoMap
 from engine.errors import MapError, OptionError
 from engine.values import Window
 from scenematch.fetch import pictures
 from scenematch.fetch.heights import files_for
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
-from scenematch.runs.map_input import MapInput
-from scenematch.runs.simulation import write_flight
-from scenematch.runs.single_image import locate_image
-from scenematch.simulator import plan_flight
 from tests.support.map_servers import HALF_WORLD_M, serving
 from tests.support.photos import gimbal, photograph
 from tests.support.rasters import write_raster
-from tests.support.towns import drawn_town
 
 SIZE = 700
 GSD_M = 0.5
@@ -203,37 +198,6 @@ def test_the_engine_reads_the_pixels_that_were_served(server, settings, tmp_path
         assert file.profile["compress"] == "deflate"
         assert file.profile["tiled"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.tif", "own.tif"]
-
-
-@pytest.mark.slow
-def test_a_frame_is_located_over_a_fetched_map_as_over_the_map_itself(tmp_path, server, raster):
-    """A town's own map, and what WMS and tiles make of it: the fixes agree to a quarter of a pixel of 0.53 m."""
-    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
-    names, values = (line.split(",") for line in (tmp_path / "telemetry.csv").read_text().splitlines())
-    row = dict(zip(names, values, strict=True))
-    names, values = (line.split(",") for line in (tmp_path / "truth.csv").read_text().splitlines()[:2])
-    truth = dict(zip(names, values, strict=True))
-    around = f"{truth['lat_deg']},{truth['lon_deg']}"
-    server.raster, server.draws, server.most_px = tmp_path / "map.tif", Resampling.cubic, 1024
-    try:
-        for name, source in (("wms", "/wms"), ("tiles", "/tiles/{z}/{x}/{y}.png")):
-            wanted = FetchSettings(
-                around=around, radius_m=150.0, source=server.url + source, gsd_m_per_px=0.53, pause_ms=0.0
-            )
-            fetch_map(wanted, tmp_path / f"{name}.tif")
-    finally:
-        server.raster, server.draws = raster, Resampling.nearest
-    site, fixes = OrthoMap.open(tmp_path / "map.tif"), {}
-    for name in ("map", "wms", "tiles"):
-        fix = locate_image(
-            tmp_path / "frames" / row["frame"], MapInput(tmp_path / f"{name}.tif", surface=tmp_path / "dsm.tif"),
-            tmp_path / "camera.yaml", method="ncc", start=f"{around},20",
-            height_agl_m=float(row["height_agl_m"]), heading_deg=float(row["heading_deg"]),
-        )  # fmt: skip
-        assert isinstance(fix, Fix), (name, fix)
-        fixes[name] = np.array(site.frame.enu_from_geodetic(fix.lat_deg, fix.lon_deg))
-    assert np.hypot(*(fixes["wms"] - fixes["map"])[:2]) < 0.13
-    assert np.hypot(*(fixes["tiles"] - fixes["map"])[:2]) < 0.13
 
 
 # ------------------------------------------------------------ manners, interruptions

@@ -12,7 +12,7 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterWindow
 from rich.console import Console
 
-from engine import Fix, MatcherOptions, NccOptions, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher
+from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher
 from engine.maps import metric_copy
 from engine.maps.rasters import GrayReader
 from engine.values import Window
@@ -86,19 +86,6 @@ def test_a_frame_is_found_where_the_small_map_has_it_in_a_part_of_the_memory(
     apart_px = np.subtract(abroad.map_xy_px, at_home.map_xy_px) - CORNER
     assert np.abs(apart_px).max() < (0.05 * at_home.sigma_m / small.gsd_m_per_px if method == "ncc" else 0.1)
     assert peak_bytes < SIDE * SIDE / 2
-
-
-def test_a_peak_is_where_the_small_map_has_it(large, small, sim_flight):
-    frame, prior, peaks = (
-        frame_of(sim_flight, 5),
-        prior_of(sim_flight, 5),
-        MatcherOptions(ncc=NccOptions(refine=False)),
-    )
-    here, there = (
-        SceneMatcher(site, sim_flight.camera, "ncc", "cpu", peaks).locate(frame, prior) for site in (small, large)
-    )
-    assert np.subtract(there.map_xy_px, here.map_xy_px) == pytest.approx(CORNER, abs=0.1)
-    assert (there.lat_deg, there.lon_deg) == pytest.approx((here.lat_deg, here.lon_deg), abs=1e-6)
 
 
 @pytest.mark.parametrize("level", [1, 2, 3, 5])

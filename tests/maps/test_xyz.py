@@ -2,15 +2,12 @@
 
 import math
 import shutil
-import sqlite3
-from contextlib import closing
 
 import cv2
 import numpy as np
 import pytest
 from affine import Affine
 from PIL import Image
-from rasterio.shutil import copy
 
 from engine import OrthoMap
 from engine.errors import MapError
@@ -124,26 +121,6 @@ def test_it_lies_where_the_slippy_map_has_it(cache):
     assert row == pytest.approx([FIRST[1], FIRST[1] + 1], abs=1e-6)
 
 
-@pytest.mark.parametrize("south_up", [False, True], ids=["XYZ", "TMS"])
-def test_the_tiles_of_mbtiles_in_a_folder_are_the_map_that_mbtiles_are(tmp_path, plain, south_up):
-    """Whose tiles GDAL cut and reads."""
-    copy(plain, tmp_path / "map.mbtiles", driver="MBTiles", tile_format="PNG")
-    with closing(sqlite3.connect(tmp_path / "map.mbtiles")) as base:
-        for zoom, column, row, data in base.execute("SELECT * FROM tiles"):  # MBTiles count rows from the south
-            path = tmp_path / f"tiles/{zoom}/{column}/{row if south_up else 2**zoom - 1 - row}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
-    if south_up:
-        (tmp_path / "tiles/tilemapresource.xml").write_text(TMS.format(srs="EPSG:3857", profile="mercator"))
-    packed, cached = OrthoMap.open(tmp_path / "map.mbtiles"), OrthoMap.open(tmp_path / "tiles")
-    corner = np.rint(cached.pixel_from_geodetic(*packed.geodetic_from_pixel([0.0, 0.0]))).astype(int)
-    lies, everything = (Window(x, y, packed.width_px, packed.height_px) for x, y in (corner.tolist(), (0, 0)))
-    np.testing.assert_array_equal(cached.valid(lies), packed.valid(everything))
-    np.testing.assert_array_equal(cached.gray(lies), packed.gray(everything))
-    assert cached.valid(lies).mean() > 0.5
-    assert cached.gsd_m_per_px == pytest.approx(packed.gsd_m_per_px, rel=1e-6)
-
-
 def test_what_a_tile_is_its_content_says(tmp_path, picture, plain):
     """Grey with alpha, a colour table, JPEG and WebP under the name of a PNG."""
     forms = {
@@ -246,11 +223,6 @@ def test_a_large_cache_without_coarser_levels_is_copied_once_and_again_when_a_ti
 # ------------------------------------------------------------------------------------------------- refusals
 
 
-def spoil_size(folder):
-    Image.new("RGB", (TILE * 2, TILE * 2)).save(tile_path(folder, 2, 2))
-    return r"cannot read .*90502\.png"
-
-
 def spoil_depth(folder):
     Image.fromarray(np.zeros((TILE, TILE), np.uint16)).save(tile_path(folder))
     return r"expected square tiles of 8 bits, got 64 x 64 px of mode I;16 in .*90500\.png"
@@ -308,7 +280,7 @@ def spoil_description(folder):
 @pytest.mark.parametrize(
     "spoil",
     [
-        *(spoil_size, spoil_depth, spoil_end, spoil_content, spoil_first, spoil_all),
+        *(spoil_depth, spoil_end, spoil_content, spoil_first, spoil_all),
         *(spoil_ending, spoil_order, spoil_extent, spoil_projection, spoil_description),
     ],
     ids=lambda spoil: spoil.__name__,
