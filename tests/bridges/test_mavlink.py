@@ -57,7 +57,7 @@ from scenematch.bridges.packets import (
 )
 from scenematch.bridges.parameters import ParameterOptions, parameter_file
 from scenematch.bridges.pictures import replay
-from scenematch.bridges.vehicle import NedOrigin, RecentValues, VehicleState, north_east_m
+from scenematch.bridges.vehicle import NedOrigin, VehicleState, north_east_m
 from scenematch.cli.app import run as main
 from scenematch.runs.last_fix import remember_delay
 from tests.support.fixes import a_fix
@@ -420,17 +420,6 @@ def test_the_date_is_the_autopilots_or_where_it_has_none_this_machines():
     assert before_ns - 1e8 < stamp_ns < time.time_ns() + 1e8  # this machine's
     telemetry.update(mavlink.MAVLink_system_time_message(unix_us, 6000), 11_000_000_000)
     assert telemetry.unix_ns(12_000_000_000) == unix_us * 1000 + 1_000_000_000
-
-
-def test_series_go_the_shorter_way_round_and_grow_stale():
-    series = RecentValues((True,))
-    series.add(0, 350.0)
-    series.add(100_000_000, 10.0)
-    series.add(150_000_000, math.nan)
-    assert series.at(50_000_000)[0] % 360.0 == pytest.approx(0.0)
-    assert series.at(400_000_000) == (10.0,)
-    assert series.at(700_000_000) is None
-    assert series.at(-1) == (350.0,)
 
 
 def test_clock_finds_the_offset_by_timesync_and_without():

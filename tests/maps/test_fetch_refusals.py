@@ -13,7 +13,7 @@ from engine.errors import MapError, OptionError
 from scenematch.fetch.crs import chosen_crs
 from scenematch.fetch.heights import files_for, read_part
 from scenematch.fetch.place import Place
-from scenematch.fetch.urls import check_url, shown
+from scenematch.fetch.urls import shown
 from scenematch.fetch.wmts import _extra_query
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
 
@@ -36,12 +36,6 @@ def test_the_users_own_surface_is_never_replaced_by_a_part_of_it(tmp_path, surfa
     with pytest.raises(OptionError, match=r"out: .* is also the input `surface`; choose another file"):
         fetch_map(settings(surface=str(tmp_path / surface), force=True), tmp_path / "s.tif")
     assert all(path.read_bytes() == b"the user's own" for path in tmp_path.glob("*.tif"))
-
-
-def test_a_refusal_leaves_no_empty_folder(tmp_path):
-    with pytest.raises(MapError, match="Failed to connect"):
-        fetch_map(settings(), tmp_path / "map.tif")
-    assert list(tmp_path.iterdir()) == []
 
 
 # ------------------------------------------------------------ keys
@@ -77,14 +71,16 @@ PLACEHOLDERS, SCHEMES = "expected {z}, {x} and {y} (or {-y}), or {q}", "begins w
         ("https://{s}.example.org/{z}/{x}/{y}.png?tk=S3CRET", PLACEHOLDERS),
         ("https://me:S3CRET@example.org/wms", "without user and password"),
         ("https://example.org/{z}/{x}/{y}.png?tk=S3 CRET", "expected"),
-        ("http://[::1/{z}/{x}/{y}.png?tk=S3CRET", "expected"),
+        ("http://[::1/{z}/{x}/{y}.png?tk=S3CRET", "expected a URL "),
+        ("http://h:abc/{z}/{x}/{y}.png?tk=S3CRET", "expected a URL "),
+        ("http://h:99999/{z}/{x}/{y}.png?tk=S3CRET", "expected a URL "),
+        ("http://h/{z}/{x}/{y}.png?tk=S3CRET\n", "expected a URL "),
     ],
 )
 def test_refusals_name_the_source_and_do_not_repeat_keys(tmp_path, source, words):
     with pytest.raises(OptionError, match=rf"^source: .*{re.escape(words)}") as error:
         fetch_map(settings(source), tmp_path / "map.tif")
-    assert "S3" not in str(error.value)
-    assert "CRET" not in str(error.value)
+    assert not re.search("S3|CRET|\n", str(error.value))
 
 
 def test_nor_do_those_of_heights():
@@ -93,21 +89,9 @@ def test_nor_do_those_of_heights():
     assert "S3CRET" not in str(error.value)
 
 
-# ------------------------------------------------------------ addresses that cannot be
-
-
 @pytest.mark.parametrize(
-    "url",
-    ["http://[::1/{z}/{x}/{y}.png", "http://h:abc/{z}/{x}/{y}.png", "http://h:99999/{z}/{x}/{y}.png",
-     "http://h/a b/{z}/{x}/{y}.png", "http://h/{z}/{x}/{y}.png?a=\n"],
-)  # fmt: skip
-def test_an_address_that_cannot_be_is_refused_at_once(url):
-    with pytest.raises(OptionError, match=r"^source: expected a URL ") as error:
-        check_url("source", url)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("surface", ["http://h/{lat}_{lon}}.tif", "d/{{lat}_{lon}.tif", "d/{lat}{lon}{.tif"])
+    "surface", ["http://h/{lat}_{lon}}.tif", "d/{{lat}_{lon}.tif", "d/{lat}{lon}{.tif", "d/{lat}.tif"]
+)
 def test_stray_braces_are_refused(surface):
     with pytest.raises(OptionError, match=r"surface: expected {lat} and {lon} as placeholders, or none"):
         files_for(surface, (0.0, 0.0, 1.0, 1.0))

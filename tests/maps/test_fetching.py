@@ -366,8 +366,6 @@ def test_files_of_degrees_by_their_names():
         "d/S01W001.tif", "d/S01E000.tif", "d/N00W001.tif", "d/N00E000.tif"
     ]  # fmt: skip
     assert files_for("own.tif", (0, 0, 1, 1)) == ["own.tif"]
-    with pytest.raises(OptionError, match=r"surface: expected {lat} and {lon}"):
-        files_for("d/{lat}.tif", (0, 0, 1, 1))
 
 
 def test_surfaces_that_cannot_be(server, files, settings, tmp_path):

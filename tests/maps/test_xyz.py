@@ -292,11 +292,6 @@ def test_what_is_no_tile_of_the_map_is_refused_by_name(own, spoil):
     assert "\n" not in str(caught.value)
 
 
-def test_pictures_are_no_surface(plain, cache):
-    with pytest.raises(MapError, match="surface: expected one band of heights, got a picture of 4 bands"):
-        OrthoMap.open(plain, surface=cache)
-
-
 def test_photographs_by_date_are_no_tiles(tmp_path):
     (tmp_path / "2024" / "11").mkdir(parents=True)
     Image.new("RGB", (TILE, TILE)).save(tmp_path / "2024" / "11" / "12.jpg")
