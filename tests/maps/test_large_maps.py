@@ -58,13 +58,9 @@ def small(sim_town, gray):
     return OrthoMap.from_arrays(gray, sim_town.pixel_to_crs, UTM)
 
 
-def prior_of(flight, index, sigma_m=10.0):
-    row = flight.truth[index]
+def prior_of(flight, sigma_m=10.0):
+    row = flight.truth[5]
     return Prior(lat_deg=row.lat_deg, lon_deg=row.lon_deg, sigma_m=sigma_m)
-
-
-def frame_of(flight, index):
-    return flight.frames[index]
 
 
 @pytest.mark.parametrize("method", ["ncc", "sift"])
@@ -72,8 +68,7 @@ def test_a_frame_is_found_where_the_small_map_has_it_in_a_part_of_the_memory(
     large_path, small, sim_flight, method
 ):
     """The grey levels and validity of the whole would take 578 MB."""
-    frame, prior = frame_of(sim_flight, 5), prior_of(sim_flight, 5)
-    camera = sim_flight.camera
+    frame, prior, camera = sim_flight.frames[5], prior_of(sim_flight), sim_flight.camera
     at_home = SceneMatcher(small, camera, method, "cpu").locate(frame, prior)
     tracemalloc.start()
     matcher = SceneMatcher(OrthoMap.open(large_path), camera, method, "cpu")
@@ -112,12 +107,13 @@ def test_what_holds_no_map_is_nodata_and_the_warm_up_finds_a_place_that_does(lar
 # ------------------------------------------------------------------------------------------------- searching
 
 
-def test_without_a_place_to_begin_at_a_map_that_is_too_large_is_refused_in_one_line(
-    large, sim_flight, monkeypatch
+def test_without_a_place_to_begin_at_only_a_map_that_is_too_large_is_refused(
+    large, small, sim_flight, monkeypatch
 ):
+    check_start(None, small)
     monkeypatch.setattr("engine.orthomap.SEARCH_LIMIT_PX", 1_000_000)
     for method in ("ncc", "sift", "auto"):
-        refused = SceneMatcher(large, sim_flight.camera, method, "cpu").locate(frame_of(sim_flight, 5))
+        refused = SceneMatcher(large, sim_flight.camera, method, "cpu").locate(sim_flight.frames[5])
         assert isinstance(refused, NoFix)
         assert refused.reason is Reason.MAP_TOO_LARGE
         assert "9.01 x 9.01 km" in refused.detail
@@ -126,12 +122,8 @@ def test_without_a_place_to_begin_at_a_map_that_is_too_large_is_refused_in_one_l
     check_start(Prior(lat_deg=48.0, lon_deg=16.0, sigma_m=10.0), large)
 
 
-def test_a_small_map_may_be_searched(small):
-    check_start(None, small)
-
-
 def test_a_vague_place_is_searched_coarse_to_fine_and_too_vague_a_one_refused(large, sim_flight, monkeypatch):
-    frame, prior = frame_of(sim_flight, 5), prior_of(sim_flight, 5, sigma_m=400.0)
+    frame, prior = sim_flight.frames[5], prior_of(sim_flight, sigma_m=400.0)
     matcher = SceneMatcher(large, sim_flight.camera, "ncc", "cpu")
     truth = large.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
     found = matcher.locate(frame, prior)
@@ -212,6 +204,25 @@ def whole(site, level=0):
     return Window(0, 0, columns, rows)
 
 
+def copy_in(cache):
+    """The folder of the only copy in a cache."""
+    (folder,) = (path for path in cache.iterdir() if path.name != "hashes")
+    return folder
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """The names of the tiles that are written from now on."""
+    names, write = [], metric_copy._write
+
+    def noted(target, *arguments, **options):
+        names.append(target.name)
+        return write(target, *arguments, **options)
+
+    monkeypatch.setattr(metric_copy, "_write", noted)
+    return names
+
+
 def same(one, other):
     """Equal, but for the rounding of places in blocks that begin elsewhere, where it was resampled."""
     valid = one.valid(whole(one))
@@ -230,14 +241,12 @@ def test_a_large_map_without_overviews_is_copied_and_is_the_same(picture, tmp_pa
     assert copied.is_large
     same(copied, small)
     for level in (1, 2, 3):
-        both = copied.valid(whole(copied, level), level) & small.valid(whole(small, level), level)
-        apart = (
-            copied.gray(whole(copied, level), level)[both].astype(int)
-            - small.gray(whole(small, level), level)[both]
-        )
+        window = whole(small, level)
+        both = copied.valid(window, level) & small.valid(window, level)
+        apart = copied.gray(window, level)[both].astype(int) - small.gray(window, level)[both]
         assert both.mean() > 0.5
         assert np.abs(apart).mean() < 1.0
-    (folder,) = (path for path in (tmp_path / "cache").iterdir() if path.name != "hashes")
+    folder = copy_in(tmp_path / "cache")
     names = sorted(path.name for path in folder.iterdir())
     assert "tiles.txt" in names
     assert not [name for name in names if name.endswith(".part")]
@@ -246,25 +255,20 @@ def test_a_large_map_without_overviews_is_copied_and_is_the_same(picture, tmp_pa
         assert "0000-0000.tif" in names  # nor here, but the map begins with it
 
 
-def test_a_copy_that_was_interrupted_is_carried_on(picture, tmp_path, tiny_limits, monkeypatch):
-    cache = tmp_path / "cache"
-    made = []
-    write = metric_copy._write
+def test_a_copy_that_was_interrupted_is_carried_on(picture, tmp_path, tiny_limits, made, monkeypatch):
+    cache, write = tmp_path / "cache", metric_copy._write
 
-    def counted(target, *arguments, **options):
+    def interrupted(target, *arguments, **options):
         if len(made) == 5:
             target.with_suffix(".part").write_bytes(b"II*\0 half a tile")
             raise KeyboardInterrupt
-        made.append(target.name)
         return write(target, *arguments, **options)
 
-    monkeypatch.setattr(metric_copy, "_write", counted)
-    with pytest.raises(KeyboardInterrupt):
-        OrthoMap.open(picture, cache_dir=cache)
-    first = list(made)
-    monkeypatch.setattr(metric_copy, "_write", lambda t, *a, **o: made.append(t.name) or write(t, *a, **o))
+    with monkeypatch.context() as patch:
+        patch.setattr(metric_copy, "_write", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            OrthoMap.open(picture, cache_dir=cache)
     site = OrthoMap.open(picture, cache_dir=cache)
-    assert len(first) == 5
     assert len(made) == len(set(made)) > 5  # none was made twice
     count = len(made)
     same(OrthoMap.open(picture, cache_dir=cache), site)
@@ -299,7 +303,7 @@ def test_a_copy_says_how_far_it_is_and_one_that_is_there_says_nothing(picture, t
 
 def test_a_copy_that_is_carried_on_begins_where_it_was(picture, tmp_path, tiny_limits):
     OrthoMap.open(picture, cache_dir=tmp_path / "cache")
-    (folder,) = (path for path in (tmp_path / "cache").iterdir() if path.name != "hashes")
+    folder = copy_in(tmp_path / "cache")
     (folder / "0003-0003.tif").unlink()  # the last one: 116 x 16 px
     stated = []
     OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: stated.append(pixels))
@@ -312,20 +316,19 @@ def test_a_terminal_shows_the_copying_and_a_pipe_does_not(picture, tmp_path, tin
     stream = io.StringIO()
     monkeypatch.setattr(console, "_errors", lambda: Console(file=stream, force_terminal=terminal, width=100))
     assert run(["map", "info", str(picture)]) == 0
-    assert ("copying the map into the cache" in stream.getvalue()) == terminal
-    assert stream.getvalue() == "" or terminal
     shown = stream.getvalue()
+    assert "copying the map into the cache" in shown if terminal else shown == ""
     assert run(["map", "info", str(picture)]) == 0
     assert stream.getvalue() == shown  # the copy is there
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("damage", ["bytes", "cut", "gone", "list cut off", "no list"])
-def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, tiny_limits, monkeypatch, damage):
+def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, tiny_limits, made, damage):
     cache = tmp_path / "cache"
     site = OrthoMap.open(picture, cache_dir=cache)
     pixels, valid = site.gray(whole(site)), site.valid(whole(site))
-    (folder,) = (path for path in cache.iterdir() if path.name != "hashes")
+    folder = copy_in(cache)
     tile, stated = folder / "0002-0001.tif", folder / "tiles.txt"
     content, lines = tile.read_bytes(), stated.read_text()
     if damage == "bytes":
@@ -336,9 +339,7 @@ def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, t
         tile.unlink()
     else:
         stated.write_text("" if damage == "no list" else lines[: len(lines) - 20])
-    made = []
-    write = metric_copy._write
-    monkeypatch.setattr(metric_copy, "_write", lambda t, *a, **o: made.append(t.name) or write(t, *a, **o))
+    made.clear()
     again = OrthoMap.open(picture, cache_dir=cache)
     assert made
     assert np.array_equal(again.valid(whole(again)), valid)

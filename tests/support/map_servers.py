@@ -17,7 +17,6 @@ from urllib.parse import parse_qsl, urlsplit
 import numpy as np
 import rasterio
 from PIL import Image
-from rasterio.enums import Resampling
 from rasterio.transform import Affine
 from rasterio.warp import reproject, transform_bounds
 
@@ -43,11 +42,15 @@ class MapServer(ThreadingHTTPServer):
         self.agents: set[str] = set()
         self.trouble: list[tuple[str, object]] = []  # part of a path and what happens, once each
         self.wms_version, self.most_px, self.layers, self.kvp = "1.3.0", 200, ("ortho",), False
-        self.draws = Resampling.nearest
 
     @property
     def url(self) -> str:
         return f"http://127.0.0.1:{self.server_address[1]}"
+
+    @property
+    def tiles(self) -> str:
+        """The address of a tile by zoom level, column and row."""
+        return f"{self.url}/tiles/{{z}}/{{x}}/{{y}}.png"
 
 
 @contextmanager
@@ -65,15 +68,12 @@ def serving(raster: Path, files: Path):
 
 
 def drawn(server: MapServer, crs: str, bounds: tuple[float, ...], width: int, height: int) -> np.ndarray:
-    """(H, W, 4) of the raster on another grid; transparent outside."""
+    """(H, W, 4) of the raster on another grid, each pixel the nearest one's; transparent outside."""
     west, south, east, north = bounds
     to_crs = Affine((east - west) / width, 0.0, west, 0.0, (south - north) / height, north)
     bands, transform, source_crs = _bands(server.raster)
     out = np.zeros((4, height, width), np.uint8)
-    reproject(
-        bands, out, src_transform=transform, src_crs=source_crs, dst_transform=to_crs, dst_crs=crs,
-        resampling=server.draws,
-    )  # fmt: skip
+    reproject(bands, out, src_transform=transform, src_crs=source_crs, dst_transform=to_crs, dst_crs=crs)
     return np.moveaxis(out, 0, 2)
 
 
