@@ -27,6 +27,8 @@ from scenematch.cli.app import run as main
 from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import open_truth
 from scenematch.files.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
+from scenematch.runs.inputs import FlightFiles, open_inputs
+from scenematch.runs.settings import TrackSettings
 from tests.support.odometries import odometry_message, twist_message
 
 STEP_NS = 100_000_000
@@ -341,31 +343,23 @@ def test_damaged_bags_are_one_line_or_a_flight(tmp_path, kind):
         file.write_bytes(data)
 
 
-# ---------------------------------------------------------------------------------------------- command line
+# ------------------------------------------------------------------------------------------------- of a run
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("bare_runs")
-def test_a_folder_becomes_a_bag_and_is_tracked_alike(flight_in, tmp_path):
-    folder, bag = tmp_path / "flight", tmp_path / "flight.bag"
-    flight_in(folder, frames=3)
-    flight_bag(folder, bag)
-    world = ["--map", str(folder / "map.tif"), "--surface", str(folder / "dsm.tif")]
-    inputs = {
-        "folder": ["--frames", str(folder / "frames"), "--telemetry", str(folder / "telemetry.csv"),
-                   "--camera", str(folder / "camera.yaml")],
-        "bag": ["--frames", str(bag), "--truth", str(bag)],
-    }  # fmt: skip
-    tracks = []
-    for name, options in inputs.items():
-        assert main(["track", *world, *options, "--out", str(tmp_path / name)]) == 0
-        lines = (tmp_path / name / "track.csv").read_text(encoding="utf-8").splitlines()
-        assert len(lines) == 4
-        tracks.append([row.split(",") for row in lines[1:]])
-    for one, other in zip(*tracks, strict=True):
-        assert (one[0], one[2]) == (other[0], other[2])
-        # Angles that went through a quaternion differ in the last bit, and places by less than is printed.
-        assert np.array(one[4:8], float) == pytest.approx(np.array(other[4:8], float), abs=0.01)
+def test_a_folder_that_becomes_a_bag_gives_a_run_the_same_inputs(flight_in, tmp_path):
+    """Angles that went through a quaternion differ in the last bits."""
+    folder = flight_in(tmp_path / "flight", frames=3)
+    flight_bag(tmp_path / "flight", tmp_path / "flight.bag")
+    of_bag = FlightFiles(map=folder.map, frames=tmp_path / "flight.bag", truth=tmp_path / "flight.bag")
+    one, other = (open_inputs(files, [TrackSettings()]) for files in (folder, of_bag))
+    for mine, theirs in zip(one.flight, other.flight, strict=True):
+        assert mine.frame.timestamp_ns == theirs.frame.timestamp_ns
+        assert np.array_equal(mine.frame.image, theirs.frame.image)
+        for name in ("height_agl_m", "roll_deg", "pitch_deg", "heading_deg", "east_velocity_mps"):
+            assert getattr(theirs.frame, name) == pytest.approx(getattr(mine.frame, name), abs=1e-9), name
+    for name in ("matrix", "distortion", "mount"):
+        assert np.array_equal(getattr(one.camera, name), getattr(other.camera, name)), name
+    assert [row.lat_deg for row in other.truth] == pytest.approx([row.lat_deg for row in one.truth], abs=1e-12)
 
 
 def test_topics_of_the_calibration(tmp_path, maker):
