@@ -1,17 +1,14 @@
 """What a fetch of a map refuses or must not repeat: one clear line, and nothing of the user's is lost."""
 
 import re
-import socket
-import threading
-import time
 from xml.etree import ElementTree as Xml
 
 import pytest
 from pyproj import CRS
 
-from engine.errors import MapError, OptionError
+from engine.errors import OptionError
 from scenematch.fetch.crs import chosen_crs
-from scenematch.fetch.heights import files_for, read_part
+from scenematch.fetch.heights import files_for
 from scenematch.fetch.place import Place
 from scenematch.fetch.urls import shown
 from scenematch.fetch.wmts import _extra_query
@@ -138,41 +135,3 @@ def test_a_key_is_sent_to_the_host_that_was_named_and_to_no_other(href, sent):
         f'<Get xlink:href="{href}"/></HTTP></DCP></Operation></C>'
     )
     assert _extra_query(Xml.fromstring(text), "https://a.org/caps.xml?key=S3CRET&Service=WMTS") == sent
-
-
-# ------------------------------------------------------------ servers that fall silent
-
-
-@pytest.fixture
-def falls_silent():
-    """The address of a server that answers the first request with four bytes, and no other at all."""
-    ear, open_lines = socket.create_server(("127.0.0.1", 0)), []
-    first = b"HTTP/1.1 206 Partial Content\r\nContent-Length: 4\r\nConnection: close\r\n\r\nII*\0"
-
-    def serve():
-        while True:
-            try:
-                line, _ = ear.accept()
-            except OSError:
-                return
-            line.recv(4096)
-            if not open_lines:
-                line.sendall(first)
-                line.close()
-            open_lines.append(line)
-
-    threading.Thread(target=serve, daemon=True).start()
-    yield f"http://127.0.0.1:{ear.getsockname()[1]}/heights.tif"
-    ear.shutdown(socket.SHUT_RDWR)
-    ear.close()
-    for line in open_lines:
-        line.close()
-
-
-@pytest.mark.slow
-def test_heights_are_waited_for_no_longer_than_agreed(falls_silent, monkeypatch):
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
-    begin_s = time.monotonic()
-    with pytest.raises(MapError, match=re.escape("heights.tif: cannot be read as a GeoTIFF in byte ranges")):
-        read_part([falls_silent], (0.0, 0.0, 1.0, 1.0), CRS.from_epsg(4326), None, 1.0)
-    assert time.monotonic() - begin_s < 60.0  # GDAL asks again, some times

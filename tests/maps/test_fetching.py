@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import re
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,14 +12,14 @@ import numpy as np
 import pytest
 import rasterio
 from PIL import Image
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from rasterio.transform import Affine
 
 from engine import OrthoMap
 from engine.errors import MapError, OptionError
 from engine.values import Window
 from scenematch.fetch import pictures
-from scenematch.fetch.heights import files_for
+from scenematch.fetch.heights import files_for, read_part
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
 from tests.support.map_servers import HALF_WORLD_M, serving
 from tests.support.photos import gimbal, photograph
@@ -370,6 +371,16 @@ def test_surfaces_that_cannot_be(server, files, settings, tmp_path):
         with pytest.raises(error, match=re.escape(text)):
             fetch_map(settings(server.tiles, surface=surface, surface_datum=datum), tmp_path / "map.tif")
     assert not (tmp_path / "map.tif").exists()
+
+
+@pytest.mark.slow
+def test_heights_are_waited_for_no_longer_than_agreed(server, files):
+    height_tile(files / "silent.tif", 48, 16)
+    server.trouble[:] = [("silent.tif", "silence")] * 99
+    begin_s = time.monotonic()
+    with pytest.raises(MapError, match=re.escape("silent.tif: cannot be read as a GeoTIFF in byte ranges")):
+        read_part([f"{server.url}/files/silent.tif"], (16.2, 48.2, 16.3, 48.3), CRS.from_epsg(4326), None, 1.0)
+    assert time.monotonic() - begin_s < 60.0  # GDAL asks again, some times
 
 
 # ------------------------------------------------------------ the command

@@ -165,27 +165,20 @@ def test_tiles_that_do_not_fit_together_are_refused(tmp_path, picture, changed, 
         ("<ColorInterp>Red", "<PixelFunctionType>evil</PixelFunctionType><ColorInterp>Red",
          "got PixelFunctionType"),
         ("0-0.tif", "gone.tif", "does not exist"),
+        ("{folder}/0-0.tif", "https://example.org/a.tif", "expected the path of a local file"),
+        ("{folder}/0-0.tif", "/vsicurl/http://example.org/a.tif", "expected the path of a local file"),
         ("0-0.tif", "self.vrt", r"expected raster files in .*map\.vrt, got .*self\.vrt"),
         ("</VRTDataset>", "", "cannot read"),
     ],
 )  # fmt: skip
 def test_a_vrt_that_does_more_than_to_lay_local_files_side_by_side_is_refused(tmp_path, folder, old, new, words):
-    here = tmp_path / "tiles"
-    shutil.copytree(folder, here)
+    here = shutil.copytree(folder, tmp_path / "tiles")
     text = vrt_of_folder(here, "map")
     (here / "self.vrt").write_text(text)
-    (tmp_path / "map.vrt").write_text(text.replace(old, new))
+    (tmp_path / "map.vrt").write_text(text.replace(old.format(folder=here), new))
     with pytest.raises(MapError, match=words) as caught:
         OrthoMap.open(tmp_path / "map.vrt")
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("address", ["https://example.org/a.tif", "/vsicurl/http://example.org/a.tif"])
-def test_a_vrt_that_names_an_address_is_refused(tmp_path, folder, address):
-    first = str(folder / "0-0.tif")
-    (tmp_path / "map.vrt").write_text(vrt_of_folder(folder, "map").replace(first, address))
-    with pytest.raises(MapError, match="expected the path of a local file"):
-        OrthoMap.open(tmp_path / "map.vrt")
 
 
 # -------------------------------------------------------------------------------------------------- MBTiles
@@ -203,9 +196,8 @@ def test_mbtiles_are_the_mercator_picture_that_they_were_made_of(tmp_path, pictu
     assert cached.info()["driver"] == "MBTiles"
     corner = np.rint(cached.pixel_from_geodetic(*whole.geodetic_from_pixel([0.0, 0.0]))).astype(int)
     lies = Window(int(corner[0]) + 20, int(corner[1]) + 20, 200, 200)
-    assert np.allclose(
-        cached.geodetic_from_pixel([lies.x0, lies.y0]), whole.geodetic_from_pixel([20, 20]), rtol=0, atol=1e-9
-    )
+    there = cached.geodetic_from_pixel([lies.x0, lies.y0])
+    assert np.allclose(there, whole.geodetic_from_pixel([20, 20]), rtol=0, atol=1e-9)
     apart = cached.gray(lies).astype(float) - whole.gray(Window(20, 20, 200, 200))
     assert np.abs(apart).mean() <= most
     assert cached.valid(lies).all()

@@ -40,6 +40,7 @@ class MapServer(ThreadingHTTPServer):
         self.raster, self.files = raster, files
         self.asked: list[str] = []
         self.agents: set[str] = set()
+        self.over = threading.Event()
         self.trouble: list[tuple[str, object]] = []  # part of a path and what happens, once each
         self.wms_version, self.most_px, self.layers, self.kvp = "1.3.0", 200, ("ortho",), False
 
@@ -62,6 +63,7 @@ def serving(raster: Path, files: Path):
     try:
         yield server
     finally:
+        server.over.set()
         server.shutdown()
         server.server_close()
         thread.join()
@@ -130,6 +132,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", "5000")
             self.end_headers()
             self.wfile.write(b"\x89PNG only the beginning")
+            self.close_connection = True
+        elif what == "silence":
+            self.server.over.wait()
             self.close_connection = True
         elif isinstance(what, tuple):
             status, headers = what
