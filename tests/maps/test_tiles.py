@@ -132,12 +132,6 @@ def test_a_surface_may_be_a_folder_too(tmp_path, plain):
 # ------------------------------------------------------------------------------------------------- refusals
 
 
-def test_a_folder_without_a_raster_is_refused(tmp_path):
-    (tmp_path / "notes.txt").write_text("nothing here")
-    with pytest.raises(MapError, match=r"map: expected raster files in the folder .*, found none"):
-        OrthoMap.open(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
