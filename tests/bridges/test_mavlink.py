@@ -730,9 +730,8 @@ def test_the_command_line_writes_them_and_refuses_in_one_line(tmp_path, capsys):
     assert "EKF2_AGP0_CTRL" in out.read_text(encoding="utf-8")
     assert main(words) == 2
     assert main([*words, "--force", "--settings", "mavlink.message=gps_input"]) == 2
-    assert (
-        "--settings mavlink.message: expected one of global_position_sensor, odometry" in capsys.readouterr().err
-    )
+    said = "--settings mavlink.message: expected one of global_position_sensor, odometry"
+    assert said in capsys.readouterr().err
     live = ["bridge", "mavlink", "--map", "m.tif", "--camera", "c.yaml", "--frames", "f", "--connect"]
     assert main([*live, "udpin:0.0.0.0:14550"]) == 2
     assert main([*live, "nonsense"]) == 2
@@ -857,9 +856,8 @@ def bridge_to():
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
         navigator = Matched()
-        bridge = MavlinkBridge(
-            parse_connection(f"udpin:127.0.0.1:{port}"), lambda _: navigator, options or MavlinkOptions(), **more
-        )
+        link = parse_connection(f"udpin:127.0.0.1:{port}")
+        bridge = MavlinkBridge(link, lambda _: navigator, options or MavlinkOptions(), **more)
         opened.append(bridge)
         return SimpleNamespace(bridge=bridge, navigator=navigator, port=port)
 

@@ -358,17 +358,13 @@ def test_a_folder_that_becomes_a_bag_gives_a_run_the_same_inputs(flight_in, tmp_
 
 def test_topics_of_the_calibration(tmp_path, maker):
     """The camera_info beside the pictures counts, not the first."""
-    image = np.zeros((23, 31), np.uint8)
     other = Camera.from_fov(31, 23, 30.0)
-    path = written(
-        tmp_path / "x.bag",
-        {
-            IMAGE: [(10**9, maker.image(10**9, "", image))],
-            "/aaa/camera_info": [(10**9, maker.camera_info(10**9, "", other))],
-            CAMERA_INFO: [(10**9, maker.camera_info(10**9, "", CAMERA))],
-        },
-    )
-    assert np.array_equal(read_bag_camera(path).matrix, CAMERA.matrix)
+    topics = {
+        IMAGE: [(10**9, maker.image(10**9, "", np.zeros((23, 31), np.uint8)))],
+        "/aaa/camera_info": [(10**9, maker.camera_info(10**9, "", other))],
+        CAMERA_INFO: [(10**9, maker.camera_info(10**9, "", CAMERA))],
+    }
+    assert np.array_equal(read_bag_camera(written(tmp_path / "x.bag", topics)).matrix, CAMERA.matrix)
 
 
 @pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])

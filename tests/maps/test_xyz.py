@@ -53,6 +53,8 @@ def cut(folder, picture, zoom=ZOOM, *, gaps=GAPS, south_up=False, save=None):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 tile = canvas[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
                 (save or (lambda tile, path: Image.fromarray(tile).save(path)))(tile, path)
+    if south_up:
+        (folder / "tilemapresource.xml").write_text(TMS.format(srs="EPSG:900913", profile="mercator"))
     return folder
 
 
@@ -98,8 +100,6 @@ def there():
 @pytest.mark.parametrize("south_up", [False, True], ids=["XYZ", "TMS"])
 def test_a_tile_cache_is_the_picture_that_it_was_cut_from_and_a_gap_is_nodata(tmp_path, plain, picture, south_up):
     folder = cut(tmp_path / "tiles", picture, south_up=south_up)
-    if south_up:
-        (folder / "tilemapresource.xml").write_text(TMS.format(srs="EPSG:900913", profile="mercator"))
     whole, cached = OrthoMap.open(plain), OrthoMap.open(folder)
     assert (cached.width_px, cached.height_px) == (WHOLE.width_px, WHOLE.height_px)
     assert cached.bounds_deg == pytest.approx(whole.bounds_deg, abs=1e-10)
@@ -168,8 +168,6 @@ def test_an_empty_file_is_a_gap(own):
 def test_complete_coarser_levels_are_overviews(tmp_path, picture, tiny_limits, south_up, gaps, levels):
     """Counted from the south they are not, and a large map is copied."""
     folder = cut(tmp_path / "tiles", picture, gaps=gaps, south_up=south_up)
-    if south_up:
-        (folder / "tilemapresource.xml").write_text(TMS.format(srs="EPSG:3857", profile="mercator"))
     for zoom in (17, 16):
         coarse = cv2.resize(picture, None, fx=2.0 ** (zoom - ZOOM), fy=2.0 ** (zoom - ZOOM))
         cut(folder, coarse, zoom, south_up=south_up)
@@ -296,7 +294,6 @@ def test_photographs_by_date_are_no_tiles(tmp_path):
     (tmp_path / "2024" / "11").mkdir(parents=True)
     Image.new("RGB", (TILE, TILE)).save(tmp_path / "2024" / "11" / "12.jpg")
     assert not is_tile_cache(tmp_path)
-    with pytest.raises(
-        MapError, match=r"expected raster files in the folder .*, or tiles as z/x/y.png below it, found none"
-    ):
+    words = r"expected raster files in the folder .*, or tiles as z/x/y.png below it, found none"
+    with pytest.raises(MapError, match=words):
         OrthoMap.open(tmp_path)
