@@ -88,6 +88,14 @@ def sending(**changes):
     return FixReport(**(values | changes))
 
 
+def autopilot(key=None, system=1, component=1):
+    """What packs the messages of a component of a vehicle."""
+    made = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    if key is not None:
+        made.signing.secret_key, made.signing.sign_outgoing, made.signing.timestamp = key, True, signing_time()
+    return made
+
+
 # -------------------------------------------------------------------------------------------- what is sent
 
 
@@ -278,8 +286,7 @@ def heard(*messages, **options):
 
 def from_camera(message, component=197):
     """A message as it comes over the wire from another component of the vehicle."""
-    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=component)
-    return mavlink.MAVLink(None).parse_char(message.pack(sender))
+    return mavlink.MAVLink(None).parse_char(message.pack(autopilot(component=component)))
 
 
 def speed_estimate(*ned_mps, variance=math.nan):
@@ -372,8 +379,7 @@ def test_velocities_arrive_from_every_component_of_the_vehicle(component):
     decoder, telemetry = PacketDecoder(1, HANDLED_MESSAGES, is_stream=False), MavlinkTelemetry()
     foreign, own = speed_estimate(9.0, 9.0, 9.0), speed_estimate(3.0, -4.0, 0.5)
     for system, message in ((2, foreign), (1, own), (1, TO_THE_WEST)):
-        sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
-        for one in decoder.feed(bytes(message.pack(sender))):
+        for one in decoder.feed(bytes(message.pack(autopilot(system=system, component=component)))):
             telemetry.update(one, 1)
     vehicle = telemetry.vehicle(1)
     assert (vehicle.east_velocity_mps, vehicle.north_velocity_mps) == pytest.approx((-4.0, 3.0))
@@ -519,13 +525,6 @@ def test_a_clock_that_is_set_is_followed_from_the_next_answer_on(step_ms):
 
 
 # ------------------------------------------------------------------------------------------------ security
-
-
-def autopilot(key=None, system=1, component=1):
-    made = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
-    if key is not None:
-        made.signing.secret_key, made.signing.sign_outgoing, made.signing.timestamp = key, True, signing_time()
-    return made
 
 
 def beat(made, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA):
@@ -1008,17 +1007,22 @@ def test_each_firmware_is_asked_for_what_it_has(loop):
     assert mavlink.MAVLINK_MSG_ID_ALTITUDE in REQUESTED_RATES_HZ["px4"]
 
 
+def sent_in_flight(made, pilot, kind):
+    """How many messages of a kind come, once the vehicle is armed, while frames are refused."""
+    pilot.armed = True
+    fly(made.bridge, lambda: made.bridge.telemetry.armed)
+    before = len(pilot.of(kind))
+    fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
+    return len(pilot.of(kind)) - before
+
+
 def test_a_camera_that_sees_nothing_does_not_keep_the_vehicle_from_arming(loop):
     """ArduPilot's check wants a message of visual odometry in the last 0.3 s; its quality says it is no fix."""
     made, pilot = loop()
     made.navigator.result = NoFix(reason=Reason.NO_TEXTURE)
     fly(made.bridge, lambda: len(pilot.of("ODOMETRY")) >= 5)
     assert {m.quality for m, _ in pilot.of("ODOMETRY")} == {-1}
-    pilot.armed = True
-    fly(made.bridge, lambda: made.bridge.telemetry.armed)
-    before = len(pilot.of("ODOMETRY"))
-    fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
-    assert len(pilot.of("ODOMETRY")) <= before + 2  # in flight its health is that of the fixes
+    assert sent_in_flight(made, pilot, "ODOMETRY") <= 2  # in flight its health is that of the fixes
     assert not pilot.of("VISION_POSITION_ESTIMATE")
 
 
@@ -1033,11 +1037,7 @@ def test_a_second_receiver_repeats_the_first_until_the_vehicle_is_armed(loop):
     assert repeated.ignore_flags & mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
     # The quickest message counts as the one without delay, and must be a fix.
     assert repeated.time_usec <= time.monotonic_ns() // 1000 - 250_000
-    pilot.armed = True
-    fly(made.bridge, lambda: made.bridge.telemetry.armed)
-    before = len(pilot.of("GPS_INPUT"))
-    fly(made.bridge, lambda: made.bridge.status.refused["no_texture"] > 40)
-    assert len(pilot.of("GPS_INPUT")) <= before + 2  # in flight it has a fix where the camera has one
+    assert sent_in_flight(made, pilot, "GPS_INPUT") <= 2  # in flight it has a fix where the camera has one
 
 
 def test_the_pilot_is_told_when_fixes_begin_and_stop(loop, monkeypatch):
