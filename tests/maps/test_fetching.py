@@ -23,7 +23,7 @@ from scenematch.fetch.heights import files_for, read_part
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
 from tests.support.map_servers import HALF_WORLD_M, serving
 from tests.support.photos import gimbal, photograph
-from tests.support.rasters import write_raster
+from tests.support.rasters import whole, write_raster
 
 SIZE = 700
 GSD_M = 0.5
@@ -193,7 +193,7 @@ def test_the_engine_reads_the_pixels_that_were_served(server, tmp_path):
     part = Window(x, y, SIZE, SIZE)
     assert site.valid(part).all()
     np.testing.assert_array_equal(site.gray(part), own.gray(Window(0, 0, SIZE, SIZE)))
-    everything = site.valid(Window(0, 0, site.width_px, site.height_px))
+    everything = site.valid(whole(site))
     assert everything.sum() == SIZE * SIZE  # what is beside the picture, or in a missing tile, is nodata
     assert facts["nodata_share"] == pytest.approx(1.0 - everything.mean())
     assert site.georeference_sigma_m == 1.5
@@ -269,16 +269,17 @@ def test_what_is_no_picture_is_refused_in_one_line(server, settings, tmp_path):
 
 
 def test_where_nothing_is(server, settings, tmp_path):
-    with pytest.raises(MapError, match=r"source: the server has no data there on level '18', 0.398 m/px"):
-        fetch_map(settings(f"{server.url}/nowhere/{{z}}/{{x}}/{{y}}.png"), tmp_path / "a.tif")
-    with pytest.raises(MapError, match=r"/nowhere\?SERVICE=WMS&REQUEST=GetCapabilities: the server answers 404"):
-        fetch_map(settings(f"{server.url}/nowhere"), tmp_path / "b.tif")
-    with pytest.raises(MapError, match="Could not resolve host: no-such-host"):
-        fetch_map(settings("http://no-such-host.invalid/{z}/{x}/{y}.png"), tmp_path / "c.tif")
-    with pytest.raises(MapError, match="Failed to connect to 127"):
-        fetch_map(settings("http://127.0.0.1:9/{z}/{x}/{y}.png"), tmp_path / "d.tif")
+    tile = "{z}/{x}/{y}.png"
+    for source, words in (
+        (f"{server.url}/nowhere/{tile}", "source: the server has no data there on level '18', 0.398 m/px"),
+        (f"{server.url}/nowhere", "/nowhere?SERVICE=WMS&REQUEST=GetCapabilities: the server answers 404"),
+        (f"http://no-such-host.invalid/{tile}", "Could not resolve host: no-such-host"),
+        (f"http://127.0.0.1:9/{tile}", "Failed to connect to 127"),
+    ):
+        with pytest.raises(MapError, match=re.escape(words)):
+            fetch_map(settings(source), tmp_path / "map.tif")
     with pytest.raises(MapError, match="source: the server has no data there on level 'EPSG:3857'"):
-        fetch_map(FetchSettings(around="10,10", radius_m=50, source=f"{server.url}/wms"), tmp_path / "e.tif")
+        fetch_map(replace(settings(f"{server.url}/wms", gsd_m_per_px=None), around="10,10"), tmp_path / "map.tif")
 
 
 def test_a_proxy_that_is_not_there_is_one_line_without_its_password(settings, tmp_path, monkeypatch):

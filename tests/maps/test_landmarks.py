@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rasterio.transform import Affine
 from scipy.spatial import KDTree
 
 from engine import OrthoMap
@@ -16,7 +15,7 @@ from engine.maps.tiles import TILE_PX
 from engine.runtime.device import CPU
 from engine.values import Window
 from tests.support.ground import Ground
-from tests.support.rasters import write_raster
+from tests.support.rasters import from_corner, whole, write_raster
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +29,6 @@ def site():
 @pytest.fixture(scope="module")
 def marks(site):
     return LandmarkMap(site, CPU)
-
-
-def whole(site, level=0):
-    rows, columns = site.level_shape(level)
-    return Window(0, 0, columns, rows)
 
 
 def in_order(rows):
@@ -155,8 +149,7 @@ def stored(tmp_path, monkeypatch):
 
 
 def write_map(path, ground, gray):
-    corner = Affine(*ground.pixel_to_crs.ravel()) @ Affine.translation(-0.5, -0.5)
-    return write_raster(path, gray, crs=f"EPSG:{ground.epsg}", transform=corner)
+    return write_raster(path, gray, crs=f"EPSG:{ground.epsg}", transform=from_corner(ground.pixel_to_crs))
 
 
 def prepared(path, upright=True, backend="auto"):

@@ -19,7 +19,7 @@ from engine.values import Window
 from scenematch.cli import console
 from scenematch.cli.app import run
 from scenematch.runs.checks import check_start
-from tests.support.rasters import write_raster
+from tests.support.rasters import from_corner, whole, write_raster
 
 SIDE = 17_000
 CORNER = (12_288, 6_656)  # of the town on the large map: on its cells, so that the same landmarks are chosen
@@ -36,8 +36,7 @@ def gray(sim_town):
 def large_path(tmp_path_factory, sim_town, gray):
     """A sparse GeoTIFF of 17,000 x 17,000 pixels with overviews; all but the town is nodata."""
     path = tmp_path_factory.mktemp("large") / "map.tif"
-    (a, b, c), (d, e, f) = sim_town.pixel_to_crs
-    corner = Affine(a, b, c - a / 2, d, e, f - e / 2) @ Affine.translation(-CORNER[0], -CORNER[1])
+    corner = from_corner(sim_town.pixel_to_crs) @ Affine.translation(-CORNER[0], -CORNER[1])
     profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "crs": UTM, "transform": corner, "nodata": 0}
     profile |= {"tiled": True, "sparse_ok": True, "compress": "deflate", "width": SIDE, "height": SIDE}
     around = np.pad(gray, MARGIN, mode="reflect")
@@ -143,33 +142,25 @@ def test_a_surface_read_by_tiles_is_the_surface_in_memory(tmp_path, gray, sim_to
     rows, columns = gray.shape
     heights = np.random.default_rng(3).uniform(100.0, 130.0, (rows, columns)).astype(np.float32)
     heights[300:420, 200:500] = -9999.0
-    (a, b, c), (d, e, f) = sim_town.pixel_to_crs
     for name, data in (("map.tif", gray), ("dsm.tif", heights)):
-        write_raster(tmp_path / name, data, crs=UTM, transform=Affine(a, b, c - a / 2, d, e, f - e / 2))
+        write_raster(tmp_path / name, data, crs=UTM, transform=from_corner(sim_town.pixel_to_crs))
     kept = OrthoMap.open(tmp_path / "map.tif", tmp_path / "dsm.tif")
     monkeypatch.setattr("engine.maps.surface.SURFACE_LIMIT_PX", 10_000)
     monkeypatch.setattr("engine.maps.surface.TILE_PX", 100)
     monkeypatch.setattr("engine.maps.surface.MAX_PATCHES", 3)
     tiled = OrthoMap.open(tmp_path / "map.tif", tmp_path / "dsm.tif")
     xy = np.random.default_rng(4).uniform(-5.0, [columns + 5.0, rows + 5.0], (60, 40, 2))
-    known = np.array([[150.0, 100.0]])
-    rounding = {"rtol": 1e-14, "atol": 0.0}  # what is in memory is interpolated by a compiled loop
-    np.testing.assert_allclose(tiled.surface_at(xy), _with(kept, xy, tiled.ground_m), **rounding)
-    np.testing.assert_allclose(tiled.surface_at(known), kept.surface_at(known), **rounding)
+    heights = kept.surface_at(xy)
+    expected = np.where(heights == kept.ground_m, tiled.ground_m, heights)  # its own for what is unknown
+    # What is in memory is interpolated by a compiled loop.
+    np.testing.assert_allclose(tiled.surface_at(xy), expected, rtol=1e-14, atol=0.0)
     planes = [site.ground_plane([150.0, 100.0], 30.0)[0] for site in (tiled, kept)]
     assert planes[0] == pytest.approx(planes[1], rel=1e-12)
     assert tiled.ground_m == pytest.approx(kept.ground_m, abs=1.0)
 
 
-def _with(site, xy, ground_m):
-    """The surface of a map with another level for what is unknown."""
-    heights = site.surface_at(xy)
-    return np.where(heights == site.ground_m, ground_m, heights)
-
-
 def test_a_surface_of_a_small_part_of_the_map_gives_its_ground(large_path, tmp_path, sim_town):
-    (a, b, c), (d, e, f) = sim_town.pixel_to_crs
-    corner = Affine(a, b, c - a / 2, d, e, f - e / 2) @ Affine.translation(200, 300)
+    corner = from_corner(sim_town.pixel_to_crs) @ Affine.translation(200, 300)
     heights = np.full((40, 40), 77.0, np.float32)
     dsm = write_raster(tmp_path / "dsm.tif", heights, crs=UTM, transform=corner)
     assert OrthoMap.open(large_path, dsm).ground_m == 77.0
@@ -197,11 +188,6 @@ def picture(request, tmp_path):
     if getattr(request, "param", "metric") == "in degrees":
         crs, corner = "EPSG:4326", Affine(1e-5, 0, 33.0, 0, -8e-6, 32.0)
     return write_raster(tmp_path / "map.tif", data, crs=crs, transform=corner, nodata=0)
-
-
-def whole(site, level=0):
-    rows, columns = site.level_shape(level)
-    return Window(0, 0, columns, rows)
 
 
 def copy_in(cache):

@@ -19,7 +19,7 @@ from engine.orthomap import OrthoMap
 from engine.values import Window
 from scenematch.files.geotiff import write_geotiff
 from tests.support.paths import SHARED
-from tests.support.rasters import write_raster
+from tests.support.rasters import whole, write_raster
 
 UTM = "EPSG:32636"
 STEP_M = 0.5
@@ -38,11 +38,6 @@ def noise(*shape, low=1, high=255, seed=0):
 
 def write(path, data, **profile):
     return write_raster(path, data, **({"crs": UTM, "transform": CORNER} | profile))
-
-
-def whole(site, level=0):
-    height, width = site.level_shape(level)
-    return Window(0, 0, width, height)
 
 
 @pytest.fixture(scope="module")
