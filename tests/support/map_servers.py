@@ -125,6 +125,9 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._send(404, b"nothing", "text/plain")
 
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
     def _misbehave(self, what) -> None:
         if what == "break":
             self.send_response(200)
@@ -147,7 +150,8 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in {"Content-Type": kind, "Content-Length": str(len(content)), **(headers or {})}.items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(content)
+        if self.command != "HEAD":
+            self.wfile.write(content)
 
     def _picture(self, pixels: np.ndarray, kind: str = "image/png") -> None:
         file = io.BytesIO()
@@ -157,12 +161,14 @@ class _Handler(BaseHTTPRequestHandler):
             Image.fromarray(pixels).save(file, "PNG", compress_level=1)
         self._send(200, file.getvalue(), kind)
 
-    def _tile(self, zoom: int, column: int, row: int) -> None:
-        pixels = drawn(self.server, "EPSG:3857", _tile_bounds(zoom, column, row), 256, 256)
+    def _picture_or_none(self, pixels: np.ndarray) -> None:
         if pixels[..., 3].any():
             self._picture(pixels)
         else:
             self._send(404, b"no such tile", "text/plain")
+
+    def _tile(self, zoom: int, column: int, row: int) -> None:
+        self._picture_or_none(drawn(self.server, "EPSG:3857", _tile_bounds(zoom, column, row), 256, 256))
 
     def _wms(self, query: dict[str, str]) -> None:
         version = self.server.wms_version
@@ -193,11 +199,7 @@ class _Handler(BaseHTTPRequestHandler):
         step = MATRICES[name]
         west, north = MATRIX_CORNER[0] + column * 100 * step, MATRIX_CORNER[1] - row * 100 * step
         bounds = (west, north - 100 * step, west + 100 * step, north)
-        pixels = drawn(self.server, "EPSG:31256", bounds, 100, 100)
-        if pixels[..., 3].any():
-            self._picture(pixels)
-        else:
-            self._send(404, b"no such tile", "text/plain")
+        self._picture_or_none(drawn(self.server, "EPSG:31256", bounds, 100, 100))
 
     def _file(self, file: Path) -> None:
         if not file.is_file():
@@ -210,13 +212,6 @@ class _Handler(BaseHTTPRequestHandler):
         first, last = int(span[1]), min(int(span[2] or len(content)), len(content) - 1)
         headers = {"Content-Range": f"bytes {first}-{last}/{len(content)}", "Accept-Ranges": "bytes"}
         self._send(206, content[first : last + 1], "image/tiff", headers)
-
-    def do_HEAD(self) -> None:
-        file = self.server.files / Path(urlsplit(self.path).path).name
-        self.send_response(200 if file.is_file() else 404)
-        self.send_header("Content-Length", str(file.stat().st_size) if file.is_file() else "0")
-        self.send_header("Accept-Ranges", "bytes")
-        self.end_headers()
 
 
 def wms_capabilities(server: MapServer) -> str:
