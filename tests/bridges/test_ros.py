@@ -401,14 +401,21 @@ def fix_on(site, **changes):
 VEHICLE = VehicleState(roll_deg=2.0, pitch_deg=-3.0, heading_deg=200.0, height_agl_m=120.0, down_m=-118.0)
 
 
-def test_a_pose_is_the_fix_with_its_covariance(ros, maker, sim_site):
-    fix = fix_on(sim_site)
-    message = wired(ros, pose(maker, fix, VEHICLE, NOW_NS, sim_site, RosOptions()))
+def pose_of(maker, fix, vehicle, site, *, ros=None, **options):
+    """Position, quaternion and covariance (6, 6) of the message of a fix."""
+    message = pose(maker, fix, vehicle, NOW_NS, site, RosOptions(**options))
+    message = message if ros is None else wired(ros, message)
     assert (stamp_ns(message), message.header.frame_id) == (NOW_NS, "map")
     at, turn = message.pose.pose.position, message.pose.pose.orientation
-    assert (at.x, at.y, at.z) == (fix.east_m, fix.north_m, 118.0)
-    assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx(quaternion_xyzw(2.0, -3.0, 200.0))
     covariance = np.asarray(message.pose.covariance).reshape(6, 6)
+    return (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w), covariance
+
+
+def test_a_pose_is_the_fix_with_its_covariance(ros, maker, sim_site):
+    fix = fix_on(sim_site)
+    place, turn, covariance = pose_of(maker, fix, VEHICLE, sim_site, ros=ros)
+    assert place == (fix.east_m, fix.north_m, 118.0)
+    assert turn == pytest.approx(quaternion_xyzw(2.0, -3.0, 200.0))
     assert np.array_equal(covariance[:3, :3], fix.covariance_m2)
     assert np.array_equal(covariance, covariance.T)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
@@ -417,10 +424,9 @@ def test_a_pose_is_the_fix_with_its_covariance(ros, maker, sim_site):
 def test_a_measured_attitude_outranks_the_vehicles(maker, sim_site):
     fix = fix_on(sim_site, attitude=Attitude(5.0, 6.0, 77.0), up_m=sim_site.ground_m + 80.0)
     level = VehicleState(roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0)
-    message = pose(maker, fix, level, NOW_NS, sim_site, RosOptions())
-    turn = message.pose.pose.orientation
-    assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx(quaternion_xyzw(5.0, 6.0, 77.0))
-    assert message.pose.pose.position.z == pytest.approx(80.0)
+    place, turn, _ = pose_of(maker, fix, level, sim_site)
+    assert turn == pytest.approx(quaternion_xyzw(5.0, 6.0, 77.0))
+    assert place[2] == pytest.approx(80.0)
 
 
 def test_a_whole_pose_has_the_covariance_of_its_attitude_about_east_north_up(maker, sim_site):
@@ -428,33 +434,27 @@ def test_a_whole_pose_has_the_covariance_of_its_attitude_about_east_north_up(mak
     known = {"attitude_covariance_deg2": np.diag([4.0, 9.0, 16.0])}
     for heading_deg, expected in ((90.0, [5.0, 10.0, 17.0]), (0.0, [10.0, 5.0, 17.0])):  # a degree is the mount's
         fix = fix_on(sim_site, **known | {"attitude": Attitude(0.0, 0.0, heading_deg)})
-        message = pose(maker, fix, VEHICLE, NOW_NS, sim_site, RosOptions())
-        turns_deg2 = np.asarray(message.pose.covariance).reshape(6, 6)[3:, 3:] * math.degrees(1.0) ** 2
-        assert turns_deg2 == pytest.approx(np.diag(expected))
+        _, _, covariance = pose_of(maker, fix, VEHICLE, sim_site)
+        assert covariance[3:, 3:] * math.degrees(1.0) ** 2 == pytest.approx(np.diag(expected))
 
 
 def test_what_is_unknown_is_as_uncertain_as_can_be(maker, sim_site):
-    message = pose(maker, fix_on(sim_site), VehicleState(), NOW_NS, sim_site, RosOptions())
-    variances = np.diag(np.asarray(message.pose.covariance).reshape(6, 6))
-    assert variances[2] >= 1e6
-    assert (variances[3:] >= math.pi**2).all()
-    turn = message.pose.pose.orientation
-    assert np.linalg.norm((turn.x, turn.y, turn.z, turn.w)) == pytest.approx(1.0)
+    _, turn, covariance = pose_of(maker, fix_on(sim_site), VehicleState(), sim_site)
+    assert covariance[2, 2] >= 1e6
+    assert (np.diag(covariance)[3:] >= math.pi**2).all()
+    assert np.linalg.norm(turn) == pytest.approx(1.0)
 
 
 def test_the_origin_moves_the_pose(maker, sim_site):
     fix = fix_on(sim_site)
-    options = RosOptions(origin=NedOrigin(fix.lat_deg, fix.lon_deg, 0.0))
-    at = pose(maker, fix, VEHICLE, NOW_NS, sim_site, options).pose.pose.position
-    assert (at.x, at.y) == pytest.approx((0.0, 0.0), abs=1e-6)
+    place, _, _ = pose_of(maker, fix, VEHICLE, sim_site, origin=NedOrigin(fix.lat_deg, fix.lon_deg, 0.0))
+    assert place[:2] == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
 def test_ardupilot_finds_the_fix_again_and_the_height_drowns_nothing(maker, sim_site):
     fix, origin = fix_on(sim_site), NedOrigin(sim_site.frame.lat_deg + 0.01, sim_site.frame.lon_deg - 0.01, 0.0)
-    message = pose(maker, fix, VEHICLE, NOW_NS, sim_site, RosOptions(firmware="ardupilot", origin=origin))
-    at = message.pose.pose.position
-    assert (at.y, at.x) == pytest.approx(north_east_m(fix.lat_deg, fix.lon_deg, origin, "ardupilot"))
-    covariance = np.asarray(message.pose.covariance).reshape(6, 6)
+    (x, y, _), _, covariance = pose_of(maker, fix, VEHICLE, sim_site, firmware="ardupilot", origin=origin)
+    assert (y, x) == pytest.approx(north_east_m(fix.lat_deg, fix.lon_deg, origin, "ardupilot"))
     assert np.array_equal(covariance[:2, :2], fix.covariance_m2[:2, :2])
     assert covariance[2, 2] == pytest.approx(fix.sigma_m**2)
     assert not covariance[2, :2].any()
