@@ -496,8 +496,8 @@ def test_diagnostics_are_pairs_of_text(ros, maker):
 class StandIn:
     """A node that keeps what is published."""
 
-    def __init__(self, maker, wanted=True):
-        self.messages, self.wanted, self.published, self.changed = maker, wanted, [], threading.Condition()
+    def __init__(self, maker):
+        self.messages, self.wanted, self.published, self.changed = maker, True, [], threading.Condition()
         self.time_ns = NOW_NS
 
     def now_ns(self):
@@ -517,6 +517,11 @@ class StandIn:
     def wait_for(self, output, count):
         with self.changed:
             assert self.changed.wait_for(lambda: len(self.of(output)) >= count, 60.0), self.published
+
+
+@pytest.fixture
+def node(maker):
+    return StandIn(maker)
 
 
 class Answers:
@@ -544,8 +549,8 @@ def an_image(maker, time_ns, shape=(4, 6)):
     return maker.image(time_ns, "camera", np.zeros(shape, np.uint8))
 
 
-def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, sim_site):
-    node, captured_ns = StandIn(maker), NOW_NS - 50_000_000
+def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, node, sim_site):
+    captured_ns = NOW_NS - 50_000_000
     with bridge_of(node, sim_site) as (bridge, seen):
         bridge.telemetry.imu(maker.imu(captured_ns, "", 1.0, 2.0, 3.0))
         bridge.on_image(an_image(maker, captured_ns))
@@ -563,8 +568,7 @@ def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, sim_site):
     assert values["fixes"] == "1"
 
 
-def test_a_refusal_is_told_and_never_a_pose(maker, sim_site):
-    node = StandIn(maker)
+def test_a_refusal_is_told_and_never_a_pose(maker, node, sim_site):
     refusals = [NoFix(reason=reason, detail="why") for reason in Reason]
     broken = [fix_on(sim_site, east_m=math.nan), fix_on(sim_site, covariance_m2=np.full((3, 3), np.inf))]
     answers = iter([*refusals, *broken])
@@ -581,16 +585,15 @@ def test_a_refusal_is_told_and_never_a_pose(maker, sim_site):
     assert {pair.key: pair.value for pair in stated[0].values}["reason"] == next(iter(Reason)).value
 
 
-def test_nobody_looks_at_the_window(maker, sim_site):
-    node = StandIn(maker, wanted=False)
+def test_nobody_looks_at_the_window(maker, node, sim_site):
+    node.wanted = False
     with bridge_of(node, sim_site) as (bridge, _):
         bridge.on_image(an_image(maker, NOW_NS))
         node.wait_for("diagnostics", 1)
     assert not node.of("window")
 
 
-def test_pictures_that_cannot_be_read_are_told(maker, sim_site):
-    node = StandIn(maker)
+def test_pictures_that_cannot_be_read_are_told(maker, node, sim_site):
     with bridge_of(node, sim_site) as (bridge, _):
         odd = an_image(maker, NOW_NS)
         odd.encoding = "32FC1"
@@ -604,8 +607,7 @@ def test_pictures_that_cannot_be_read_are_told(maker, sim_site):
     assert (status.unusable, status.counts.submitted, status.fixes) == (2, 1, 1)
 
 
-def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, sim_site):
-    node = StandIn(maker)
+def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, node, sim_site):
     with bridge_of(node, sim_site) as (bridge, seen):
         for k, time_ns in enumerate((0, NOW_NS + 1, NOW_NS - 60_000_000_000)):
             node.time_ns = time_ns or NOW_NS
@@ -616,8 +618,8 @@ def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, si
     assert (status.restarts, status.counts.submitted, status.counts.answered) == (1, 3, 3)
 
 
-def test_an_odometry_along_other_axes_is_reported_with_every_frame(ros, maker, sim_site, caplog):
-    node, level = StandIn(maker), (0.0, 0.0, 0.0)
+def test_an_odometry_along_other_axes_is_reported_with_every_frame(ros, maker, node, sim_site, caplog):
+    level = (0.0, 0.0, 0.0)
     topics = RosTopics(odometry="/vio/twist", odometry_type="TwistWithCovarianceStamped")
     with bridge_of(node, sim_site) as (bridge, seen):
         _, heard = bridge.handlers(topics)["/vio/twist"]
@@ -635,8 +637,8 @@ def test_an_odometry_along_other_axes_is_reported_with_every_frame(ros, maker, s
     assert seen.frames[2].north_velocity_mps == pytest.approx(2.0)
 
 
-def test_compressed_pictures_are_live_too(ros, maker, sim_site):
-    node, picture = StandIn(maker), np.random.default_rng(1).integers(0, 256, (5, 7), dtype=np.uint8)
+def test_compressed_pictures_are_live_too(ros, maker, node, sim_site):
+    picture = np.random.default_rng(1).integers(0, 256, (5, 7), dtype=np.uint8)
     with bridge_of(node, sim_site) as (bridge, seen):
         handlers = bridge.handlers(RosTopics(image="/camera/image_raw/compressed"))
         kind, handler = handlers["/camera/image_raw/compressed"]
@@ -649,8 +651,8 @@ def test_compressed_pictures_are_live_too(ros, maker, sim_site):
     assert np.array_equal(seen.frames[0].image, picture)
 
 
-def test_a_picture_waits_for_the_attitude_of_its_capture(maker, sim_site):
-    node, after_ns = StandIn(maker), NOW_NS + 40_000_000
+def test_a_picture_waits_for_the_attitude_of_its_capture(maker, node, sim_site):
+    after_ns = NOW_NS + 40_000_000
     with bridge_of(node, sim_site) as (bridge, seen):
         bridge.on_imu(maker.imu(NOW_NS - 60_000_000, "", 0.0, -6.0, 0.0))
         bridge.on_image(an_image(maker, NOW_NS))
@@ -664,9 +666,9 @@ def test_a_picture_waits_for_the_attitude_of_its_capture(maker, sim_site):
         assert bridge.status.counts.submitted == 3
 
 
-def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, sim_site):
+def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, node, sim_site):
     """A simulator at a tenth of the real speed, and one that runs away."""
-    node, answers = StandIn(maker), threading.Event()
+    answers = threading.Event()
 
     def slowly(frame):
         answers.wait(60.0)
@@ -685,8 +687,7 @@ def test_deadlines_are_on_the_clock_that_the_node_is_told(maker, sim_site):
     assert bridge.status.refused == {"late": 1}
 
 
-def test_silence_is_told(maker, sim_site, monkeypatch):
-    node = StandIn(maker)
+def test_silence_is_told(node, sim_site, monkeypatch):
     with bridge_of(node, sim_site) as (bridge, _):
         bridge.check_input()
         assert not node.of("diagnostics")
@@ -696,8 +697,7 @@ def test_silence_is_told(maker, sim_site, monkeypatch):
     assert "no picture for" in node.of("diagnostics")[0].status[0].message
 
 
-def test_an_empty_name_leaves_a_topic_out(maker, sim_site):
-    node = StandIn(maker)
+def test_an_empty_name_leaves_a_topic_out(maker, node, sim_site):
     with bridge_of(node, sim_site) as (bridge, _):
         handlers = bridge.handlers(RosTopics(compass="", velocity=""))
         kinds = {topic: kind for topic, (kind, _) in handlers.items()}
@@ -956,10 +956,10 @@ def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
         ros1.Node("again")
 
 
-def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, flight, monkeypatch):
+def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, node, flight, monkeypatch):
     """Of its field of view; nothing but the picture's topic is waited for."""
 
-    node, asked, pictures = StandIn(maker), [], [an_image(maker, NOW_NS, (30, 40, 3)), None]
+    asked, pictures = [], [an_image(maker, NOW_NS, (30, 40, 3)), None]
 
     def wait_for(*topic_type_timeout):
         asked.append(topic_type_timeout[:2])
