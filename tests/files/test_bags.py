@@ -21,12 +21,13 @@ from rosbags.typesys import Stores, get_typestore
 from bench.inputs.bags import BAG_KINDS, BagMessages, flight_bag, write_bag
 from bench.live.fuzz_files import damaged
 from engine.camera import Camera
-from engine.errors import MissingExtraError, TelemetryError
+from engine.errors import MissingExtraError, OptionError, TelemetryError
 from engine.values import Frame, Prior, Truth
-from scenematch.cli.app import run as main
 from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import open_truth
 from scenematch.files.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
+from scenematch.runs.inputs import FlightFiles, open_inputs
+from scenematch.runs.settings import TrackSettings
 from tests.support.odometries import odometry_message, twist_message
 
 STEP_NS = 100_000_000
@@ -45,12 +46,11 @@ def _code_of_messages_compiled_once():
         yield
 
 
-def a_flight(count=5, grey=False):
+def a_flight(count=5):
     rng = np.random.default_rng(3)
-    shape = (23, 31) if grey else (23, 31, 3)
     frames = [
         Frame(
-            rng.integers(0, 256, shape, dtype=np.uint8),
+            rng.integers(0, 256, (23, 31, 3), dtype=np.uint8),
             timestamp_ns=1_700_000_000_123_456_789 + k * STEP_NS,
             height_agl_m=120.0 + k,
             heading_deg=(357.0 + 2.0 * k) % 360.0,
@@ -71,9 +71,9 @@ def a_flight(count=5, grey=False):
     return frames, truth
 
 
-def a_bag(folder, kind, **options):
+def a_bag(folder, kind, count=5):
     path = folder / ("flight.bag" if kind == "ros1" else kind)
-    frames, truth = a_flight(**options)
+    frames, truth = a_flight(count)
     start = Prior(lat_deg=48.2001, lon_deg=15.1001, sigma_m=12.0)
     write_bag(path, ((f, start if k == 0 else None) for k, f in enumerate(frames)), CAMERA, kind=kind, truth=truth)
     return path, frames, truth
@@ -91,11 +91,6 @@ def test_pictures_come_back_byte_for_byte(bag):
     assert source.stamps_ns() == [frame.timestamp_ns for frame in frames]
     for k in (0, 1, 4, 2, 2):  # forward, and back
         assert source.read(str(k)).tobytes() == frames[k].image.tobytes()
-
-
-def test_grey_pictures_come_back_in_three_channels(tmp_path):
-    path, frames, _ = a_bag(tmp_path, BAG_KINDS[1], grey=True)
-    assert BagFrames(path).read("1").tobytes() == np.repeat(frames[1].image[:, :, None], 3, axis=2).tobytes()
 
 
 def test_a_flight_comes_back(bag):
@@ -141,19 +136,6 @@ def test_others_read_what_is_written(bag):
     assert compass == [frame.heading_deg for frame in frames]
 
 
-def test_without_a_compass_the_imu_has_the_heading(tmp_path):
-    types = get_typestore(Stores.ROS1_NOETIC)
-    maker = BagMessages(types.types.__getitem__, True)
-    with Writer1(tmp_path / "imu.bag") as writer:
-        connection = writer.add_connection("/imu/data", "sensor_msgs/msg/Imu", typestore=types)
-        for k in range(3):
-            message = maker.imu(10**9 + k, "base_link", 5.0, -7.0, 200.0 + k)
-            writer.write(connection, 5 * 10**9, types.serialize_ros1(message, connection.msgtype))
-    series = read_bag(tmp_path / "imu.bag").series
-    assert series["heading_deg"].stamps_ns.tolist() == [10**9 + k for k in range(3)]  # the headers', not the bag's
-    assert np.mod(series["heading_deg"].values, 360.0) == pytest.approx([200.0, 201.0, 202.0])
-
-
 STORES = {True: Stores.ROS1_NOETIC, False: Stores.ROS2_HUMBLE}
 
 
@@ -176,10 +158,18 @@ def maker():
     return BagMessages(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
 
 
+def test_without_a_compass_the_imu_has_the_heading(tmp_path, maker):
+    messages = [(5 * 10**9, maker.imu(10**9 + k, "base_link", 5.0, -7.0, 200.0 + k)) for k in range(3)]
+    heading = read_bag(written(tmp_path / "imu.bag", {"/imu/data": messages})).series["heading_deg"]
+    assert heading.stamps_ns.tolist() == [10**9 + k for k in range(3)]  # the headers', not the bag's
+    assert np.mod(heading.values, 360.0) == pytest.approx([200.0, 201.0, 202.0])
+
+
 def test_several_topics_with_pictures_ask_for_one(tmp_path, maker):
-    pictures = [np.full((4, 6), level, np.uint8) for level in (10, 20)]
-    topics = {f"/{name}/image_raw": [(10**9, maker.image(10**9, "", picture))] for name, picture in
-              zip(("front", "down"), pictures, strict=True)}  # fmt: skip
+    topics = {
+        f"/{name}/image_raw": [(10**9, maker.image(10**9, "", np.full((4, 6), level, np.uint8)))]
+        for name, level in (("front", 10), ("down", 20))
+    }
     path = written(tmp_path / "two.bag", topics)
     with pytest.raises(TelemetryError, match=r"one topic.*/down/image_raw, /front/image_raw; .*`image_topic`"):
         BagFrames(path)
@@ -215,7 +205,8 @@ def test_a_picture_that_is_published_again_counts_once(tmp_path, maker):
     source = BagFrames(written(tmp_path / "x.bag", {IMAGE: messages}))
     assert source.names == ["0", "2", "4"]
     assert source.stamps_ns() == [10**9, 2 * 10**9, 3 * 10**9]
-    assert [source.read(name)[0, 0, 0] for name in source.names] == [10, 20, 30]
+    for name, level in zip(source.names, (10, 20, 30), strict=True):
+        assert np.array_equal(source.read(name), np.full((4, 6, 3), level))  # grey in three channels
 
 
 def test_the_heading_with_a_stamp_precedes_the_one_without(tmp_path, maker):
@@ -227,10 +218,12 @@ def test_the_heading_with_a_stamp_precedes_the_one_without(tmp_path, maker):
     assert read_bag(written(tmp_path / "raw.bag", raw)).series["heading_deg"].values == pytest.approx(110.0)
 
 
-def a_bag_with_odometry(path, maker, *, variances=None, by=None, **left_out):
+BY_ODOMETRY = partial(odometry_message, yaw_deg=77.0)
+
+
+def a_bag_with_odometry(path, maker, *, variances=None, by=BY_ODOMETRY, without=()):
     """A turn of 60 degrees a second by attitude and odometry, and by a velocity of another source."""
     moments = [(k * STEP_NS, (10.0, -5.0, 20.0 + 6.0 * k), (0.5 * k, -3.0, 0.25)) for k in range(1, 12)]
-    by = by or partial(odometry_message, yaw_deg=77.0)
     topics = {
         IMAGE: [(t, maker.image(t, "", np.zeros((4, 6), np.uint8))) for t, _, _ in moments[::5]],
         "/imu/data": [(t, maker.imu(t, "", *angles)) for t, angles, _ in moments],
@@ -239,30 +232,17 @@ def a_bag_with_odometry(path, maker, *, variances=None, by=None, **left_out):
             (t + 7, by(maker, t, angles, enu_mps, variances=variances)) for t, angles, enu_mps in moments
         ],
     }
-    return written(path, {name: each for name, each in topics.items() if name not in left_out.get("without", ())})
-
-
-def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, maker):
-    path = a_bag_with_odometry(tmp_path / "x.bag", maker, variances=(0.16, 0.04, 0.04))
-    for item in open_flight(path):
-        assert (item.frame.east_velocity_mps, item.frame.velocity_sigma_mps) == (50.0, None)
-    flight = open_flight(path, odometry_topic="/vio/odometry")
-    for k, item in zip((1, 6, 11), flight, strict=True):
-        velocity = item.frame.east_velocity_mps, item.frame.north_velocity_mps
-        assert velocity == pytest.approx((0.5 * k, -3.0), abs=1e-9)
-        speed_mps = np.linalg.norm((0.5 * k, -3.0, 0.25))
-        assert item.frame.velocity_sigma_mps == pytest.approx(np.hypot(0.4, np.radians(1.0) * speed_mps))
-    unstated = a_bag_with_odometry(tmp_path / "zeros.bag", maker)
-    frames = [item.frame for item in open_flight(unstated, odometry_topic="/vio/odometry")]
-    assert [frame.velocity_sigma_mps for frame in frames] == [None] * 3
-    assert frames[1].east_velocity_mps == pytest.approx(3.0, abs=1e-9)
+    return written(path, {name: each for name, each in topics.items() if name not in without})
 
 
 @pytest.mark.parametrize("variances", [(0.16, 0.04, 0.04), None])
 @pytest.mark.parametrize("ros1", [True, False])
-def test_a_twist_by_itself_is_an_odometry_too(tmp_path, ros1, variances):
+@pytest.mark.parametrize("by", [BY_ODOMETRY, twist_message], ids=["odometry", "twist"])
+def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, ros1, by, variances):
     maker = BagMessages(get_typestore(STORES[ros1]).types.__getitem__, ros1)
-    path = a_bag_with_odometry(tmp_path / ("x.bag" if ros1 else "x"), maker, variances=variances, by=twist_message)
+    path = a_bag_with_odometry(tmp_path / ("x.bag" if ros1 else "x"), maker, variances=variances, by=by)
+    for item in open_flight(path):
+        assert (item.frame.east_velocity_mps, item.frame.velocity_sigma_mps) == (50.0, None)
     flight = open_flight(path, odometry_topic="/vio/odometry")
     for k, item in zip((1, 6, 11), flight, strict=True):
         velocity = item.frame.east_velocity_mps, item.frame.north_velocity_mps
@@ -295,14 +275,9 @@ def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker):
         read_bag(path, odometry_topic="/vio/odometry")
 
 
-def test_an_odometrys_topic_needs_a_bag(tmp_path, capsys):
-    for command in ("track", "check", "compare"):
-        given = [
-            "--map", "m.tif", "--frames", "f", "--telemetry", "t.csv", "--settings", "input.odometry_topic=/vio",
-        ]  # fmt: skip
-        out = [] if command == "check" else ["--out", str(tmp_path / "out")]
-        assert main([command, *given, *out]) == 2
-        assert "--settings input.odometry_topic: expected a bag as telemetry, got t.csv" in capsys.readouterr().err
+def test_an_odometrys_topic_needs_a_bag():
+    with pytest.raises(OptionError, match=r"^odometry_topic: expected a bag as telemetry, got t\.csv"):
+        FlightFiles(map="m.tif", frames="f", telemetry="t.csv", odometry_topic="/vio")
 
 
 def test_a_bag_without_telemetry_or_calibration_says_so(tmp_path, maker):
@@ -339,87 +314,57 @@ def test_a_bag_that_is_missing_or_without_its_reader_is_named(tmp_path, monkeypa
 @pytest.mark.parametrize(
     "kind", [BAG_KINDS[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in BAG_KINDS[1:])]
 )
-def test_every_truncation_is_one_line_or_a_shorter_flight(tmp_path, kind):
-    path, frames, _ = a_bag(tmp_path, kind, count=2)
-    file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix in (".db3", ".mcap"))
-    data = file.read_bytes()
-    for size in [0, 1, 13, *range(500, len(data), max(len(data) // 12, 1))]:
-        file.write_bytes(data[:size])
-        check_readable_or_one_line(path, frames)
-
-
-@pytest.mark.parametrize(
-    "kind", [BAG_KINDS[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in BAG_KINDS[1:])]
-)
-def test_mutated_bags_are_one_line_or_a_flight(tmp_path, kind):
+def test_damaged_bags_are_one_line_or_a_flight(tmp_path, kind):
+    """Cut short, or with bytes turned; of a folder also what says how it is made up."""
     path, frames, _ = a_bag(tmp_path, kind, count=2)
     sound = {file: file.read_bytes() for file in ([path] if path.is_file() else sorted(path.iterdir()))}
     rng = random.Random(5)
-    for _ in range(25):
+    for trial in range(40):
         file = rng.choice(list(sound))
-        file.write_bytes(damaged(rng, sound[file]))
-        check_readable_or_one_line(path, frames)
-        file.write_bytes(sound[file])
+        data = sound[file]
+        file.write_bytes(damaged(rng, data) if trial % 2 else data[: rng.randrange(len(data))])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ResourceWarning)  # the reader's own, where a file breaks as it opens
+            said, images = str(path), []
+            try:
+                images = [item.frame.image for item in open_flight(path)]
+            except TelemetryError as error:
+                said = str(error)
+        assert all(image.dtype == np.uint8 for image in images)
+        assert len(images) <= 2 * len(frames)
+        assert "\n" not in said
+        assert str(path) in said
+        file.write_bytes(data)
 
 
-def check_readable_or_one_line(path, frames):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)  # the reader's own, where a file breaks while it opens
-        said, count = str(path), 0
-        try:
-            for item in open_flight(path):
-                assert item.frame.image.dtype == np.uint8
-                count += 1
-        except TelemetryError as error:
-            said = str(error)
-    assert "\n" not in said
-    assert str(path) in said
-    assert count <= 2 * len(frames)
+# ------------------------------------------------------------------------------------------------- of a run
 
 
-# ---------------------------------------------------------------------------------------------- command line
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("bare_runs")
-def test_a_folder_becomes_a_bag_and_is_tracked_alike(flight_in, tmp_path, capsys):
-    folder, bag = tmp_path / "flight", tmp_path / "flight.bag"
-    flight_in(folder, frames=3)
-    flight_bag(folder, bag)
-    world = ["--map", str(folder / "map.tif"), "--surface", str(folder / "dsm.tif")]
-    inputs = {
-        "folder": ["--frames", str(folder / "frames"), "--telemetry", str(folder / "telemetry.csv"),
-                   "--camera", str(folder / "camera.yaml")],
-        "bag": ["--frames", str(bag), "--truth", str(bag)],
-    }  # fmt: skip
-    tracks = []
-    for name, options in inputs.items():
-        assert main(["track", *world, *options, "--out", str(tmp_path / name)]) == 0
-        lines = (tmp_path / name / "track.csv").read_text(encoding="utf-8").splitlines()
-        assert len(lines) == 4
-        tracks.append([row.split(",") for row in lines[1:]])
-    for one, other in zip(*tracks, strict=True):
-        assert (one[0], one[2]) == (other[0], other[2])
-        # Angles that went through a quaternion differ in the last bit, and places by less than is printed.
-        assert np.array(one[4:8], float) == pytest.approx(np.array(other[4:8], float), abs=0.01)
-    capsys.readouterr()
-    assert main(["track", *world, "--frames", str(folder / "frames"), "--out", str(tmp_path / "y")]) == 1
-    assert "--camera" in capsys.readouterr().err
+def test_a_folder_that_becomes_a_bag_gives_a_run_the_same_inputs(flight_in, tmp_path):
+    """Angles that went through a quaternion differ in the last bits."""
+    folder = flight_in(tmp_path / "flight", frames=3)
+    flight_bag(tmp_path / "flight", tmp_path / "flight.bag")
+    of_bag = FlightFiles(map=folder.map, frames=tmp_path / "flight.bag", truth=tmp_path / "flight.bag")
+    one, other = (open_inputs(files, [TrackSettings()]) for files in (folder, of_bag))
+    for mine, theirs in zip(one.flight, other.flight, strict=True):
+        assert mine.frame.timestamp_ns == theirs.frame.timestamp_ns
+        assert np.array_equal(mine.frame.image, theirs.frame.image)
+        for name in ("height_agl_m", "roll_deg", "pitch_deg", "heading_deg", "east_velocity_mps"):
+            assert getattr(theirs.frame, name) == pytest.approx(getattr(mine.frame, name), abs=1e-9), name
+    for name in ("matrix", "distortion", "mount"):
+        assert np.array_equal(getattr(one.camera, name), getattr(other.camera, name)), name
+    assert [row.lat_deg for row in other.truth] == pytest.approx([row.lat_deg for row in one.truth], abs=1e-12)
 
 
 def test_topics_of_the_calibration(tmp_path, maker):
     """The camera_info beside the pictures counts, not the first."""
-    image = np.zeros((23, 31), np.uint8)
     other = Camera.from_fov(31, 23, 30.0)
-    path = written(
-        tmp_path / "x.bag",
-        {
-            IMAGE: [(10**9, maker.image(10**9, "", image))],
-            "/aaa/camera_info": [(10**9, maker.camera_info(10**9, "", other))],
-            CAMERA_INFO: [(10**9, maker.camera_info(10**9, "", CAMERA))],
-        },
-    )
-    assert np.array_equal(read_bag_camera(path).matrix, CAMERA.matrix)
+    topics = {
+        IMAGE: [(10**9, maker.image(10**9, "", np.zeros((23, 31), np.uint8)))],
+        "/aaa/camera_info": [(10**9, maker.camera_info(10**9, "", other))],
+        CAMERA_INFO: [(10**9, maker.camera_info(10**9, "", CAMERA))],
+    }
+    assert np.array_equal(read_bag_camera(written(tmp_path / "x.bag", topics)).matrix, CAMERA.matrix)
 
 
 @pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])

@@ -27,11 +27,9 @@ def test_the_defaults_change_nothing():
 
 
 def test_radians_become_degrees():
-    row = replace(ROW, roll_deg=0.1, pitch_deg=-0.2, heading_deg=3.0)
-    row = corrected(row, angles="radians")
-    assert (row.roll_deg, row.pitch_deg, row.heading_deg) == pytest.approx(
-        [math.degrees(v) for v in (0.1, -0.2, 3.0)]
-    )
+    row = corrected(replace(ROW, roll_deg=0.1, pitch_deg=-0.2, heading_deg=3.0), angles="radians")
+    angles_deg = [math.degrees(v) for v in (0.1, -0.2, 3.0)]
+    assert [row.roll_deg, row.pitch_deg, row.heading_deg] == pytest.approx(angles_deg)
 
 
 def test_columns_are_made_of_the_row_as_it_was():

@@ -1,8 +1,11 @@
-"""Tracks in other programs' formats, read back by other parsers: places, times, gaps."""
+"""Tracks in other programs' formats, read back by other parsers (gpxpy, GDAL): places, times, gaps."""
 
+import datetime
 import io
 import json
+import warnings
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,36 +24,27 @@ GPX = "{http://www.topografix.com/GPX/1/1}"
 
 def fix(k, lat_deg=32.5, lon_deg=35.25, *, start_ns=T0, up_m=None, **more):
     return export.PoseRow(
-        timestamp_ns=None if start_ns is None else start_ns + k * 250_000_000,
-        frame=f"<{k}>&.png",
-        status="fix",
-        lat_deg=lat_deg + k * 1e-5,
-        lon_deg=lon_deg - k * 2e-5,
-        east_m=1.5 * k,
-        north_m=-0.5 * k,
-        up_m=up_m,
-        sigma_east_m=0.25,
-        sigma_north_m=0.5,
-        covariance_en_m2=0.01,
-        score=0.8,
-        method="ncc",
-        **more,
-    )
+        timestamp_ns=None if start_ns is None else start_ns + k * 250_000_000, frame=f"<{k}>&.png", status="fix",
+        lat_deg=lat_deg + k * 1e-5, lon_deg=lon_deg - k * 2e-5, east_m=1.5 * k, north_m=-0.5 * k, up_m=up_m,
+        sigma_east_m=0.25, sigma_north_m=0.5, covariance_en_m2=0.01, score=0.8, method="ncc", **more,
+    )  # fmt: skip
 
 
 def refusal(k):
     return export.PoseRow(timestamp_ns=T0 + k * 250_000_000, frame=f"{k}.png", status="no_fix", reason="low_score")
 
 
+RUNS = ([0, 1], [3], [6, 7, 8])
 ROWS = [fix(0), fix(1), refusal(2), fix(3), refusal(4), refusal(5), fix(6), fix(7), fix(8)]
 
 
+def places(ks):
+    """(N, 2) longitude and latitude of fixes."""
+    return np.array([[ROWS[k].lon_deg, ROWS[k].lat_deg] for k in ks])
+
+
 def test_a_refusal_ends_a_segment():
-    assert [[row.frame for row in run] for run in export.segments(ROWS)] == [
-        ["<0>&.png", "<1>&.png"],
-        ["<3>&.png"],
-        ["<6>&.png", "<7>&.png", "<8>&.png"],
-    ]
+    assert export.segments(ROWS) == [[ROWS[k] for k in run] for run in RUNS]
     assert export.segments([refusal(0)]) == []
 
 
@@ -65,9 +59,7 @@ def test_gpx_has_a_segment_a_run_and_its_elements_in_the_order_of_the_schema():
     rows = [fix(0, alt_amsl_m=12.5), fix(1, up_m=150.0), refusal(2), fix(3, alt_amsl_m=-1.0)]
     root = ElementTree.fromstring(export.to_gpx(rows))
     assert (root.tag, root.attrib["version"]) == (f"{GPX}gpx", "1.1")
-    runs = root.findall(f"{GPX}trk/{GPX}trkseg")
-    assert [len(run) for run in runs] == [2, 1]
-    first, second = runs[0]
+    first, second = root.find(f"{GPX}trk/{GPX}trkseg")
     assert [child.tag.removeprefix(GPX) for child in first] == ["ele", "time", "name"]
     assert [child.tag.removeprefix(GPX) for child in second] == ["time", "name"]
     assert (first.attrib["lat"], first.attrib["lon"]) == ("32.500000000", "35.250000000")
@@ -75,16 +67,37 @@ def test_gpx_has_a_segment_a_run_and_its_elements_in_the_order_of_the_schema():
     assert root.find(f"{GPX}trk")[0].tag == f"{GPX}name"
 
 
-def test_geojson_has_lines_of_two_points_or_more_and_every_fix_with_its_sigma():
-    line, *points = json.loads(export.to_geojson(ROWS))["features"]
-    assert line["geometry"]["type"] == "MultiLineString"
-    assert [len(part) for part in line["geometry"]["coordinates"]] == [2, 3]
-    assert [p["properties"]["frame"] for p in points] == [row.frame for row in ROWS if row.fixed]
-    for point, row in zip(points, (row for row in ROWS if row.fixed), strict=True):
-        assert point["geometry"]["coordinates"] == pytest.approx([row.lon_deg, row.lat_deg], abs=1e-9)
-        assert (point["properties"]["sigma_east_m"], point["properties"]["sigma_north_m"]) == (0.25, 0.5)
-        assert point["properties"]["timestamp_ns"] == row.timestamp_ns
-    assert all(f["geometry"]["type"] == "Point" for f in json.loads(export.to_geojson([fix(0)]))["features"])
+def test_gpxpy_finds_a_segment_a_run_with_its_places_times_and_heights():
+    gpxpy = pytest.importorskip("gpxpy", reason="gpxpy is not installed")
+    rows = [replace(row, alt_amsl_m=170.0 + 0.125 * k) if row.fixed else row for k, row in enumerate(ROWS)]
+    (track,) = gpxpy.parse(export.to_gpx(rows)).tracks
+    begin = datetime.datetime.fromtimestamp(T0 / 1e9, datetime.UTC)
+    for segment, ks in zip(track.segments, RUNS, strict=True):
+        found = np.array([[point.longitude, point.latitude] for point in segment.points])
+        assert found == pytest.approx(places(ks), abs=1e-9)
+        assert [point.elevation for point in segment.points] == [rows[k].alt_amsl_m for k in ks]
+        assert [(point.time - begin).total_seconds() for point in segment.points] == [0.25 * k for k in ks]
+
+
+def test_gdal_opens_geojson_with_lines_of_two_points_or_more_and_every_fix_with_its_sigma(tmp_path):
+    pyogrio = pytest.importorskip("pyogrio", reason="pyogrio is not installed")
+    path = tmp_path / "track.geojson"
+    path.write_text(export.to_geojson(ROWS), encoding="utf-8")
+    with warnings.catch_warnings():  # pyogrio's own, of NumPy 2.5
+        warnings.filterwarnings("ignore", "The 'generic' unit for NumPy timedelta", DeprecationWarning)
+        facts, _, geometries, values = pyogrio.raw.read(path)
+    assert facts["crs"] == "EPSG:4326"
+    lines, *points = geometries
+    assert (lines[1], lines[5]) == (5, 2)  # OGC's multi-line of two: a run of one fix is no line
+    assert all(wkb[1] == 1 for wkb in points)
+    found = np.array([np.frombuffer(wkb, "<f8", count=2, offset=5) for wkb in points])
+    fixes = [k for run in RUNS for k in run]
+    assert found == pytest.approx(places(fixes), abs=1e-9)
+    fields = {name: column[1:].tolist() for name, column in zip(facts["fields"], values, strict=True)}
+    for name in ("frame", "sigma_east_m", "sigma_north_m"):
+        assert fields[name] == [getattr(ROWS[k], name) for k in fixes], name
+    (only,) = json.loads(export.to_geojson([fix(0)]))["features"]
+    assert (only["geometry"]["type"], only["properties"]["timestamp_ns"]) == ("Point", T0)
 
 
 def test_tum_keeps_every_nanosecond_and_says_what_is_not_known():
@@ -180,16 +193,10 @@ def test_the_truth_comes_at_the_moments_of_the_fixes_about_the_same_origin(tmp_p
     lines = (tmp_path / "truth.tum").read_text().splitlines()[1:]
     values = [[float(value) for value in line.split()[1:4]] for line in lines]
     assert all(line.endswith(" 0 0 0 1") for line in lines)  # heading east is the identity of forward, left, up
-    assert [line.split()[0][-11:] for line in lines] == [
-        "0.000000000",
-        "0.250000000",
-        "0.750000000",
-        "1.500000000",
-    ]
-    expected = [[0.0, 100.0 + 4.0 * t, 155.0 + t] for t in (0.0, 0.25, 0.75, 1.5)]
-    assert [value for row in values for value in row] == pytest.approx(
-        [value for row in expected for value in row], abs=0.02
-    )
+    moments_s = [0.0, 0.25, 0.75, 1.5]
+    assert [line.split()[0][-11:] for line in lines] == [f"{t:.9f}" for t in moments_s]
+    expected = [[0.0, 100.0 + 4.0 * t, 155.0 + t] for t in moments_s]
+    assert np.array(values) == pytest.approx(np.array(expected), abs=0.02)
     assert run(arguments) == 2
     (tmp_path / "t.csv").write_text("timestamp_ns,lat_deg,lon_deg\n1,32.5,35.25\n2,32.5,35.25\n")
     assert run([*arguments, "--force"]) == 1

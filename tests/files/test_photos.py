@@ -1,6 +1,5 @@
 """Photographs: telemetry and camera from what stands in them, against hand-computed values and a real survey."""
 
-import csv
 import math
 
 import numpy as np
@@ -11,7 +10,8 @@ from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import open_truth
 from scenematch.files.photo_camera import photo_camera
 from scenematch.files.photos import COMPASS_SIGMA_DEG, GIMBAL_SIGMA_DEG, exif_telemetry, photo_telemetry
-from scenematch.files.telemetry import DEFAULT_PRIOR_SIGMA_M
+from scenematch.files.telemetry import DEFAULT_PRIOR_SIGMA_M, read_telemetry
+from scenematch.files.truth import read_truth
 from tests.support.paths import NO_SHARED, SHARED
 from tests.support.photos import gimbal, photograph
 
@@ -37,10 +37,8 @@ def test_exif_heading_counts_only_from_true_north(tmp_path):
 
 
 def test_exif_without_a_fix_or_below_the_sea(tmp_path):
-    photograph(
-        tmp_path / "a.jpg", gps={1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0), 5: b"\1", 6: 3.0, 31: 2.5}
-    )
-    (row,) = exif_telemetry([tmp_path / "a.jpg"])
+    nowhere = {1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0), 5: b"\1", 6: 3.0, 31: 2.5}
+    (row,) = exif_telemetry([photograph(tmp_path / "a.jpg", gps=nowhere)])
     assert row.prior is None
     assert row.alt_amsl_m == -3.0
 
@@ -189,21 +187,18 @@ def test_a_real_survey_says_camera_place_height_and_heading_itself():
     assert (camera.width_px, camera.height_px) == (4000, 2250)
     assert camera.focal_px == pytest.approx(3.61 / (6.17 / 4000), rel=0.02)
     assert flight.has_gimbal
-    with (folder / "truth.csv").open() as file:
-        truth = list(csv.DictReader(file))
-    with (folder / "telemetry.csv").open() as file:
-        posed = list(csv.DictReader(file))
-    assert [row.frame for row in flight.rows] == [row["frame"] for row in posed]
+    truth, posed = read_truth(folder / "truth.csv"), read_telemetry(folder / "telemetry.csv")
+    assert [row.frame for row in flight.rows] == [row.frame for row in posed]
     for row, true, pose in zip(flight.rows, truth, posed, strict=True):
-        north_m = (row.lat_deg - float(true["lat_deg"])) * 111_200.0
-        east_m = (row.lon_deg - float(true["lon_deg"])) * 111_200.0 * math.cos(math.radians(row.lat_deg))
+        north_m = (row.lat_deg - true.lat_deg) * 111_200.0
+        east_m = (row.lon_deg - true.lon_deg) * 111_200.0 * math.cos(math.radians(row.lat_deg))
         assert math.hypot(east_m, north_m) < 1.0
         # Structure from motion over a plane leaves the focal length open, and with it the height: only the
         # scale of the picture is known.
-        scale = (row.height_agl_m / camera.focal_px * 2.5) / (float(true["height_agl_m"]) / 1125.5349)
+        scale = (row.height_agl_m / camera.focal_px * 2.5) / (true.height_agl_m / 1125.5349)
         assert abs(scale - 1.0) < 2.0 * row.height_sigma_m / row.height_agl_m
         if row.heading_deg is not None:
-            turn_deg = (row.heading_deg - float(pose["heading_deg"]) + 180.0) % 360.0 - 180.0
+            turn_deg = (row.heading_deg - pose.heading_deg + 180.0) % 360.0 - 180.0
             assert abs(turn_deg) < 3.0 * row.heading_sigma_deg
             assert abs(row.roll_deg) < 0.2
             assert abs(row.pitch_deg) < 0.2
@@ -221,8 +216,7 @@ def test_positions_of_photographs_serve_as_truth_at_their_own_times(tmp_path):
     assert [early.timestamp_ns, late.timestamp_ns] == stamps[:2]
     assert (early.lat_deg, late.lat_deg, late.lon_deg) == pytest.approx((48.27, 48.25, 16.5), abs=1e-12)
     assert (late.alt_amsl_m, late.height_agl_m, late.heading_deg) == (None, None, None)  # no truth
-    only = tmp_path / "only"
-    only.mkdir()
-    photograph(only / "a.jpg")
+    for name in ("a.jpg", "b.jpg"):
+        (tmp_path / name).unlink()
     with pytest.raises(TelemetryError, match="expected photographs with a time and a position in their EXIF"):
-        open_truth(only)
+        open_truth(tmp_path)

@@ -7,29 +7,31 @@ import pytest
 
 from engine import OptionError
 from engine.options import NavigatorOptions, SiftOptions
-from scenematch.files.settings import (
-    changed,
-    field_descriptions,
-    options_from_mapping,
-    settings_text,
-)
+from scenematch.files.settings import changed, field_descriptions, options_from_mapping, settings_text
 from scenematch.runs.settings import TrackSettings, load_settings
+from tests.support.refusals import refusal
 
 KEY = re.compile(r"^#(\w+ = )", re.MULTILINE)
 
 
-def test_all_keys_set_to_what_the_file_shows_are_the_defaults(tmp_path):
-    path = tmp_path / "all.toml"
-    text = KEY.sub(r"\1", settings_text(TrackSettings()))
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "settings.toml"
+
+
+def loaded(path, text, **typed):
     path.write_text(text, encoding="utf-8")
-    assert load_settings(path) == TrackSettings()
-    assert len(KEY.findall(settings_text(TrackSettings()))) > 60
+    return load_settings(path, **typed)
 
 
-def test_a_new_file_changes_nothing(tmp_path):
-    path = tmp_path / "new.toml"
-    path.write_text(settings_text(TrackSettings()), encoding="utf-8")
-    assert load_settings(path) == TrackSettings()
+def test_all_keys_set_to_what_the_file_shows_are_the_defaults(path):
+    text = settings_text(TrackSettings())
+    assert loaded(path, KEY.sub(r"\1", text)) == TrackSettings()
+    assert len(KEY.findall(text)) > 60
+
+
+def test_a_new_file_changes_nothing(path):
+    assert loaded(path, settings_text(TrackSettings())) == TrackSettings()
 
 
 def test_every_field_that_a_file_can_hold_is_explained():
@@ -40,13 +42,9 @@ def test_every_field_that_a_file_can_hold_is_explained():
         assert before.splitlines()[-1].startswith("# "), line
 
 
-def test_values_arrive(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(
-        'method = "sift"\n[ncc]\nexclusion_m = 2\n[ncc.errors]\nmap_m = 6.5\n[navigator]\nodometry = true\n',
-        encoding="utf-8",
-    )
-    found = load_settings(path)
+def test_values_arrive(path):
+    text = 'method = "sift"\n[ncc]\nexclusion_m = 2\n[ncc.errors]\nmap_m = 6.5\n[navigator]\nodometry = true\n'
+    found = loaded(path, text)
     assert (found.method, found.ncc.exclusion_m, found.ncc.errors.map_m) == ("sift", 2.0, 6.5)
     assert found.navigator.odometry is True
     assert changed(found) == {
@@ -58,50 +56,36 @@ def test_values_arrive(tmp_path):
     assert changed(TrackSettings()) == {}
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("risk = 5", "risk: expected a probability above 0 and below 1, got 5.0"),
-        ('profile = "fast"', "profile: expected one of engine, paper, got 'fast'"),
-    ],
-)
-def test_what_the_matcher_would_refuse_is_refused_as_the_file_is_read(tmp_path, text, message):
-    path = tmp_path / "bad.toml"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(OptionError) as caught:
-        load_settings(path)
-    assert str(caught.value) == f"{path}: {message}"
-
-
-def test_the_command_line_counts_more_than_the_file(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text('method = "sift"\nbudget_ms = 40\n', encoding="utf-8")
-    found = load_settings(path, method="ncc", budget_ms=None)
+def test_the_command_line_counts_more_than_the_file(path):
+    found = loaded(path, 'method = "sift"\nbudget_ms = 40\n', method="ncc", budget_ms=None)
     assert found == replace(TrackSettings(), method="ncc", budget_ms=40.0)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("exclusoin_m = 1", "exclusoin_m: not a setting; did you mean exclusion_m?"),
-        ("[errors]\nmpa_m = 4", "errors.mpa_m: not a setting; did you mean map_m?"),
-        ("zebra = 1", "zebra: not a setting; expected one of score, "),
-        ('exclusion_m = "wide"', "exclusion_m: expected a number, got 'wide'"),
-        ("exclusion_m = 0.0", "exclusion_m: expected a number above 0, got 0.0"),
-        ("enhance_radius_px = 2.5", "enhance_radius_px: expected a whole number, got 2.5"),
-        ("refine = 1", "refine: expected true or false, got 1"),
-        ("errors = 3", "errors: expected a table, got 3"),
-        ("[errors]\nmap_m = -1", "errors.map_m: expected a number above 0, got -1.0"),
+        ("risk = 5", "risk: expected a probability above 0 and below 1, got 5.0"),
+        ('profile = "fast"', "profile: expected one of engine, paper, got 'fast'"),
+        ("[ncc]\nexclusoin_m = 1", "ncc.exclusoin_m: not a setting; did you mean exclusion_m?"),
+        ("[ncc.errors]\nmpa_m = 4", "ncc.errors.mpa_m: not a setting; did you mean map_m?"),
+        ("[ncc]\nzebra = 1", "ncc.zebra: not a setting; expected one of score, "),
+        ('[ncc]\nexclusion_m = "wide"', "ncc.exclusion_m: expected a number, got 'wide'"),
+        ("[ncc]\nexclusion_m = 0.0", "ncc.exclusion_m: expected a number above 0, got 0.0"),
+        ("[ncc]\nenhance_radius_px = 2.5", "ncc.enhance_radius_px: expected a whole number, got 2.5"),
+        ("[ncc]\nrefine = 1", "ncc.refine: expected true or false, got 1"),
+        ("[ncc]\nerrors = 3", "ncc.errors: expected a table, got 3"),
+        ("[ncc.errors]\nmap_m = -1", "ncc.errors.map_m: expected a number above 0, got -1.0"),
+        ('[telemetry_columns]\naltitude = "alt"', "telemetry_columns: expected one of timestamp_ns, "),
+        (
+            '[telemetry_columns]\nframe = " "',
+            "telemetry_columns.frame: expected the name of a column, got an empty",
+        ),
+        ("[telemetry_columns]\nframe = 3", "telemetry_columns.frame: expected a quoted string, got 3"),
         ("exclusion_m = ", "expected TOML, got something else: "),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path, text, message):
-    path = tmp_path / "bad.toml"
-    path.write_text("[ncc]\n" + text.replace("[errors]", "[ncc.errors]"), encoding="utf-8")
-    with pytest.raises(OptionError) as caught:
-        load_settings(path)
-    assert str(caught.value).startswith((f"{path}: ncc.{message}", f"{path}: {message}"))
-    assert "\n" not in str(caught.value)
+def test_what_is_wrong_is_named(path, text, message):
+    assert refusal(loaded, path, text, error=OptionError).startswith(f"{path}: {message}")
 
 
 def test_a_file_cannot_hold_what_is_no_value():

@@ -1,19 +1,16 @@
 """What a fetch of a map refuses or must not repeat: one clear line, and nothing of the user's is lost."""
 
 import re
-import socket
-import threading
-import time
 from xml.etree import ElementTree as Xml
 
 import pytest
 from pyproj import CRS
 
-from engine.errors import MapError, OptionError
+from engine.errors import OptionError
 from scenematch.fetch.crs import chosen_crs
-from scenematch.fetch.heights import files_for, read_part
+from scenematch.fetch.heights import files_for
 from scenematch.fetch.place import Place
-from scenematch.fetch.urls import check_url, shown
+from scenematch.fetch.urls import shown
 from scenematch.fetch.wmts import _extra_query
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
 
@@ -36,12 +33,6 @@ def test_the_users_own_surface_is_never_replaced_by_a_part_of_it(tmp_path, surfa
     with pytest.raises(OptionError, match=r"out: .* is also the input `surface`; choose another file"):
         fetch_map(settings(surface=str(tmp_path / surface), force=True), tmp_path / "s.tif")
     assert all(path.read_bytes() == b"the user's own" for path in tmp_path.glob("*.tif"))
-
-
-def test_a_refusal_leaves_no_empty_folder(tmp_path):
-    with pytest.raises(MapError, match="Failed to connect"):
-        fetch_map(settings(), tmp_path / "map.tif")
-    assert list(tmp_path.iterdir()) == []
 
 
 # ------------------------------------------------------------ keys
@@ -77,14 +68,16 @@ PLACEHOLDERS, SCHEMES = "expected {z}, {x} and {y} (or {-y}), or {q}", "begins w
         ("https://{s}.example.org/{z}/{x}/{y}.png?tk=S3CRET", PLACEHOLDERS),
         ("https://me:S3CRET@example.org/wms", "without user and password"),
         ("https://example.org/{z}/{x}/{y}.png?tk=S3 CRET", "expected"),
-        ("http://[::1/{z}/{x}/{y}.png?tk=S3CRET", "expected"),
+        ("http://[::1/{z}/{x}/{y}.png?tk=S3CRET", "expected a URL "),
+        ("http://h:abc/{z}/{x}/{y}.png?tk=S3CRET", "expected a URL "),
+        ("http://h:99999/{z}/{x}/{y}.png?tk=S3CRET", "expected a URL "),
+        ("http://h/{z}/{x}/{y}.png?tk=S3CRET\n", "expected a URL "),
     ],
 )
 def test_refusals_name_the_source_and_do_not_repeat_keys(tmp_path, source, words):
     with pytest.raises(OptionError, match=rf"^source: .*{re.escape(words)}") as error:
         fetch_map(settings(source), tmp_path / "map.tif")
-    assert "S3" not in str(error.value)
-    assert "CRET" not in str(error.value)
+    assert not re.search("S3|CRET|\n", str(error.value))
 
 
 def test_nor_do_those_of_heights():
@@ -93,21 +86,9 @@ def test_nor_do_those_of_heights():
     assert "S3CRET" not in str(error.value)
 
 
-# ------------------------------------------------------------ addresses that cannot be
-
-
 @pytest.mark.parametrize(
-    "url",
-    ["http://[::1/{z}/{x}/{y}.png", "http://h:abc/{z}/{x}/{y}.png", "http://h:99999/{z}/{x}/{y}.png",
-     "http://h/a b/{z}/{x}/{y}.png", "http://h/{z}/{x}/{y}.png?a=\n"],
-)  # fmt: skip
-def test_an_address_that_cannot_be_is_refused_at_once(url):
-    with pytest.raises(OptionError, match=r"^source: expected a URL ") as error:
-        check_url("source", url)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("surface", ["http://h/{lat}_{lon}}.tif", "d/{{lat}_{lon}.tif", "d/{lat}{lon}{.tif"])
+    "surface", ["http://h/{lat}_{lon}}.tif", "d/{{lat}_{lon}.tif", "d/{lat}{lon}{.tif", "d/{lat}.tif"]
+)
 def test_stray_braces_are_refused(surface):
     with pytest.raises(OptionError, match=r"surface: expected {lat} and {lon} as placeholders, or none"):
         files_for(surface, (0.0, 0.0, 1.0, 1.0))
@@ -139,10 +120,8 @@ def test_only_a_coordinate_system_for_the_place_is_chosen():
     assert chosen_crs(None, ["urn:ogc:def:crs", "EPSG:31256"], vienna) == "EPSG:31256"  # one that names none
     with pytest.raises(OptionError, match=r"crs: expected one for 48.2,16.4 .*, got EPSG:2154"):
         chosen_crs(None, ["EPSG:2154"], vienna)
-    assert (
-        chosen_crs(None, ["EPSG:3832"], Place(-17.0, 179.0, 50.0)) == "EPSG:3832"
-    )  # its area crosses 180 degrees
-    assert chosen_crs(None, ["EPSG:3832"], Place(-17.0, -179.0, 50.0)) == "EPSG:3832"
+    for lon_deg in (179.0, -179.0):  # its area crosses 180 degrees
+        assert chosen_crs(None, ["EPSG:3832"], Place(-17.0, lon_deg, 50.0)) == "EPSG:3832"
 
 
 @pytest.mark.parametrize(
@@ -155,41 +134,3 @@ def test_a_key_is_sent_to_the_host_that_was_named_and_to_no_other(href, sent):
         f'<Get xlink:href="{href}"/></HTTP></DCP></Operation></C>'
     )
     assert _extra_query(Xml.fromstring(text), "https://a.org/caps.xml?key=S3CRET&Service=WMTS") == sent
-
-
-# ------------------------------------------------------------ servers that fall silent
-
-
-@pytest.fixture
-def falls_silent():
-    """The address of a server that answers the first request with four bytes, and no other at all."""
-    ear, open_lines = socket.create_server(("127.0.0.1", 0)), []
-    first = b"HTTP/1.1 206 Partial Content\r\nContent-Length: 4\r\nConnection: close\r\n\r\nII*\0"
-
-    def serve():
-        while True:
-            try:
-                line, _ = ear.accept()
-            except OSError:
-                return
-            line.recv(4096)
-            if not open_lines:
-                line.sendall(first)
-                line.close()
-            open_lines.append(line)
-
-    threading.Thread(target=serve, daemon=True).start()
-    yield f"http://127.0.0.1:{ear.getsockname()[1]}/heights.tif"
-    ear.shutdown(socket.SHUT_RDWR)
-    ear.close()
-    for line in open_lines:
-        line.close()
-
-
-@pytest.mark.slow
-def test_heights_are_waited_for_no_longer_than_agreed(falls_silent, monkeypatch):
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
-    begin_s = time.monotonic()
-    with pytest.raises(MapError, match=re.escape("heights.tif: cannot be read as a GeoTIFF in byte ranges")):
-        read_part([falls_silent], (0.0, 0.0, 1.0, 1.0), CRS.from_epsg(4326), None, 1.0)
-    assert time.monotonic() - begin_s < 60.0  # GDAL asks again, some times

@@ -4,30 +4,26 @@ import io
 import itertools
 import json
 import re
+import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rasterio
 from PIL import Image
-from pyproj import Transformer
-from rasterio.enums import Resampling
+from pyproj import CRS, Transformer
 from rasterio.transform import Affine
 
-from engine import Fix, OrthoMap
+from engine import OrthoMap
 from engine.errors import MapError, OptionError
 from engine.values import Window
 from scenematch.fetch import pictures
-from scenematch.fetch.heights import files_for
+from scenematch.fetch.heights import files_for, read_part
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
-from scenematch.runs.map_input import MapInput
-from scenematch.runs.simulation import write_flight
-from scenematch.runs.single_image import locate_image
-from scenematch.simulator import plan_flight
 from tests.support.map_servers import HALF_WORLD_M, serving
 from tests.support.photos import gimbal, photograph
-from tests.support.rasters import write_raster
-from tests.support.towns import drawn_town
+from tests.support.rasters import whole, write_raster
 
 SIZE = 700
 GSD_M = 0.5
@@ -70,12 +66,13 @@ def one_server(raster, files):
 
 
 @pytest.fixture
-def server(one_server, monkeypatch):
+def server(one_server, raster, monkeypatch):
     """Asked without a proxy, and nothing of another test left."""
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     monkeypatch.setattr(pictures, "FIRST_WAIT_S", 0.01)
     one_server.asked.clear()
     one_server.trouble.clear()
+    one_server.raster = raster
     one_server.wms_version, one_server.most_px, one_server.layers, one_server.kvp = "1.3.0", 200, ("ortho",), False
     return one_server
 
@@ -110,6 +107,13 @@ def fetched(settings, tmp_path):
             return facts, pixels, file.profile | {"tags": file.tags(), "bounds": file.bounds}
 
     return fetch
+
+
+def tile_answer(side_px=256):
+    """A grey tile, as a server sends it."""
+    picture = io.BytesIO()
+    Image.new("RGB", (side_px, side_px), (90, 100, 110)).save(picture, "PNG")
+    return picture.getvalue()
 
 
 def offsets_px(pixels, profile):
@@ -167,24 +171,20 @@ def test_a_wmts_is_read_in_its_own_grid(server, fetched, kvp):
     assert facts["server_states"][1] == "AccessConstraints: CC BY"
 
 
-def test_the_engine_reads_the_pixels_that_were_served(server, settings, tmp_path, raster):
+def test_the_engine_reads_the_pixels_that_were_served(server, tmp_path):
     """Of tiles cut from a picture that is on their grid: equal to the bit, in the same place."""
     step, corner = 2.0 * HALF_WORLD_M / (256 << ZOOM), (143_000 * 256 + 70, 90_900 * 256 + 40)
     origin = corner[0] * step - HALF_WORLD_M, HALF_WORLD_M - corner[1] * step
     noise = np.random.default_rng(0).integers(1, 255, (3, SIZE, SIZE), np.uint8)
     write_raster(tmp_path / "own.tif", noise, crs="EPSG:3857", transform=from_origin(*origin, step))
-    lon, lat = Transformer.from_crs(3857, 4326, always_xy=True).transform(
-        origin[0] + SIZE / 2 * step, origin[1] - SIZE / 2 * step
-    )
+    centre = origin[0] + SIZE / 2 * step, origin[1] - SIZE / 2 * step
+    lon, lat = Transformer.from_crs(3857, 4326, always_xy=True).transform(*centre)
     server.raster = tmp_path / "own.tif"
     wanted = FetchSettings(
-        around=f"{lat},{lon}", radius_m=260.0, source=f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", pause_ms=0.0,
+        around=f"{lat},{lon}", radius_m=260.0, source=server.tiles, pause_ms=0.0,
         map_sigma_m=1.5, attribution="a surveyor", licence="CC BY 4.0",
     )  # fmt: skip
-    try:
-        facts = fetch_map(wanted, tmp_path / "map.tif")
-    finally:
-        server.raster = raster
+    facts = fetch_map(wanted, tmp_path / "map.tif")
     own, site = OrthoMap.open(tmp_path / "own.tif"), OrthoMap.open(tmp_path / "map.tif")
     x, y = np.rint(site.pixel_from_geodetic(*own.geodetic_from_pixel([0.0, 0.0]))).astype(int).tolist()
     np.testing.assert_allclose(
@@ -193,7 +193,7 @@ def test_the_engine_reads_the_pixels_that_were_served(server, settings, tmp_path
     part = Window(x, y, SIZE, SIZE)
     assert site.valid(part).all()
     np.testing.assert_array_equal(site.gray(part), own.gray(Window(0, 0, SIZE, SIZE)))
-    everything = site.valid(Window(0, 0, site.width_px, site.height_px))
+    everything = site.valid(whole(site))
     assert everything.sum() == SIZE * SIZE  # what is beside the picture, or in a missing tile, is nodata
     assert facts["nodata_share"] == pytest.approx(1.0 - everything.mean())
     assert site.georeference_sigma_m == 1.5
@@ -205,64 +205,32 @@ def test_the_engine_reads_the_pixels_that_were_served(server, settings, tmp_path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.tif", "own.tif"]
 
 
-@pytest.mark.slow
-def test_a_frame_is_located_over_a_fetched_map_as_over_the_map_itself(tmp_path, server, raster):
-    """A town's own map, and what WMS and tiles make of it: the fixes agree to a quarter of a pixel of 0.53 m."""
-    write_flight(tmp_path, plan_flight(town=drawn_town(), frames=1))
-    names, values = (line.split(",") for line in (tmp_path / "telemetry.csv").read_text().splitlines())
-    row = dict(zip(names, values, strict=True))
-    names, values = (line.split(",") for line in (tmp_path / "truth.csv").read_text().splitlines()[:2])
-    truth = dict(zip(names, values, strict=True))
-    around = f"{truth['lat_deg']},{truth['lon_deg']}"
-    server.raster, server.draws, server.most_px = tmp_path / "map.tif", Resampling.cubic, 1024
-    try:
-        for name, source in (("wms", "/wms"), ("tiles", "/tiles/{z}/{x}/{y}.png")):
-            wanted = FetchSettings(
-                around=around, radius_m=150.0, source=server.url + source, gsd_m_per_px=0.53, pause_ms=0.0
-            )
-            fetch_map(wanted, tmp_path / f"{name}.tif")
-    finally:
-        server.raster, server.draws = raster, Resampling.nearest
-    site, fixes = OrthoMap.open(tmp_path / "map.tif"), {}
-    for name in ("map", "wms", "tiles"):
-        fix = locate_image(
-            tmp_path / "frames" / row["frame"], MapInput(tmp_path / f"{name}.tif", surface=tmp_path / "dsm.tif"),
-            tmp_path / "camera.yaml", method="ncc", start=f"{around},20",
-            height_agl_m=float(row["height_agl_m"]), heading_deg=float(row["heading_deg"]),
-        )  # fmt: skip
-        assert isinstance(fix, Fix), (name, fix)
-        fixes[name] = np.array(site.frame.enu_from_geodetic(fix.lat_deg, fix.lon_deg))
-    assert np.hypot(*(fixes["wms"] - fixes["map"])[:2]) < 0.13
-    assert np.hypot(*(fixes["tiles"] - fixes["map"])[:2]) < 0.13
-
-
 # ------------------------------------------------------------ manners, interruptions
 
 
 def test_nothing_is_asked_for_where_too_much_is_wanted_or_nothing_is_to_be_fetched(server, settings, tmp_path):
-    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
     with pytest.raises(OptionError, match=r"max_tiles: expected at most 9 tiles, but the area has \d+") as error:
-        fetch_map(settings(source, 300.0, max_tiles=9), tmp_path / "map.tif")
+        fetch_map(settings(server.tiles, 300.0, max_tiles=9), tmp_path / "map.tif")
     count = int(re.search(r"has (\d+)", str(error.value))[1])
-    facts = fetch_map(settings(source, 300.0, max_tiles=count, dry_run=True), tmp_path / "map.tif")
+    facts = fetch_map(settings(server.tiles, 300.0, max_tiles=count, dry_run=True), tmp_path / "map.tif")
     assert (facts["tiles"], facts["dry_run"]) == (count, True)
     assert server.asked == []
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_interrupted_fetch_goes_on_where_it_was(server, settings, tmp_path):
-    source, out = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", tmp_path / "map.tif"
-    fetch_map(settings(source, 120.0), tmp_path / "whole.tif")
+    wanted, out = settings(server.tiles, 120.0), tmp_path / "map.tif"
+    fetch_map(wanted, tmp_path / "whole.tif")
     first_asked = list(server.asked)
     server.asked.clear()
     server.trouble[:] = [(first_asked[4], (403, {}))]
     with pytest.raises(MapError, match="answers 403: access denied"):
-        fetch_map(settings(source, 120.0), out)
+        fetch_map(wanted, out)
     assert len(server.asked) == 5
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith("map.tif")] == ["map.tif.tiles"]
     (tmp_path / "map.tif.tiles" / "mine.txt").write_text("the user's own", encoding="utf-8")
     server.asked.clear()
-    fetch_map(settings(source, 120.0), out)
+    fetch_map(wanted, out)
     assert server.asked == first_asked[4:]
     assert [path.name for path in (tmp_path / "map.tif.tiles").rglob("*")] == ["mine.txt"]
     with rasterio.open(out) as one, rasterio.open(tmp_path / "whole.tif") as other:
@@ -274,23 +242,21 @@ def test_a_busy_server_is_waited_for(server, settings, tmp_path, monkeypatch):
     waits = []
     monkeypatch.setattr(pictures.time, "sleep", waits.append)
     server.trouble[:] = [("/tiles/", (429, {})), ("/tiles/", (503, {})), ("/tiles/", (502, {}))]
-    facts = fetch_map(settings(f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", pause_ms=250.0), tmp_path / "map.tif")
+    facts = fetch_map(settings(server.tiles, pause_ms=250.0), tmp_path / "map.tif")
     assert len(server.asked) == facts["tiles"] + 3
     assert waits == pytest.approx([0.0, 0.01, 0.02, 0.04] + [0.25] * (facts["tiles"] - 1))
     assert len(server.agents) == 1
     assert server.agents.pop().startswith("scenematch")
     server.trouble[:] = [("/tiles/", (503, {}))] * 5
     with pytest.raises(MapError, match=r"the server answers 503, at attempt 5$"):
-        fetch_map(settings(f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"), tmp_path / "other.tif")
+        fetch_map(settings(server.tiles), tmp_path / "other.tif")
 
 
 def test_what_is_no_picture_is_refused_in_one_line(server, settings, tmp_path):
-    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png?key=S3CRET"
-    picture = io.BytesIO()
-    Image.new("RGB", (512, 512)).save(picture, "PNG")
+    source = f"{server.tiles}?key=S3CRET"
     for answer, text in (
         (b"<html><body>Please <b>log in</b></body></html>", "expected pictures, got something else"),
-        (picture.getvalue(), "Incorrect size 512 x 512 of downloaded block, expected 256 x 256"),
+        (tile_answer(512), "Incorrect size 512 x 512 of downloaded block, expected 256 x 256"),
         ("break", "expected pictures, got something else"),
         ((401, {}), "the server answers 401: access denied"),
     ):
@@ -303,17 +269,17 @@ def test_what_is_no_picture_is_refused_in_one_line(server, settings, tmp_path):
 
 
 def test_where_nothing_is(server, settings, tmp_path):
-    with pytest.raises(MapError, match=r"source: the server has no data there on level '18', 0.398 m/px"):
-        fetch_map(settings(f"{server.url}/nowhere/{{z}}/{{x}}/{{y}}.png"), tmp_path / "a.tif")
-    with pytest.raises(MapError, match=r"/nowhere\?SERVICE=WMS&REQUEST=GetCapabilities: the server answers 404"):
-        fetch_map(settings(f"{server.url}/nowhere"), tmp_path / "b.tif")
-    with pytest.raises(MapError, match="Could not resolve host: no-such-host"):
-        fetch_map(settings("http://no-such-host.invalid/{z}/{x}/{y}.png"), tmp_path / "c.tif")
-    with pytest.raises(MapError, match="Failed to connect to 127"):
-        fetch_map(settings("http://127.0.0.1:9/{z}/{x}/{y}.png"), tmp_path / "d.tif")
-    server.wms_version = "1.3.0"
+    tile = "{z}/{x}/{y}.png"
+    for source, words in (
+        (f"{server.url}/nowhere/{tile}", "source: the server has no data there on level '18', 0.398 m/px"),
+        (f"{server.url}/nowhere", "/nowhere?SERVICE=WMS&REQUEST=GetCapabilities: the server answers 404"),
+        (f"http://no-such-host.invalid/{tile}", "Could not resolve host: no-such-host"),
+        (f"http://127.0.0.1:9/{tile}", "Failed to connect to 127"),
+    ):
+        with pytest.raises(MapError, match=re.escape(words)):
+            fetch_map(settings(source), tmp_path / "map.tif")
     with pytest.raises(MapError, match="source: the server has no data there on level 'EPSG:3857'"):
-        fetch_map(FetchSettings(around="10,10", radius_m=50, source=f"{server.url}/wms"), tmp_path / "e.tif")
+        fetch_map(replace(settings(f"{server.url}/wms", gsd_m_per_px=None), around="10,10"), tmp_path / "map.tif")
 
 
 def test_a_proxy_that_is_not_there_is_one_line_without_its_password(settings, tmp_path, monkeypatch):
@@ -361,14 +327,10 @@ def test_a_surface_is_cut_from_the_files_of_degrees(server, files, settings, tmp
     names = "Copernicus_DSM_COG_10_{lat}_00_{lon}_00_DEM.tif"
     for lat, lon in ((48, 16), (48, 17), (47, 16)):
         height_tile(files / names.format(lat=f"N{lat}", lon=f"E0{lon}"), lat, lon)
-    server.draws = Resampling.nearest
-    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
-    wanted = settings(
-        source, 2000.0, gsd_m_per_px=50.0, surface=f"{server.url}/files/{names}" if remote else f"{files}/{names}"
-    )
-    corner = FetchSettings(**{name: getattr(wanted, name) for name in wanted.__slots__} | {"around": "48.0,17.0"})
+    surface = f"{server.url}/files/{names}" if remote else f"{files}/{names}"
+    wanted = replace(settings(server.tiles, 2000.0, gsd_m_per_px=50.0, surface=surface), around="48.0,17.0")
     server.trouble[:] = [("/tiles/", tile_answer()) for _ in range(4)]
-    facts = fetch_map(corner, tmp_path / "map.tif")
+    facts = fetch_map(wanted, tmp_path / "map.tif")
     assert facts["surface"] == str(tmp_path / "map-surface.tif")
     assert facts["surface_datum"] == "EGM2008 height"
     assert 0.1 < facts["surface_nodata_share"] < 0.5
@@ -377,24 +339,13 @@ def test_a_surface_is_cut_from_the_files_of_degrees(server, files, settings, tmp
         row, column = np.nonzero(known)
         lon, lat = file.transform @ (column + 0.5, row + 0.5)
         np.testing.assert_allclose(heights[known], plane(lon, lat), atol=1e-2)  # float32, and no resampling
-        lon, lat = (
-            v.reshape(known.shape) for v in file.transform @ (np.indices(known.shape)[::-1] + 0.5).reshape(2, -1)
-        )
+        lon, lat = file.transform @ (np.indices(known.shape)[::-1] + 0.5)
         half = file.transform.a / 2
         np.testing.assert_array_equal(known, ~((lon > 17.0 - half) & (lat < 48.0 + half)))  # the south-east is sea
-        west, south, east, north = rasterio.warp.transform_bounds("EPSG:3857", "EPSG:4326", *ground.bounds)
-        assert file.bounds.left < west
-        assert file.bounds.right > east
-        assert file.bounds.bottom < south
-        assert file.bounds.top > north
+        around = np.subtract(file.bounds, rasterio.warp.transform_bounds("EPSG:3857", "EPSG:4326", *ground.bounds))
+        assert (around * [1, 1, -1, -1] < 0.0).all()  # it reaches beyond the map on every side
     site = OrthoMap.open(tmp_path / "map.tif", surface=tmp_path / "map-surface.tif")
     assert (site.surface_datum, site.slope_sigma_deg) == ("EGM2008 height", 0.5)
-
-
-def tile_answer():
-    picture = io.BytesIO()
-    Image.new("RGB", (256, 256), (90, 100, 110)).save(picture, "PNG")
-    return picture.getvalue()
 
 
 def test_files_of_degrees_by_their_names():
@@ -402,12 +353,9 @@ def test_files_of_degrees_by_their_names():
         "d/S01W001.tif", "d/S01E000.tif", "d/N00W001.tif", "d/N00E000.tif"
     ]  # fmt: skip
     assert files_for("own.tif", (0, 0, 1, 1)) == ["own.tif"]
-    with pytest.raises(OptionError, match=r"surface: expected {lat} and {lon}"):
-        files_for("d/{lat}.tif", (0, 0, 1, 1))
 
 
 def test_surfaces_that_cannot_be(server, files, settings, tmp_path):
-    source = f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"
     height_tile(files / "far.tif", 10, 10)
     (files / "tiles/0/0").mkdir(parents=True)
     (files / "tiles/0/0/0.png").write_bytes(tile_answer())
@@ -422,8 +370,18 @@ def test_surfaces_that_cannot_be(server, files, settings, tmp_path):
         (str(files / "far.tif"), "EPSG:4326", OptionError, "surface_datum: expected a vertical datum in metres"),
     ):
         with pytest.raises(error, match=re.escape(text)):
-            fetch_map(settings(source, surface=surface, surface_datum=datum), tmp_path / "map.tif")
+            fetch_map(settings(server.tiles, surface=surface, surface_datum=datum), tmp_path / "map.tif")
     assert not (tmp_path / "map.tif").exists()
+
+
+@pytest.mark.slow
+def test_heights_are_waited_for_no_longer_than_agreed(server, files):
+    height_tile(files / "silent.tif", 48, 16)
+    server.trouble[:] = [("silent.tif", "silence")] * 99
+    begin_s = time.monotonic()
+    with pytest.raises(MapError, match=re.escape("silent.tif: cannot be read as a GeoTIFF in byte ranges")):
+        read_part([f"{server.url}/files/silent.tif"], (16.2, 48.2, 16.3, 48.3), CRS.from_epsg(4326), None, 1.0)
+    assert time.monotonic() - begin_s < 60.0  # GDAL asks again, some times
 
 
 # ------------------------------------------------------------ the command

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rasterio.transform import Affine
 from scipy.spatial import KDTree
 
 from engine import OrthoMap
@@ -16,7 +15,7 @@ from engine.maps.tiles import TILE_PX
 from engine.runtime.device import CPU
 from engine.values import Window
 from tests.support.ground import Ground
-from tests.support.rasters import write_raster
+from tests.support.rasters import from_corner, whole, write_raster
 
 
 @pytest.fixture(scope="module")
@@ -32,17 +31,15 @@ def marks(site):
     return LandmarkMap(site, CPU)
 
 
-def whole(site, level=0):
-    rows, columns = site.level_shape(level)
-    return Window(0, 0, columns, rows)
+def in_order(rows):
+    return rows[np.lexsort(rows.T[:4])]
 
 
 def table(found):
     """(N, 135) every value of the landmarks, in an order of their own."""
     f = found.features
     parts = (f.xy_px[0], f.scale_px[0, :, None], f.angle_deg[0, :, None], f.descriptors[0])
-    values = np.concatenate([np.concatenate(parts, axis=1), found.points_m], axis=1)
-    return values[np.lexsort(values.T[:4])]
+    return in_order(np.concatenate([*parts, found.points_m], axis=1))
 
 
 def nearest(xy, others):
@@ -72,11 +69,11 @@ def test_tiles_join_as_if_the_level_had_been_described_in_one_piece(site, monkey
 def test_a_window_holds_what_its_parts_hold_and_nothing_outside(site, marks):
     window = Window(150, 90, 300, 400)
     parts = [Window(150, 90, 107, 400), Window(257, 90, 193, 211), Window(257, 301, 193, 189)]
-    found = [marks.find(part, 0, upright=True) for part in parts]
-    xy = marks.find(window, 0, upright=True).features.xy_px[0]
+    found = marks.find(window, 0, upright=True)
+    xy = found.features.xy_px[0]
     assert ((xy >= [149.5, 89.5]) & (xy < [449.5, 489.5])).all()
-    joined = np.concatenate([table(part) for part in found])
-    np.testing.assert_array_equal(joined[np.lexsort(joined.T[:4])], table(marks.find(window, 0, upright=True)))
+    joined = np.concatenate([table(marks.find(part, 0, upright=True)) for part in parts])
+    np.testing.assert_array_equal(in_order(joined), table(found))
 
 
 def test_landmarks_do_not_depend_on_what_was_asked_before(site, marks):
@@ -152,8 +149,7 @@ def stored(tmp_path, monkeypatch):
 
 
 def write_map(path, ground, gray):
-    corner = Affine(*ground.pixel_to_crs.ravel()) @ Affine.translation(-0.5, -0.5)
-    return write_raster(path, gray, crs=f"EPSG:{ground.epsg}", transform=corner)
+    return write_raster(path, gray, crs=f"EPSG:{ground.epsg}", transform=from_corner(ground.pixel_to_crs))
 
 
 def prepared(path, upright=True, backend="auto"):
@@ -175,75 +171,57 @@ def test_a_prepared_map_is_read_back_as_it_was_found(stored, monkeypatch, uprigh
     np.testing.assert_array_equal(prepared(stored[0], upright), first)
 
 
-def spoiled(path, how):
-    whole = path.read_bytes()
-    if how == "cut short":
-        path.write_bytes(whole[: len(whole) // 2])
-    elif how == "a bit turned":
-        middle = len(whole) // 2
-        path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 255]) + whole[middle + 1 :])
-    elif how == "something else":
-        path.write_bytes(b"PK\3\4 but no archive")
-    elif how == "empty":
-        path.write_bytes(b"")
-    else:
-        with np.load(path) as file:
-            arrays = dict(file)
-        if how == "of another map":
-            arrays["key"] = np.array("0" * 64)
-        elif how == "pickled":
-            arrays["rank"] = np.array([{"a": 1}] * len(arrays["rank"]), object)
-        elif how == "not finite":
-            arrays["scale_px"][3] = np.nan
-        elif how == "of two lengths":
-            arrays["angle_deg"] = arrays["angle_deg"][:-1]
-        elif how == "of another type":
-            arrays["xy_px"] = arrays["xy_px"].astype(np.float64)
-        np.savez(path, **arrays)
+OTHER_BYTES = {
+    "cut short": lambda whole: whole[: len(whole) // 2],
+    "a bit turned": lambda whole: whole[:5000] + bytes([whole[5000] ^ 255]) + whole[5001:],
+    "something else": lambda _: b"PK\3\4 but no archive",
+    "empty": lambda _: b"",
+}
+OTHER_ARRAYS = {
+    "of another map": ("key", lambda _: np.array("0" * 64)),
+    "pickled": ("rank", lambda rank: np.array([{"a": 1}] * len(rank), object)),
+    "not finite": ("scale_px", lambda scales: np.where(np.arange(len(scales)) == 3, np.nan, scales)),
+    "of two lengths": ("angle_deg", lambda angles: angles[:-1]),
+    "of another type": ("xy_px", lambda xy: xy.astype(np.float64)),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "how",
-    ["cut short", "a bit turned", "something else", "empty", "of another map", "pickled", "not finite",
-     "of two lengths", "of another type"],
-)  # fmt: skip
+@pytest.mark.parametrize("how", [*OTHER_BYTES, *OTHER_ARRAYS])
 def test_a_file_that_is_not_to_be_believed_is_made_anew(stored, how):
     first = prepared(stored[0])
     for path in stored[1].iterdir():
-        spoiled(path, how)
+        if how in OTHER_BYTES:
+            path.write_bytes(OTHER_BYTES[how](path.read_bytes()))
+        else:
+            name, other = OTHER_ARRAYS[how]
+            with np.load(path) as file:
+                arrays = dict(file)
+            np.savez(path, **arrays | {name: other(arrays[name])})
     np.testing.assert_array_equal(prepared(stored[0]), first)
     for path in stored[1].iterdir():
-        key = path.stem
-        assert landmark_cache.load_arrays(key, landmarks._STORED) is not None
+        assert landmark_cache.load_arrays(path.stem, landmarks._STORED) is not None
 
 
-def test_another_map_or_another_detector_has_another_file(stored, monkeypatch):
-    prepared(stored[0])
-    names = {path.name for path in stored[1].iterdir()}
-    ground = Ground(size=(280, 300))
-    changed = ground.gray.copy()
-    changed[140, 150] ^= 1
-    write_map(stored[0], ground, changed)
-    prepared(stored[0])
-    more = {path.name for path in stored[1].iterdir()}
-    assert len(names) == 2  # upright and not
-    assert names < more
-    monkeypatch.setattr(landmarks, "DETECTOR_VERSION", 999)
-    prepared(stored[0])
-    assert len({path.name for path in stored[1].iterdir()}) == len(more) + 2
-
-
-def test_a_file_says_by_which_backend_it_was_made(stored):
+def test_another_map_detector_or_backend_has_another_file(stored, monkeypatch):
+    path, cache = stored
     ground = Ground(size=(120, 130))
-    write_map(stored[0], ground, ground.gray)
-    first = prepared(stored[0])
-    names = {path.name for path in stored[1].iterdir()}
-    other = prepared(stored[0], backend="kornia")
-    assert len({path.name for path in stored[1].iterdir()}) == 2 * len(names)
+    changed = ground.gray.copy()
+    changed[60, 65] ^= 1
+    write_map(path, ground, ground.gray)
+    first = prepared(path)
+    assert len(list(cache.iterdir())) == 2  # upright and not
+    other = prepared(path, backend="kornia")
+    assert len(list(cache.iterdir())) == 4
     assert other.shape != first.shape or not np.array_equal(other, first)
-    np.testing.assert_array_equal(prepared(stored[0], backend="compiled"), first)  # which is auto's on a CPU
-    assert len({path.name for path in stored[1].iterdir()}) == 2 * len(names)
+    np.testing.assert_array_equal(prepared(path, backend="compiled"), first)  # which is auto's on a CPU
+    assert len(list(cache.iterdir())) == 4
+    write_map(path, ground, changed)
+    prepared(path)
+    assert len(list(cache.iterdir())) == 6
+    monkeypatch.setattr(landmarks, "DETECTOR_VERSION", 999)
+    prepared(path)
+    assert len(list(cache.iterdir())) == 8
 
 
 def test_a_folder_that_cannot_be_written_is_no_error(stored, tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ import rasterio
 from affine import Affine
 from hypothesis import given
 from hypothesis import strategies as st
-from pyproj import Geod, Transformer
+from pyproj import Geod, Proj, Transformer
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.warp import calculate_default_transform, reproject
 
@@ -19,12 +19,13 @@ from engine.orthomap import OrthoMap
 from engine.values import Window
 from scenematch.files.geotiff import write_geotiff
 from tests.support.paths import SHARED
-from tests.support.rasters import write_raster
+from tests.support.rasters import whole, write_raster
 
 UTM = "EPSG:32636"
 STEP_M = 0.5
 WEST, NORTH = 686000.0, 3630000.0
 CORNER = Affine(STEP_M, 0.0, WEST, 0.0, -STEP_M, NORTH)
+DEGREES = {"crs": "EPSG:4326", "transform": Affine(1e-5, 0, 33, 0, -8e-6, 32)}
 CENTRED = np.array([[STEP_M, 0.0, WEST + STEP_M / 2], [0.0, -STEP_M, NORTH - STEP_M / 2]])
 
 needs_data = pytest.mark.skipif(not SHARED.is_dir(), reason="the flights of ../shared/data are not there")
@@ -37,17 +38,6 @@ def noise(*shape, low=1, high=255, seed=0):
 
 def write(path, data, **profile):
     return write_raster(path, data, **({"crs": UTM, "transform": CORNER} | profile))
-
-
-def whole(site, level=0):
-    height, width = site.level_shape(level)
-    return Window(0, 0, width, height)
-
-
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path_factory, monkeypatch):
-    """Keep resampled maps out of the home directory."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +66,8 @@ def test_frame_is_at_the_centre_and_bounds_are_outer_edges(site):
     centre = np.array([59.5, 44.5])
     assert np.allclose(site.enu_from_pixel(centre), 0.0, atol=1e-6)
     assert np.allclose(site.geodetic_from_pixel(centre), (site.frame.lat_deg, site.frame.lon_deg))
-    west, south, east, north = site.bounds_deg
     lat, lon = site.geodetic_from_pixel([[-0.5, -0.5], [119.5, 89.5], [-0.5, 89.5], [119.5, -0.5]])
-    assert np.allclose((west, south, east, north), (lon.min(), lat.min(), lon.max(), lat.max()))
+    assert np.allclose(site.bounds_deg, (lon.min(), lat.min(), lon.max(), lat.max()))
 
 
 @given(x=st.floats(-60, 180), y=st.floats(-60, 150))
@@ -148,7 +137,7 @@ def test_features_lie_in_one_place_whatever_the_file_is_stored_in(tmp_path, crs)
     lon, lat = Transformer.from_crs(UTM, 4326, always_xy=True).transform(
         WEST + (centres[:, 0] + 0.5) * STEP_M, NORTH - (centres[:, 1] + 0.5) * STEP_M
     )
-    path = tmp_path / "map.tif"
+    to = UTM if crs == "rotated" else crs
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PendingDeprecationWarning)
         if crs == "rotated":
@@ -156,19 +145,11 @@ def test_features_lie_in_one_place_whatever_the_file_is_stored_in(tmp_path, crs)
         else:
             box = (WEST, NORTH - 200 * STEP_M, WEST + 250 * STEP_M, NORTH)
             target, width, height = calculate_default_transform(UTM, crs, 250, 200, *box)
-        to = UTM if crs == "rotated" else crs
         warped, _ = reproject(
-            image,
-            np.zeros((height, width), np.uint8),
-            src_transform=CORNER,
-            src_crs=UTM,
-            dst_transform=target,
-            dst_crs=to,
-            resampling=Resampling.cubic,
-            tolerance=0.001,
-        )
-    write(path, warped, crs=to, transform=target)
-    site = OrthoMap.open(path, cache_dir=tmp_path / "cache")
+            image, np.zeros((height, width), np.uint8), src_transform=CORNER, src_crs=UTM, dst_transform=target,
+            dst_crs=to, resampling=Resampling.cubic, tolerance=0.001,
+        )  # fmt: skip
+    site = OrthoMap.open(write(tmp_path / "map.tif", warped, crs=to, transform=target), cache_dir=tmp_path)
     assert site.info()["resampled"] == (crs in ("EPSG:4326", "rotated"))
     assert site.source_crs.to_string() == to
     for spot_lat, spot_lon in zip(lat, lon, strict=True):
@@ -178,14 +159,12 @@ def test_features_lie_in_one_place_whatever_the_file_is_stored_in(tmp_path, crs)
 
 
 def test_geographic_maps_across_the_antimeridian_and_in_the_south(tmp_path):
-    transform = Affine(1e-5, 0, 179.9995, 0, -1e-5, -17.0)
-    site = OrthoMap.open(
-        write(tmp_path / "fiji.tif", noise(80, 100), crs="EPSG:4326", transform=transform), cache_dir=tmp_path
-    )
+    fiji = {"crs": "EPSG:4326", "transform": Affine(1e-5, 0, 179.9995, 0, -1e-5, -17.0)}
+    site = OrthoMap.open(write(tmp_path / "fiji.tif", noise(80, 100), **fiji), cache_dir=tmp_path)
     assert site.crs.to_epsg() in (32701, 32760)
     assert site.info()["nodata_share"] < 0.1
-    lat, lon = site.geodetic_from_pixel([site.width_px / 2, site.height_px / 2])
-    assert np.allclose(site.pixel_from_geodetic(lat, lon), [site.width_px / 2, site.height_px / 2], atol=1e-5)
+    middle = np.array([site.width_px / 2, site.height_px / 2])
+    assert np.allclose(site.pixel_from_geodetic(*site.geodetic_from_pixel(middle)), middle, atol=1e-5)
 
 
 # --- grey values and nodata ---------------------------------------------------------------------------------
@@ -240,10 +219,8 @@ def test_nodata_comes_from_tag_alpha_and_mask(tmp_path, how):
     elif how == "rgba":
         write(path, [gray, gray, gray, alpha], photometric="rgb", alpha="yes")
     else:
-        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
-            write(path, gray)
-            with rasterio.open(path, "r+") as dataset:
-                dataset.write_mask(expected)
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(write(path, gray), "r+") as dataset:
+            dataset.write_mask(expected)
     site = OrthoMap.open(path)
     assert np.array_equal(site.valid(whole(site)), expected)
     assert not site.fully_valid
@@ -284,10 +261,7 @@ def test_a_tag_ends_the_search_for_a_collar(tmp_path):
 def test_resampling_does_not_bleed_nodata_into_valid_pixels(tmp_path):
     data = np.full((80, 80), 128, np.uint8)
     data[30:50, 30:50] = 255
-    path = write(
-        tmp_path / "map.tif", data, nodata=255, crs="EPSG:4326", transform=Affine(1e-5, 0, 33, 0, -8e-6, 32)
-    )
-    site = OrthoMap.open(path, cache_dir=tmp_path)
+    site = OrthoMap.open(write(tmp_path / "map.tif", data, nodata=255, **DEGREES), cache_dir=tmp_path)
     gray, valid = site.gray(whole(site)), site.valid(whole(site))
     assert 0.7 < valid.mean() < 0.95
     assert (np.abs(gray[valid].astype(int) - 128) <= 1).all()
@@ -374,9 +348,8 @@ def test_surface_of_another_grid_lies_at_the_same_place(tmp_path, crs, dtype):
     (x0, x1), (_, y1) = to_crs.transform(np.array([west, east]), np.array([south, north]))
     step = (x1 - x0) / 30
     transform = Affine(step, 0, x0 - 5 * step, 0, -step, y1 + 5 * step)
-    rows, columns = np.mgrid[0:50, 0:40]
-    at_x, at_y = transform.c + step * (columns + 0.5), transform.f - step * (rows + 0.5)
-    lon, lat = Transformer.from_crs(crs, 4326, always_xy=True).transform(at_x, at_y)
+    rows, columns = np.mgrid[0:50, 0:40] + 0.5
+    lon, lat = to_crs.transform(*(transform @ (columns, rows)), direction="INVERSE")
 
     def plane(lat_deg, lon_deg):
         return 500 + (np.asarray(lon_deg) - west) * 4e5 + (np.asarray(lat_deg) - south) * 9e5
@@ -385,8 +358,9 @@ def test_surface_of_another_grid_lies_at_the_same_place(tmp_path, crs, dtype):
     surface = write(tmp_path / "dsm.tif", np.rint(heights).astype(dtype), crs=crs, transform=transform)
     site = OrthoMap.open(path, surface)
     xy = np.random.default_rng(2).uniform(0, 99, (200, 2))
-    assert np.abs(site.surface_at(xy) - plane(*site.geodetic_from_pixel(xy))).max() < 1.0
-    assert abs((site.surface_at(xy) - plane(*site.geodetic_from_pixel(xy))).mean()) < 0.1
+    off_m = site.surface_at(xy) - plane(*site.geodetic_from_pixel(xy))
+    assert np.abs(off_m).max() < 1.0
+    assert abs(off_m.mean()) < 0.1
 
 
 @pytest.mark.parametrize("nodata", [None, -9999.0, float("nan")])
@@ -403,9 +377,8 @@ def test_surface_nodata_and_what_lies_outside_is_ground(tmp_path, nodata):
 
 def test_surface_that_lies_elsewhere_or_knows_nothing_is_refused(tmp_path):
     path = write(tmp_path / "map.tif", noise(60, 60))
-    far = write(
-        tmp_path / "far.tif", np.ones((9, 9), np.float32), transform=Affine(1, 0, WEST + 900, 0, -1, NORTH)
-    )
+    beside = CORNER @ Affine.translation(1800, 0)
+    far = write(tmp_path / "far.tif", np.ones((9, 9), np.float32), transform=beside)
     empty = write(tmp_path / "empty.tif", np.full((60, 60), np.nan, np.float32))
     for surface in (far, empty):
         with pytest.raises(MapError, match="surface"):
@@ -554,11 +527,8 @@ def test_odd_file_names_and_sizes_open(tmp_path):
     ],
 )
 def test_arrays_that_are_no_map_are_refused(changed, error):
-    arguments = {"gray": noise(20, 20), "pixel_to_crs": CENTRED, "crs": UTM} | changed
     with pytest.raises(error):
-        OrthoMap.from_arrays(
-            arguments.pop("gray"), arguments.pop("pixel_to_crs"), arguments.pop("crs"), **arguments
-        )
+        OrthoMap.from_arrays(**{"gray": noise(20, 20), "pixel_to_crs": CENTRED, "crs": UTM} | changed)
 
 
 # --- cache --------------------------------------------------------------------------------------------------
@@ -566,7 +536,7 @@ def test_arrays_that_are_no_map_are_refused(changed, error):
 
 @pytest.fixture
 def geographic(tmp_path):
-    return write(tmp_path / "map.tif", noise(80, 90), crs="EPSG:4326", transform=Affine(1e-5, 0, 33, 0, -8e-6, 32))
+    return write(tmp_path / "map.tif", noise(80, 90), **DEGREES)
 
 
 def test_resampled_map_is_made_once_and_again_for_other_content(tmp_path, geographic):
@@ -577,7 +547,7 @@ def test_resampled_map_is_made_once_and_again_for_other_content(tmp_path, geogra
     second = OrthoMap.open(geographic, cache_dir=cache)
     assert [p.stat().st_mtime_ns for p in cache.glob("*/*.tif")] == [stamp]
     assert np.array_equal(first.gray(whole(first)), second.gray(whole(second)))
-    write(geographic, noise(80, 90, seed=5), crs="EPSG:4326", transform=Affine(1e-5, 0, 33, 0, -8e-6, 32))
+    write(geographic, noise(80, 90, seed=5), **DEGREES)
     OrthoMap.open(geographic, cache_dir=cache)
     assert len(list(cache.iterdir())) == 2
 
@@ -614,17 +584,10 @@ def test_info_can_be_written_as_json(tmp_path, geographic, site):
     assert facts["driver"] == "GTiff"
     assert facts["bands"] == 1
     assert facts["source_crs"] == "EPSG:4326"
-    assert json.loads(json.dumps(site.info()))["surface_range_m"] == [0.0, pytest.approx(74.25)]
-
-
-@needs_data
-def test_simulated_town():
-    folder = SHARED / "gazebo-a1"
-    site = OrthoMap.open(folder / "map.tif", folder / "dsm.tif")
-    assert site.info()["convergence_deg"] == pytest.approx(1.078, abs=5e-4)
-    assert site.gsd_m_per_px == pytest.approx(0.53, abs=1e-4)
-    assert site.fully_valid
-    assert site.ground_m == pytest.approx(0.0, abs=0.1)
+    facts = json.loads(json.dumps(site.info()))
+    assert facts["surface_range_m"] == [0.0, pytest.approx(74.25)]
+    convergence_deg = Proj(UTM).get_factors(site.frame.lon_deg, site.frame.lat_deg).meridian_convergence
+    assert facts["convergence_deg"] == pytest.approx(convergence_deg, abs=1e-4)
 
 
 @needs_data
@@ -652,16 +615,13 @@ def test_geographic_orthophoto_with_a_black_collar(tmp_path):
 @pytest.mark.parametrize("epsg", [32633, 4326])
 def test_a_map_says_how_well_it_lies_and_its_surface_how_it_leans(tmp_path, epsg):
     """Also where it is resampled; what the caller says counts more."""
-    step = 0.5 if epsg == 32633 else 5e-6
-    corner = (5e5, 5.3e6) if epsg == 32633 else (15.0, 47.8)
-    affine = [[step, 0.0, corner[0]], [0.0, -step, corner[1]]]
+    step, west, north = (0.5, 5e5, 5.3e6) if epsg == 32633 else (5e-6, 15.0, 47.8)
+    affine = [[step, 0.0, west], [0.0, -step, north]]
     write_geotiff(tmp_path / "map.tif", noise(40, 50), affine, epsg, tags={GEOREFERENCE_TAG: 0.12})
     write_geotiff(tmp_path / "dsm.tif", np.ones((40, 50), np.float32), affine, epsg, tags={SLOPE_TAG: 0.04})
 
     def opened(**said):
-        site = OrthoMap.open(
-            tmp_path / "map.tif", surface=tmp_path / "dsm.tif", cache_dir=tmp_path / "cache", **said
-        )
+        site = OrthoMap.open(tmp_path / "map.tif", tmp_path / "dsm.tif", cache_dir=tmp_path / "cache", **said)
         return site.georeference_sigma_m, site.slope_sigma_deg
 
     assert opened() == opened() == (0.12, 0.04)
@@ -705,11 +665,8 @@ def test_what_stands_at_a_wall_is_not_to_be_relied_on():
     ],
 )
 def test_a_surface_is_above_the_sea_where_its_crs_says_so(tmp_path, crs, datum):
-    affine = CENTRED if crs != "EPSG:4979" else np.array([[1e-5, 0.0, 15.0], [0.0, -1e-5, 48.0]])
-    write_geotiff(tmp_path / "map.tif", noise(40, 50), affine, 4326 if crs == "EPSG:4979" else 32633)
-    corner = affine[:, 2] - 0.5 * (affine[:, 0] + affine[:, 1])
-    transform = rasterio.Affine(*np.column_stack([affine[:, :2], corner]).ravel())
-    write(tmp_path / "dsm.tif", np.full((40, 50), 150.0, np.float32), crs=crs, transform=transform)
-    site = OrthoMap.open(tmp_path / "map.tif", surface=tmp_path / "dsm.tif", cache_dir=tmp_path / "cache")
-    assert site.surface_datum == datum
-    assert site.info()["surface_datum"] == datum
+    place = DEGREES if crs == "EPSG:4979" else {"crs": "EPSG:32633"}
+    ortho = write(tmp_path / "map.tif", noise(40, 50), **place)
+    surface = write(tmp_path / "dsm.tif", np.full((40, 50), 150.0, np.float32), **place | {"crs": crs})
+    site = OrthoMap.open(ortho, surface, cache_dir=tmp_path / "cache")
+    assert site.surface_datum == site.info()["surface_datum"] == datum

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 import torch
@@ -15,6 +12,7 @@ from engine.maps import prepared
 from engine.maps.prepared import PreparedMap, Region
 from engine.ncc_fft import prepare
 from engine.values import Window
+from tests.support.threads import called_at_once
 
 RADIUS_PX = 8
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])
@@ -80,19 +78,10 @@ def test_a_cut_is_the_enhanced_level_from_the_multiple_of_eight_before_it(gray, 
     rows, columns = site.level_shape(level)
     picture = enhance(site.gray(Window(0, 0, columns, rows), level), radius_px=RADIUS_PX)
     maps = PreparedMap(site, CPU, RADIUS_PX)
-    for window in (
-        Window(0, 0, columns, rows),
-        Window(13, 31, 60, 50),
-        Window(16, 24, 41, 33),
-        Window(columns - 5, 7, 5, 5),
-    ):
-        cut = maps.cut(window, level)
-        x0, y0 = cut.window.x0, cut.window.y0
-        assert (x0 % 8, y0 % 8) == (0, 0)
-        assert 0 <= window.x0 - x0 < 8
-        assert 0 <= window.y0 - y0 < 8
-        assert x0 + cut.window.width_px == window.x0 + window.width_px
-        assert y0 + cut.window.height_px == window.y0 + window.height_px
+    for x, y, width, height in ((0, 0, columns, rows), (13, 31, 60, 50), (16, 24, 41, 33), (columns - 5, 7, 5, 5)):
+        cut = maps.cut(Window(x, y, width, height), level)
+        x0, y0 = x // 8 * 8, y // 8 * 8
+        assert cut.window == Window(x0, y0, x + width - x0, y + height - y0)
         expected = picture[y0 : y0 + cut.window.height_px, x0 : x0 + cut.window.width_px]
         np.testing.assert_array_equal(cut.search.image, expected)
         assert cut.valid is None
@@ -150,12 +139,6 @@ def test_several_threads_may_cut_at_once(gray, monkeypatch, by_cells):
     search = prepare(torch.zeros(400, 550))
     monkeypatch.setattr(maps, "_prepare", lambda window, level: Region(window, search, None))
     places = np.random.default_rng(0).integers(0, 400 - 64, (4000, 2)).tolist()
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        with ThreadPoolExecutor(4) as pool:
-            cuts = list(pool.map(lambda place: maps.cut(Window(*place, 64, 64), 0), places))
-    finally:
-        sys.setswitchinterval(before)
+    cuts = called_at_once(lambda place: maps.cut(Window(*place, 64, 64), 0), places)
     assert all(cut.window.x0 == x & -8 for cut, (x, _) in zip(cuts, places, strict=True))
     assert len(maps._regions) <= 2

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from concurrent.futures import ThreadPoolExecutor
+import itertools
 from dataclasses import fields
 from functools import partial
 
@@ -18,6 +17,7 @@ from engine.maps.prepared import PreparedMap
 from engine.maps.samples import BLOCK_PX, SampleMap
 from engine.maps.tiles import TILE_PX
 from engine.values import Window
+from tests.support.threads import called_at_once
 
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])
 
@@ -44,11 +44,9 @@ def test_a_level_may_end_anywhere_beyond_a_cell(more_px, by_cells):
     window = Window(width_px - 40, height_px - 30, 40, 30)
     xy = site.pixel_from_enu(sampled.find(window, 0).points_m[:, :2])
     blocks = np.rint(xy).astype(int) // BLOCK_PX
-    columns, rows = (np.arange(low // BLOCK_PX, high // BLOCK_PX)
-                     for low, high in ((width_px - 40, width_px), (height_px - 30, height_px)))  # fmt: skip
-    expected = {(column, row) for column in columns for row in rows}
-    assert {(column, row) for column, row in blocks.tolist()} == expected
-    assert len(blocks) == len(expected)
+    columns = range((width_px - 40) // BLOCK_PX, width_px // BLOCK_PX)
+    rows = range((height_px - 30) // BLOCK_PX, height_px // BLOCK_PX)
+    assert sorted(map(tuple, blocks.tolist())) == list(itertools.product(columns, rows))
 
 
 @pytest.mark.slow
@@ -60,14 +58,7 @@ def test_several_threads_may_take_samples_at_once(by_cells, monkeypatch):
     monkeypatch.setattr(samples, "MAX_CELLS", 1)
     monkeypatch.setattr(sampled, "_sampled", lambda cell, level: (one, (1, 1)))
     windows = [Window(x, y, 40, 40) for x, y in rng.integers(0, 3 * TILE_PX - 40, (6000, 2)).tolist()]
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        with ThreadPoolExecutor(4) as pool:
-            found = list(pool.map(lambda window: sampled.find(window, 0), windows))
-    finally:
-        sys.setswitchinterval(before)
-    assert len(found) == len(windows)
+    assert len(called_at_once(lambda window: sampled.find(window, 0), windows)) == len(windows)
     assert len(sampled._cells) == 1
 
 

@@ -1,7 +1,8 @@
-"""Folders of tiles, VRTs and MBTiles: the picture that they were cut from, or one clear line."""
+"""Folders of tiles, VRTs, MBTiles and GeoPackages: the picture that they were cut from, or one clear line."""
 
 import shutil
-from pathlib import Path
+import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -132,12 +133,6 @@ def test_a_surface_may_be_a_folder_too(tmp_path, plain):
 # ------------------------------------------------------------------------------------------------- refusals
 
 
-def test_a_folder_without_a_raster_is_refused(tmp_path):
-    (tmp_path / "notes.txt").write_text("nothing here")
-    with pytest.raises(MapError, match=r"map: expected raster files in the folder .*, found none"):
-        OrthoMap.open(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
@@ -165,54 +160,78 @@ def test_tiles_that_do_not_fit_together_are_refused(tmp_path, picture, changed, 
         ("<ColorInterp>Red", "<PixelFunctionType>evil</PixelFunctionType><ColorInterp>Red",
          "got PixelFunctionType"),
         ("0-0.tif", "gone.tif", "does not exist"),
+        ("{folder}/0-0.tif", "https://example.org/a.tif", "expected the path of a local file"),
+        ("{folder}/0-0.tif", "/vsicurl/http://example.org/a.tif", "expected the path of a local file"),
         ("0-0.tif", "self.vrt", r"expected raster files in .*map\.vrt, got .*self\.vrt"),
         ("</VRTDataset>", "", "cannot read"),
     ],
 )  # fmt: skip
 def test_a_vrt_that_does_more_than_to_lay_local_files_side_by_side_is_refused(tmp_path, folder, old, new, words):
-    here = tmp_path / "tiles"
-    shutil.copytree(folder, here)
+    here = shutil.copytree(folder, tmp_path / "tiles")
     text = vrt_of_folder(here, "map")
     (here / "self.vrt").write_text(text)
-    (tmp_path / "map.vrt").write_text(text.replace(old, new))
+    (tmp_path / "map.vrt").write_text(text.replace(old.format(folder=here), new))
     with pytest.raises(MapError, match=words) as caught:
         OrthoMap.open(tmp_path / "map.vrt")
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("address", ["https://example.org/a.tif", "/vsicurl/http://example.org/a.tif"])
-def test_a_vrt_that_names_an_address_is_refused(tmp_path, folder, address):
-    first = str(folder / "0-0.tif")
-    (tmp_path / "map.vrt").write_text(vrt_of_folder(folder, "map").replace(first, address))
-    with pytest.raises(MapError, match="expected the path of a local file"):
-        OrthoMap.open(tmp_path / "map.vrt")
+# ------------------------------------------------------------------------------------ MBTiles and GeoPackages
 
 
-# -------------------------------------------------------------------------------------------------- MBTiles
-
-
-@pytest.mark.parametrize(("form", "most"), [("PNG", 0.0), ("JPEG", 4.0)])
-def test_mbtiles_are_the_mercator_picture_that_they_were_made_of(tmp_path, picture, form, most):
-    step = 156543.03392804097 / 2**18  # the pixels of zoom level 18
-    origin, column, row = 20037508.342789244, 36621000, 23256000
-    at = Affine(step, 0.0, column * step - origin, 0.0, -step, origin - row * step)
-    mercator = write(tmp_path / "map.tif", picture, crs="EPSG:3857", transform=at)
-    path = tmp_path / "map.mbtiles"
-    copy(mercator, path, driver="MBTiles", tile_format=form, quality=95)
-    whole, cached = OrthoMap.open(mercator), OrthoMap.open(path)
-    assert cached.info()["driver"] == "MBTiles"
-    corner = np.rint(cached.pixel_from_geodetic(*whole.geodetic_from_pixel([0.0, 0.0]))).astype(int)
-    lies = Window(int(corner[0]) + 20, int(corner[1]) + 20, 200, 200)
-    assert np.allclose(
-        cached.geodetic_from_pixel([lies.x0, lies.y0]), whole.geodetic_from_pixel([20, 20]), rtol=0, atol=1e-9
-    )
-    apart = cached.gray(lies).astype(float) - whole.gray(Window(20, 20, 200, 200))
+@pytest.mark.parametrize(
+    ("driver", "form", "most"), [("MBTiles", "PNG", 0.0), ("MBTiles", "JPEG", 4.0), ("GPKG", "PNG", 0.0)]
+)
+def test_a_database_of_tiles_is_the_picture_that_it_was_made_of(tmp_path, picture, plain, driver, form, most):
+    if driver == "MBTiles":
+        step = 156543.03392804097 / 2**18  # the pixels of zoom level 18
+        origin, column, row = 20037508.342789244, 36621000, 23256000
+        at = Affine(step, 0.0, column * step - origin, 0.0, -step, origin - row * step)
+        plain = write(tmp_path / "map.tif", picture, crs="EPSG:3857", transform=at)
+    path = tmp_path / f"map.{driver.lower()}"
+    copy(plain, path, driver=driver, tile_format=form, quality=95)
+    whole, found = OrthoMap.open(plain), OrthoMap.open(path)
+    assert found.info()["driver"] == driver
+    x, y = np.rint(found.pixel_from_geodetic(*whole.geodetic_from_pixel([20.0, 20.0]))).astype(int).tolist()
+    there = found.geodetic_from_pixel([x, y])
+    assert np.allclose(there, whole.geodetic_from_pixel([20, 20]), rtol=0, atol=1e-9)
+    lies = Window(x, y, 200, 200)
+    apart = found.gray(lies).astype(float) - whole.gray(Window(20, 20, 200, 200))
     assert np.abs(apart).mean() <= most
-    assert cached.valid(lies).all()
+    assert found.valid(lies).all()
 
 
-def test_a_file_that_only_calls_itself_mbtiles_is_refused(tmp_path):
-    for name, content in (("a.mbtiles", b"hello"), ("b.mbtiles", b"SQLite format 3\0 and nothing more")):
-        Path(tmp_path / name).write_bytes(content)
-        with pytest.raises(MapError, match="map: "):
-            OrthoMap.open(tmp_path / name)
+def test_heights_in_a_geopackage_are_a_surface(tmp_path, plain):
+    heights = (200.0 + np.add.outer(np.arange(SIDE), np.arange(SIDE)) / 10.0).astype(np.float32)
+    whole = write(tmp_path / "dsm.tif", heights)
+    copy(whole, tmp_path / "dsm.gpkg", driver="GPKG")
+    wanted, found = OrthoMap.open(plain, whole), OrthoMap.open(plain, tmp_path / "dsm.gpkg")
+    pixels = np.array([[50.0, 60.0], [200.5, 100.25]])
+    assert found.surface_at(pixels) == pytest.approx(wanted.surface_at(pixels), abs=0.01)
+
+
+def test_a_geopackage_of_several_rasters_or_none_is_refused(tmp_path, plain):
+    path = tmp_path / "map.gpkg"
+    copy(plain, path, driver="GPKG", raster_table="NORTH")
+    copy(plain, path, driver="GPKG", raster_table="SOUTH", append_subdataset="yes")
+    with pytest.raises(MapError, match="map: expected a GeoPackage with one raster, got NORTH, SOUTH in"):
+        OrthoMap.open(path)
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("UPDATE gpkg_contents SET data_type = 'features'")
+        base.commit()
+    with pytest.raises(MapError, match="expected a GeoPackage with one raster, got none in"):
+        OrthoMap.open(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.mbtiles", b"hello", "expected a raster file"),
+        ("b.mbtiles", b"SQLite format 3\0 and nothing more", "cannot read"),
+        ("c.gpkg", b"SQLite format 3\0".ljust(68, b"\0") + b"GPKG" + bytes(100), "cannot read"),
+    ],
+)
+def test_a_file_that_only_calls_itself_a_database_of_tiles_is_refused(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(MapError, match=f"map: {words}"):
+        OrthoMap.open(tmp_path / name)

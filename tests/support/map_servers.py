@@ -17,7 +17,6 @@ from urllib.parse import parse_qsl, urlsplit
 import numpy as np
 import rasterio
 from PIL import Image
-from rasterio.enums import Resampling
 from rasterio.transform import Affine
 from rasterio.warp import reproject, transform_bounds
 
@@ -41,13 +40,18 @@ class MapServer(ThreadingHTTPServer):
         self.raster, self.files = raster, files
         self.asked: list[str] = []
         self.agents: set[str] = set()
+        self.over = threading.Event()
         self.trouble: list[tuple[str, object]] = []  # part of a path and what happens, once each
         self.wms_version, self.most_px, self.layers, self.kvp = "1.3.0", 200, ("ortho",), False
-        self.draws = Resampling.nearest
 
     @property
     def url(self) -> str:
         return f"http://127.0.0.1:{self.server_address[1]}"
+
+    @property
+    def tiles(self) -> str:
+        """The address of a tile by zoom level, column and row."""
+        return f"{self.url}/tiles/{{z}}/{{x}}/{{y}}.png"
 
 
 @contextmanager
@@ -59,21 +63,19 @@ def serving(raster: Path, files: Path):
     try:
         yield server
     finally:
+        server.over.set()
         server.shutdown()
         server.server_close()
         thread.join()
 
 
 def drawn(server: MapServer, crs: str, bounds: tuple[float, ...], width: int, height: int) -> np.ndarray:
-    """(H, W, 4) of the raster on another grid; transparent outside."""
+    """(H, W, 4) of the raster on another grid, each pixel the nearest one's; transparent outside."""
     west, south, east, north = bounds
     to_crs = Affine((east - west) / width, 0.0, west, 0.0, (south - north) / height, north)
     bands, transform, source_crs = _bands(server.raster)
     out = np.zeros((4, height, width), np.uint8)
-    reproject(
-        bands, out, src_transform=transform, src_crs=source_crs, dst_transform=to_crs, dst_crs=crs,
-        resampling=server.draws,
-    )  # fmt: skip
+    reproject(bands, out, src_transform=transform, src_crs=source_crs, dst_transform=to_crs, dst_crs=crs)
     return np.moveaxis(out, 0, 2)
 
 
@@ -123,6 +125,9 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._send(404, b"nothing", "text/plain")
 
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
     def _misbehave(self, what) -> None:
         if what == "break":
             self.send_response(200)
@@ -130,6 +135,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", "5000")
             self.end_headers()
             self.wfile.write(b"\x89PNG only the beginning")
+            self.close_connection = True
+        elif what == "silence":
+            self.server.over.wait()
             self.close_connection = True
         elif isinstance(what, tuple):
             status, headers = what
@@ -142,7 +150,8 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in {"Content-Type": kind, "Content-Length": str(len(content)), **(headers or {})}.items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(content)
+        if self.command != "HEAD":
+            self.wfile.write(content)
 
     def _picture(self, pixels: np.ndarray, kind: str = "image/png") -> None:
         file = io.BytesIO()
@@ -152,12 +161,14 @@ class _Handler(BaseHTTPRequestHandler):
             Image.fromarray(pixels).save(file, "PNG", compress_level=1)
         self._send(200, file.getvalue(), kind)
 
-    def _tile(self, zoom: int, column: int, row: int) -> None:
-        pixels = drawn(self.server, "EPSG:3857", _tile_bounds(zoom, column, row), 256, 256)
+    def _picture_or_none(self, pixels: np.ndarray) -> None:
         if pixels[..., 3].any():
             self._picture(pixels)
         else:
             self._send(404, b"no such tile", "text/plain")
+
+    def _tile(self, zoom: int, column: int, row: int) -> None:
+        self._picture_or_none(drawn(self.server, "EPSG:3857", _tile_bounds(zoom, column, row), 256, 256))
 
     def _wms(self, query: dict[str, str]) -> None:
         version = self.server.wms_version
@@ -188,11 +199,7 @@ class _Handler(BaseHTTPRequestHandler):
         step = MATRICES[name]
         west, north = MATRIX_CORNER[0] + column * 100 * step, MATRIX_CORNER[1] - row * 100 * step
         bounds = (west, north - 100 * step, west + 100 * step, north)
-        pixels = drawn(self.server, "EPSG:31256", bounds, 100, 100)
-        if pixels[..., 3].any():
-            self._picture(pixels)
-        else:
-            self._send(404, b"no such tile", "text/plain")
+        self._picture_or_none(drawn(self.server, "EPSG:31256", bounds, 100, 100))
 
     def _file(self, file: Path) -> None:
         if not file.is_file():
@@ -205,13 +212,6 @@ class _Handler(BaseHTTPRequestHandler):
         first, last = int(span[1]), min(int(span[2] or len(content)), len(content) - 1)
         headers = {"Content-Range": f"bytes {first}-{last}/{len(content)}", "Accept-Ranges": "bytes"}
         self._send(206, content[first : last + 1], "image/tiff", headers)
-
-    def do_HEAD(self) -> None:
-        file = self.server.files / Path(urlsplit(self.path).path).name
-        self.send_response(200 if file.is_file() else 404)
-        self.send_header("Content-Length", str(file.stat().st_size) if file.is_file() else "0")
-        self.send_header("Accept-Ranges", "bytes")
-        self.end_headers()
 
 
 def wms_capabilities(server: MapServer) -> str:

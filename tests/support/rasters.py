@@ -8,7 +8,22 @@ from typing import Any
 
 import numpy as np
 import rasterio
+from affine import Affine
 from rasterio.enums import Resampling
+
+from engine import OrthoMap
+from engine.values import Window
+
+
+def whole(site: OrthoMap, level: int = 0) -> Window:
+    """All of a level of a map."""
+    rows, columns = site.level_shape(level)
+    return Window(0, 0, columns, rows)
+
+
+def from_corner(pixel_to_crs: Any) -> Affine:
+    """The transform of a file, which counts from the corner of the first pixel, not from its centre."""
+    return Affine(*np.ravel(pixel_to_crs)) @ Affine.translation(-0.5, -0.5)
 
 
 def write_raster(

@@ -1,0 +1,19 @@
+"""What a call says that refuses its input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from engine.errors import TelemetryError
+
+
+def refusal(call: Callable[..., Any], *arguments: Any, error: type = TelemetryError, **options: Any) -> str:
+    """The one line with which a call refuses its input."""
+    with pytest.raises(error) as caught:
+        call(*arguments, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
