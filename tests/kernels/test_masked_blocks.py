@@ -77,19 +77,6 @@ def test_the_division_changes_no_score(kind, monkeypatch):
         np.testing.assert_allclose(other, found[0], rtol=0, atol=1e-10)
 
 
-def test_what_is_wholly_valid_is_scored_as_without_a_mask():
-    window, valid, templates = (v.astype(np.float32) for v in drawn("holes", (230, 317), (48, 61)))
-    valid = valid.astype(bool)
-    scores = ncc(window[None], templates[None], search_valid=valid[None])[0]
-    plain = ncc(window[None], templates[None])[0]
-    whole = (
-        cv2.erode(valid.astype(np.uint8), np.ones((48, 61), np.uint8), anchor=(0, 0))[: 230 - 47, : 317 - 60] > 0
-    )
-    assert whole.any()
-    assert not whole.all()
-    np.testing.assert_allclose(scores[:, whole], plain[:, whole], rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("level", [0.1, 77.0, -3.3])
 def test_flat_templates_and_flat_ground_score_zero_also_across_an_edge(level):
     window, valid, templates = drawn("border", (120, 130), (30, 31))
