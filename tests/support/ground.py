@@ -14,7 +14,7 @@ import numpy as np
 from pyproj import Transformer
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from engine import Camera, Frame, OrthoMap, Prior
+from engine import Camera, Fix, Frame, OrthoMap, Prior
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 """The paper's: straight down."""
@@ -115,9 +115,19 @@ class Ground:
         enu = self.enu_from_pixel(np.stack([x, y], axis=-1))
         return np.clip(np.rint(self.levels(enu[..., 0], enu[..., 1])), 0, 255).astype(np.uint8)
 
+    def map_of(self, gray=None, **more):
+        """Its map, or one of another picture in its place, with what more there is of it."""
+        gray = self.gray if gray is None else gray
+        return OrthoMap.from_arrays(gray, self.pixel_to_crs, f"EPSG:{self.epsg}", **more)
+
     @cached_property
     def site(self):
-        return OrthoMap.from_arrays(self.gray, self.pixel_to_crs, f"EPSG:{self.epsg}")
+        return self.map_of()
+
+    @cached_property
+    def flat_site(self):
+        """With a surface model that says how flat it is: only then is a pose refined."""
+        return self.map_of(surface_m=np.zeros(self.size, np.float32))
 
     def picture(self, camera, nadir_px, height_m, **attitude):
         """What the camera sees above a map pixel (x, y): one ray a pixel, onto flat ground."""
@@ -136,3 +146,13 @@ class Ground:
         """A prior some metres off a map pixel."""
         east, north = self.enu_from_pixel(nadir_px) + off_m
         return Prior(east_m=float(east), north_m=float(north), sigma_m=sigma_m)
+
+    def off_m(self, fix, nadir_px):
+        """(2,) metres east and north of a map pixel."""
+        assert isinstance(fix, Fix), fix
+        return np.array([fix.east_m, fix.north_m]) - self.enu_from_pixel(nadir_px)
+
+    def chi_square(self, fix, nadir_px):
+        """The squared error of a fix in sigmas of its own, of two degrees of freedom."""
+        off_m = self.off_m(fix, nadir_px)
+        return float(off_m @ np.linalg.solve(fix.covariance_m2[:2, :2], off_m))
