@@ -49,15 +49,17 @@ def plainly(query, train, ratio, turn_deg, most_deg, scale, factor):
 
 
 @pytest.mark.parametrize("chunk", [7, 64, 4096])
-@pytest.mark.parametrize(("most_deg", "factor"), [(180.0, 1e9), (60.0, 1e9), (180.0, 1.5), (75.0, 2.0)])
-def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, chunk, most_deg, factor):
+@pytest.mark.parametrize(
+    ("ratio", "most_deg", "factor"),
+    [(1.0, 180.0, 1e9), (0.9, 180.0, 1e9), (0.9, 60.0, 1e9), (0.9, 180.0, 1.5), (0.9, 75.0, 2.0)],
+)
+def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, chunk, ratio, most_deg, factor):
     monkeypatch.setattr(matching, "TRAIN_CHUNK", chunk)
     query = described(60, 1)
     train = described(333, 2, like=query)
-    found = match(
-        query, train, ratio=0.9, rotation_deg=20.0, max_angle_diff_deg=most_deg, scale=1.2, max_scale_factor=factor
-    )
-    expected = plainly(query, train, 0.9, 20.0, most_deg, 1.2, factor)
+    limits = {"rotation_deg": 20.0, "max_angle_diff_deg": most_deg, "scale": 1.2, "max_scale_factor": factor}
+    found = match(query, train, ratio=ratio, **limits)
+    expected = plainly(query, train, ratio, 20.0, most_deg, 1.2, factor)
     assert len(expected) > 3
     assert [tuple(pair) for pair in pairs_of(found)] == expected
 
