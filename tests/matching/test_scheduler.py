@@ -291,23 +291,27 @@ def test_a_vague_prior_does_not_raise_the_cost_of_a_sharp_one(site, camera, fram
     assert isinstance(matcher.locate(frame, prior, Budget(total_ms=3_600_000.0)), Fix)
 
 
-def test_after_warmup_nothing_is_created_in_flight(ground, warm, camera):
-    matcher, _ = warm("auto")
+NOISE = np.random.default_rng(0).integers(0, 255, (300, 300), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("method", "changed"),
+    [
+        ("auto", {}),
+        ("sift", {"heading_deg": 6.0}),  # refinement has to begin on a coarser level
+        ("ncc", {"roll_deg": None, "pitch_deg": None}),
+        ("ncc", {"image": NOISE}),
+    ],
+    ids=["usual", "another heading", "no tilt", "refused"],
+)
+def test_after_warmup_nothing_is_prepared_or_compiled_in_flight(ground, warm, camera, method, changed):
+    matcher, _ = warm(method)
     before = matcher.cache_counters
     assert all(count > 0 for count in before.values())
     for number in range(8):
         place = NADIR + np.array([4.0, -3.0]) * number
         frame = ground.frame(camera, place, 120.0 + 8 * number, heading_deg=40.0 * number)
-        matcher.locate(frame, ground.prior(place, sigma_m=5.0 + number))
-    assert matcher.cache_counters == before
-
-
-def test_after_warmup_no_loop_is_compiled_for_a_refused_frame_or_one_without_tilt(warm, frame, prior):
-    matcher, _ = warm("ncc")
-    before = matcher.cache_counters
-    assert isinstance(matcher.locate(replace(frame, roll_deg=None, pitch_deg=None), prior), Fix)
-    noise = np.random.default_rng(0).integers(0, 255, frame.image.shape, np.uint8)
-    assert isinstance(matcher.locate(replace(frame, image=noise), prior), NoFix)
+        matcher.locate(replace(frame, **changed), ground.prior(place, sigma_m=5.0 + number))
     assert matcher.cache_counters == before
 
 

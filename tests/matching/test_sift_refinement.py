@@ -148,17 +148,6 @@ def test_wrong_telemetry_does_not_draw_the_pose_away(ground, camera, matcher, pl
     assert ground.chi_square(fix, NADIR) < 9.21  # of 2 degrees of freedom, 99 %
 
 
-@pytest.mark.parametrize("heading_off_deg", [pytest.param(0.0, marks=pytest.mark.slow), 6.0])
-def test_after_the_warm_up_nothing_is_prepared_in_flight(ground, site, camera, heading_off_deg):
-    """Also where refinement has to begin on a coarser level."""
-    matcher = SceneMatcher(site, camera, "sift", "cpu")
-    matcher.warmup()
-    before = dict(matcher.cache_counters)
-    frame = shot(ground, camera)
-    matcher.locate(replace(frame, heading_deg=frame.heading_deg + heading_off_deg), ground.prior(NADIR))
-    assert matcher.cache_counters == before
-
-
 @pytest.mark.usefixtures("clock_stands")
 @pytest.mark.parametrize("wrong", [{"roll_deg": 5.0}, {"pitch_deg": 0.0}], ids=str)
 def test_an_unrefined_fix_of_few_features_covers_a_wrong_telemetry(ground, site, camera, wrong):
