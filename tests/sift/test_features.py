@@ -114,31 +114,6 @@ def opencv_sift(image: np.ndarray, max_keypoints: int = 300) -> Features:
     return Features(slots[..., :2] - 0.25, slots[..., 2], slots[..., 3], descriptors, valid)
 
 
-def near_pairs(one, other, *, px, octaves):
-    """Slots of keypoints that lie within so many pixels and are of one scale to so many octaves."""
-    distance = torch.cdist(one.xy_px[0], other.xy_px[0])
-    scales = (one.scale_px[0, :, None] / other.scale_px[0].clamp_min(1e-3)).log2().abs()
-    near = (distance < px) & (scales < octaves) & one.valid[0][:, None] & other.valid[0]
-    return near.nonzero().unbind(1)
-
-
-def turns_between(one, other, first, second):
-    """By how many degrees the angles of pairs differ."""
-    return ((one.angle_deg[0, first] - other.angle_deg[0, second] + 180).remainder(360) - 180).abs()
-
-
-def test_position_scale_and_angle_agree_with_opencv(backend):
-    image = texture(200, 240, 1)
-    ours, theirs = sift(tensor(image), max_keypoints=600, backend=backend), opencv_sift(image, max_keypoints=600)
-    first, second = near_pairs(ours, theirs, px=0.5, octaves=0.2)
-    # kornia leaves out what has not settled within half a voxel, and ranks weaker ones before the rest.
-    assert len(first.unique()) > {"compiled": 0.75, "kornia": 0.7}[backend] * ours.valid.sum()
-    turn = turns_between(ours, theirs, first, second)
-    turn = torch.stack([turn[first == slot].min() for slot in first.unique()])  # OpenCV gives some several angles
-    assert turn.median() < 3
-    assert (turn < 15).float().mean() > 0.8
-
-
 # What is kept.
 
 
@@ -253,9 +228,12 @@ def test_the_backends_find_and_describe_the_same():
     for upright in (False, True):
         options = {"upright": upright, "up_deg": 20.0, "max_keypoints": 600}
         one, other = (sift(image, backend=name, **options) for name in ("compiled", "kornia"))
-        first, second = near_pairs(one, other, px=0.3, octaves=0.1)
-        assert len(first.unique()) > 0.8 * one.valid.sum()
-        turn = turns_between(one, other, first, second)
+        distance = torch.cdist(one.xy_px[0], other.xy_px[0])
+        scales = (one.scale_px[0, :, None] / other.scale_px[0].clamp_min(1e-3)).log2().abs()
+        near = (distance < 0.3) & (scales < 0.1) & one.valid[0][:, None] & other.valid[0]
+        assert near.any(1).sum() > 0.8 * one.valid.sum()
+        first, second = near.nonzero().unbind(1)
+        turn = ((one.angle_deg[0, first] - other.angle_deg[0, second] + 180).remainder(360) - 180).abs()
         assert (turn < 5).float().mean() > 0.9
         cosine = (one.descriptors[0, first] * other.descriptors[0, second]).sum(1)
         assert cosine[turn < 5].median() > 0.98
