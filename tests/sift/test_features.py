@@ -1,7 +1,6 @@
 """Truths about the features: where a blob lies, what a rotation does, what OpenCV and kornia find."""
 
 import math
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -260,67 +259,6 @@ def test_auto_is_compiled_on_the_cpu_and_kornia_elsewhere():
         chosen_backend("compiled", cuda)
 
 
-# What matches.
-
-
-def features(descriptors: torch.Tensor) -> Features:
-    batch, count, _ = descriptors.shape
-    zeros = torch.zeros(batch, count)
-    return Features(
-        xy_px=torch.zeros(batch, count, 2),
-        scale_px=zeros + 1,
-        angle_deg=zeros,
-        descriptors=torch.nn.functional.normalize(descriptors, dim=2),
-        valid=torch.ones(batch, count, dtype=torch.bool),
-    )
-
-
-@pytest.fixture
-def pair() -> tuple[Features, Features]:
-    generator = torch.Generator().manual_seed(2)
-    base = torch.rand(2, 70, 128, generator=generator)
-    noise = torch.rand(2, 90, 128, generator=generator)
-    noise[:, 10:80] = base + 0.6 * torch.rand(2, 70, 128, generator=generator)
-    return features(base), features(noise)
-
-
-def test_distances_are_those_of_the_pairs(pair):
-    query, train = pair
-    found = match(query, train)
-    full = torch.cdist(query.descriptors, train.descriptors)
-    assert_close(found.distance, full.amin(2), atol=1e-4, rtol=1e-4)
-    two = full.topk(2, largest=False).values
-    assert_close(found.ratio, two[..., 0] / two[..., 1], atol=1e-4, rtol=1e-4)
-
-
-def test_invalid_slots_never_match(pair):
-    query, train = pair
-    blind = replace(train, valid=torch.zeros(2, 90, dtype=torch.bool))
-    assert not match(query, blind).valid.any()
-    assert not match(blind, query).valid.any()
-    one = replace(train, valid=(torch.arange(90) == 10).expand(2, -1))
-    assert pairs_of(match(query, one)) == [[0, 10]]
-
-
-@pytest.mark.parametrize("stored", [torch.float32, torch.float16], ids=str)
-def test_of_two_alike_neither_is_matched(stored):
-    """Nothing tells which of them is right, also where rounding puts one at 0 and the other a hair off."""
-    rng = torch.Generator().manual_seed(4)
-    descriptors = torch.rand(1, 300, 128, generator=rng) ** 2
-    query = features(descriptors)
-    first = query.descriptors.to(stored).float()
-    twice = torch.cat([first, torch.nextafter(first, torch.ones(()))], dim=1)
-    twins = replace(features(twice), descriptors=twice)
-    found = match(query, twins)
-    assert found.distance.max() < 0.02
-    assert not found.valid.any()
-    assert_close(found.ratio, torch.ones(1, 300), atol=0.1, rtol=0)
-    lone = match(query, replace(twins, valid=torch.arange(600)[None] < 300))
-    assert lone.valid.all()
-    assert lone.ratio.max() < 0.05
-    assert pairs_of(lone) == [[n, n] for n in range(300)]
-
-
 # What is refused.
 
 
@@ -351,11 +289,6 @@ def test_wrong_arguments_are_named(images, options, error, text):
     with pytest.raises(error) as caught:
         sift(images, **options)
     assert text in str(caught.value)
-
-
-def test_a_wrong_ratio_is_named(pair):
-    with pytest.raises(OptionError, match="ratio"):
-        match(*pair, ratio=1.5)
 
 
 def test_a_picture_that_requires_a_gradient_has_the_same_features(backend):

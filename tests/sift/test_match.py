@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from engine.errors import OptionError
 from engine.features import Features, match
 from engine.sift import matching, matching_tensors
 from engine.sift.values import fields_of
@@ -27,6 +28,10 @@ def described(count, seed, *, like=None):
         descriptors=torch.nn.functional.normalize(descriptors, dim=2),
         valid=torch.rand(1, count, generator=generator) < 0.9,
     )
+
+
+def all_valid(features):
+    return replace(features, valid=torch.ones_like(features.valid))
 
 
 def plainly(query, train, ratio, turn_deg, most_deg, scale, factor):
@@ -107,3 +112,44 @@ def test_nothing_matches_a_map_without_features():
     empty = described(0, 3)
     assert pairs_of(match(described(5, 1), empty)) == []
     assert pairs_of(match(empty, described(5, 1))) == []
+
+
+def test_distances_are_those_of_the_pairs():
+    query = all_valid(described(70, 1))
+    train = all_valid(described(90, 2, like=query))
+    found = match(query, train)
+    full = torch.cdist(query.descriptors, train.descriptors)
+    assert_close(found.distance, full.amin(2), atol=1e-4, rtol=1e-4)
+    two = full.topk(2, largest=False).values
+    assert_close(found.ratio, two[..., 0] / two[..., 1], atol=1e-4, rtol=1e-4)
+
+
+def test_invalid_slots_never_match():
+    query = all_valid(described(70, 1))
+    train = described(90, 2, like=query)
+    blind = replace(train, valid=torch.zeros_like(train.valid))
+    assert not match(query, blind).valid.any()
+    assert not match(blind, query).valid.any()
+    assert pairs_of(match(query, replace(train, valid=torch.arange(90)[None] == 10))) == [[10, 10]]
+
+
+@pytest.mark.parametrize("stored", [torch.float32, torch.float16], ids=str)
+def test_of_two_alike_neither_is_matched(stored):
+    """Nothing tells which of them is right, also where rounding puts one at 0 and the other a hair off."""
+    query = all_valid(described(300, 4))
+    first = query.descriptors.to(stored).float()
+    twins = Features(*(torch.cat([values, values], dim=1) for values in fields_of(query)))
+    twins = replace(twins, descriptors=torch.cat([first, torch.nextafter(first, torch.ones(()))], dim=1))
+    found = match(query, twins)
+    assert found.distance.max() < 0.02
+    assert not found.valid.any()
+    assert_close(found.ratio, torch.ones(1, 300), atol=0.1, rtol=0)
+    lone = match(query, replace(twins, valid=torch.arange(600)[None] < 300))
+    assert lone.valid.all()
+    assert lone.ratio.max() < 0.05
+    assert pairs_of(lone) == [[n, n] for n in range(300)]
+
+
+def test_a_wrong_ratio_is_named():
+    with pytest.raises(OptionError, match="ratio"):
+        match(described(5, 1), described(5, 1), ratio=1.5)
