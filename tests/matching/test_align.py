@@ -34,20 +34,11 @@ def matcher_of(site, camera, method):
     return SceneMatcher(site, camera, method, "cpu")
 
 
-def locate(ground, camera, frame, method="ncc", nadir=NADIR):
-    return matcher_of(ground.site, camera, method).locate(frame, ground.prior(nadir))
+def locate(ground, camera, frame, method="ncc"):
+    return matcher_of(ground.site, camera, method).locate(frame, ground.prior(NADIR))
 
 
 # The map
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("nadir", [(310.0, 305.0), (290.5, 320.25)])
-def test_half_pixel_of_the_map_a_place_is_counted_from_the_centre_of_the_first_pixel(
-    ground, camera, nadir, method
-):
-    nadir = np.array(nadir)
-    assert px_off(locate(ground, camera, ground.frame(camera, nadir), method, nadir), nadir) < 0.15
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -64,7 +55,7 @@ def test_half_pixel_of_the_map_a_geotiff_counts_from_the_corner_of_the_first_pix
     assert (result.east_m, result.north_m) == (pytest.approx(east, abs=0.08), pytest.approx(north, abs=0.08))
 
 
-# Equation 3: heading
+# Equations 2 and 3: scale and heading
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -82,16 +73,6 @@ def test_half_pixel_of_the_map_a_geotiff_counts_from_the_corner_of_the_first_pix
 def test_a_frame_of_any_heading_height_and_tilt_is_found_where_it_was_taken(ground, camera, taken, method):
     """Headings are clockwise from north, a positive roll lowers the right side, positive pitch lifts the nose."""
     assert px_off(locate(ground, camera, ground.frame(camera, NADIR, **taken), method), NADIR) < PIXELS
-
-
-def test_sign_of_heading_at_90_the_top_of_the_frame_lies_to_the_east():
-    picture = np.zeros((300, 300), np.uint8)
-    picture[60:80, 140:160] = 255  # near the top, in the middle
-    view = view_of(CAMERA, Attitude(0.0, 0.0, 90.0), 129.9, UPRIGHT)  # 0.5 m a pixel
-    patch = rectify(picture, CAMERA, view)
-    y, x = np.argwhere(patch.gray > 128).mean(axis=0) + patch.offset_px[::-1]
-    assert x == pytest.approx(80.0, abs=1.0)
-    assert y == pytest.approx(0.0, abs=1.0)
 
 
 @pytest.mark.parametrize("size", [(320, 240), (301, 200)])
@@ -158,11 +139,7 @@ def test_there_is_no_view_where_a_corner_looks_at_the_horizon(axis, angle):
         assert (view is not None) == sees, tilt
 
 
-@given(
-    roll=st.floats(-25.0, 25.0),
-    pitch=st.floats(-25.0, 25.0),
-    heading=st.floats(0.0, 360.0),
-)
+@given(roll=st.floats(-25.0, 25.0), pitch=st.floats(-25.0, 25.0), heading=st.floats(0.0, 360.0))
 def test_a_patch_holds_frame_alone(roll, pitch, heading):
     """No corner of the patch lies outside the frame, and it keeps to whole map pixels and to its size."""
     view = view_of(CAMERA, Attitude(roll, pitch, heading), 150.0, UPRIGHT)
