@@ -15,8 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rasterio.transform import Affine
 
-from engine import Attitude, Camera, Frame, OrthoMap, SceneMatcher
+from engine import Attitude, Camera, Frame, MatcherOptions, OrthoMap, SceneMatcher
 from engine.matching.align import FRACTION, MAX_RAY_DEG, rectify, to_gray, view_of
+from engine.options import NccOptions, SiftOptions
 from tests.support.fixes import px_off
 from tests.support.ground import ground_hits
 from tests.support.rasters import write_raster
@@ -30,8 +31,12 @@ PIXELS = 0.3  # the most that a fix may be off, in map pixels
 
 @lru_cache(maxsize=4)
 def matcher_of(site, camera, method):
-    """The one that the tests before have used: what it has prepared of the map is as it was."""
-    return SceneMatcher(site, camera, method, "cpu")
+    """The one that the tests before have used: what it has prepared of the map is as it was.
+
+    Nothing is refined, which would put right what the alignment does wrong.
+    """
+    options = MatcherOptions(ncc=NccOptions(refine=False), sift=SiftOptions(refine=False))
+    return SceneMatcher(site, camera, method, "cpu", options)
 
 
 def locate(ground, camera, frame, method="ncc"):
