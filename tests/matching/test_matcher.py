@@ -126,16 +126,6 @@ def test_nothing_that_is_handed_in_is_changed(matchers, frame, prior):
     np.testing.assert_array_equal(frame.image, before)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_without_a_prior_the_whole_map_is_searched_and_the_same_place_found(
-    matchers, ground, frame, prior, method
-):
-    known = matchers[method].locate(frame, prior)
-    lost = matchers[method].locate(frame)
-    assert px_off(lost, NADIR) < 0.3
-    assert np.hypot(lost.east_m - known.east_m, lost.north_m - known.north_m) < 0.1
-
-
 @pytest.mark.slow
 def test_without_a_prior_a_place_on_a_large_map_is_found_by_way_of_a_coarse_one(camera):
     ground = Ground(size=(1200, 1100), seed=9)  # more than the million pixels that are searched at once

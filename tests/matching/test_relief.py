@@ -11,7 +11,7 @@ from engine import Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher
 from engine.matching.align import view_of
 from engine.options import NccOptions
 from engine.values import Attitude
-from tests.support.ground import body_axes
+from tests.support.ground import pixels_of, rays_of
 
 NADIR = np.array([315.0, 296.0])
 HEIGHT_M = 150.0
@@ -30,35 +30,25 @@ def hill(east_m, north_m):
     return 40.0 * np.exp(-((east_m - 60.0) ** 2 + (north_m - 20.0) ** 2) / (2.0 * 55.0**2))
 
 
-def rays(camera, xy_px):
-    forward, right, down = body_axes(**ATTITUDE)
-    at = (np.asarray(xy_px, float) - camera.matrix[:2, 2]) / np.diag(camera.matrix)[:2]
-    return down + at[..., :1] * right - at[..., 1:] * forward
-
-
 def seen(ground, camera, shape):
     """The frame from above :data:`NADIR`, its rays followed down to the ground, and how high it hangs.
 
     The telemetry is off by 0.5, 0.4 and 1 degree, and by 2 m of height above the ground below.
     """
-    x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-    down = rays(camera, np.stack([x, y], axis=-1))
+    down = rays_of(camera, pixels_of(camera.height_px, camera.width_px), **ATTITUDE)
     nadir = ground.enu_from_pixel(NADIR)
     up = shape(*nadir) + HEIGHT_M
     hits = np.broadcast_to(nadir, (*down.shape[:2], 2))
     for _ in range(40):  # the slope is below 1, so this contracts
         sink_m = up - shape(hits[..., 0], hits[..., 1])
         hits = nadir + down[..., :2] * (sink_m[..., None] / -down[..., 2:])
-    image = np.clip(np.rint(ground.levels(hits[..., 0], hits[..., 1])), 0, 255).astype(np.uint8)
     stated = {name: angle + off for (name, angle), off in zip(ATTITUDE.items(), (0.5, -0.4, 1.0), strict=True)}
-    return Frame(image, timestamp_ns=0, height_agl_m=HEIGHT_M + 2.0, **stated), up
+    return Frame(ground.seen_at(hits), timestamp_ns=0, height_agl_m=HEIGHT_M + 2.0, **stated), up
 
 
 def site_on(ground, shape):
-    rows, columns = ground.size
-    enu = ground.enu_from_pixel(np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1))
-    heights = shape(enu[..., 0], enu[..., 1])
-    return ground.map_of(surface_m=heights)
+    enu = ground.enu_from_pixel(pixels_of(*ground.size))
+    return ground.map_of(surface_m=shape(enu[..., 0], enu[..., 1]))
 
 
 @pytest.fixture(scope="module", params=[plane, hill], ids=["plane", "hill"])
@@ -144,7 +134,7 @@ def test_the_view_of_a_slope_is_what_rays_do(camera, slope):
     jacobian = np.diag([0.5, -0.5])
     view = view_of(camera, Attitude(**ATTITUDE), HEIGHT_M, jacobian, np.array(slope))
     pixels = np.array([[0.0, 0.0], [299.0, 0.0], [40.0, 250.0], [149.5, 149.5]])
-    down = rays(camera, pixels)
+    down = rays_of(camera, pixels, **ATTITUDE)
     rise = down[:, 0] * slope[0] / 0.5 - down[:, 1] * slope[1] / 0.5
     hits = down[:, :2] * (HEIGHT_M / (rise - down[:, 2]))[:, None] / [0.5, -0.5]
     image = np.c_[hits, np.ones(4)] @ view.image_from_map.T
