@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -12,6 +11,7 @@ import torch
 from engine.kernels.peaks import find_peak
 from engine.kernels.tensors import peak_numbers
 from engine.ncc_fft import match_template, prepare
+from tests.support.fields import fields_of
 from tests.support.pretended import DEVICE, pretended_device
 
 SHAPES = [
@@ -51,20 +51,6 @@ def test_nan_never_wins():
     assert peak_numbers(torch.full((63, 65), math.nan), 5.0)[:3] == [0.0, -1.0, -1.0]
 
 
-def picture(size, model):
-    """A smooth picture, and a template of it that lies at a fifth of the way."""
-    rng = torch.Generator().manual_seed(size[0])
-    rough = torch.randn(1, 1, *size, generator=rng)
-    image = torch.nn.functional.avg_pool2d(rough, 3, stride=1, padding=1)[0, 0]
-    y, x = ((n - m) // 5 for n, m in zip(size, model, strict=True))
-    return image, image[y : y + model[0], x : x + model[1]] + 0.05 * torch.randn(*model, generator=rng)
-
-
-def assert_same(found, expected):
-    for field in dataclasses.fields(expected):
-        np.testing.assert_array_equal(getattr(found, field.name), getattr(expected, field.name), field.name)
-
-
 @pytest.mark.parametrize("exclusion_px", [0.0, math.sqrt(2.0), 5.0, 5.5, 1000.0])
 @pytest.mark.parametrize(
     "size",
@@ -77,10 +63,13 @@ def assert_same(found, expected):
     ],
 )
 def test_the_peak_on_a_device_is_that_on_the_host(size, exclusion_px):
-    scores = picture(size, (1, 1))[0].clamp(-1.0, 1.0)
+    rough = torch.randn(1, 1, *size, generator=torch.Generator().manual_seed(size[0]))
+    scores = torch.nn.functional.avg_pool2d(rough, 3, stride=1, padding=1)[0, 0].clamp(-1.0, 1.0)
+    expected = find_peak(scores, exclusion_px=exclusion_px)
     with pretended_device():
         found = find_peak(scores.to(DEVICE), exclusion_px=exclusion_px)
-    assert_same(found, find_peak(scores, exclusion_px=exclusion_px))
+    for one, other in zip(fields_of(found), fields_of(expected), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_the_peak_of_a_window_without_texture_is_finite():
