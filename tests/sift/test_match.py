@@ -53,40 +53,35 @@ def plainly(query, train, ratio, turn_deg, most_deg, scale, factor):
     return pairs
 
 
+def by_tensor_ops(query, train, *, ratio=0.8, rotation_deg=0.0, max_angle_diff_deg=None, scale=1.0,
+                  max_scale_factor=None):  # fmt: skip
+    """As on a device."""
+    limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
+    return matching_tensors.match_tensors(query, train, limits, ratio)
+
+
+WAYS = pytest.mark.parametrize("way", [match, by_tensor_ops], ids=["loops", "tensor ops"])
+
+
+@WAYS
 @pytest.mark.parametrize("chunk", [7, 64, 4096])
 @pytest.mark.parametrize(
     ("ratio", "most_deg", "factor"),
-    [(1.0, 180.0, 1e9), (0.9, 180.0, 1e9), (0.9, 60.0, 1e9), (0.9, 180.0, 1.5), (0.9, 75.0, 2.0)],
+    [(1.0, None, None), (0.9, None, None), (0.9, 60.0, None), (0.9, None, 1.5), (0.9, 75.0, 2.0)],
 )
-def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, chunk, ratio, most_deg, factor):
-    monkeypatch.setattr(matching, "TRAIN_CHUNK", chunk)
+def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, way, chunk, ratio, most_deg, factor):
+    """Of one frame with two parts of the map."""
+    for module in (matching, matching_tensors):
+        monkeypatch.setattr(module, "TRAIN_CHUNK", chunk)
     query = described(60, 1)
-    train = described(333, 2, like=query)
-    limits = {"rotation_deg": 20.0, "max_angle_diff_deg": most_deg, "scale": 1.2, "max_scale_factor": factor}
-    found = match(query, train, ratio=ratio, **limits)
-    expected = plainly(query, train, ratio, 20.0, most_deg, 1.2, factor)
-    assert len(expected) > 3
-    assert [tuple(pair) for pair in pairs_of(found)] == expected
-
-
-@pytest.mark.parametrize(("most_deg", "factor"), [(None, None), (60.0, None), (None, 1.5), (75.0, 2.0)])
-@pytest.mark.parametrize("batch", [1, 3])
-def test_the_loops_find_what_the_tensor_ops_find(batch, most_deg, factor):
-    query = described(50, 3)
-    trains = [described(90, seed, like=query) for seed in range(batch)]
+    trains = [described(333, seed, like=query) for seed in (2, 3)]
     train = Features(*(torch.cat(values) for values in zip(*map(fields_of, trains), strict=True)))
-    limits = (20.0, most_deg, 1.2, factor)
-    found = matching._nearest_by_loops(matching._as_arrays(query), matching._as_arrays(train), limits)
-    got, expected = tuple(map(torch.from_numpy, found)), matching_tensors._nearest(query, train, limits)
-    allowed = expected[0] > -2.0
-    assert allowed.sum() > 20 * batch
-    assert_close(got[0][allowed], expected[0][allowed])
-    assert torch.equal(got[1][allowed], expected[1][allowed])
-    assert torch.equal(got[3][allowed], expected[3][allowed])
-    assert (got[0][~allowed] < -2.0).all()
-    two = expected[2] > -2.0
-    assert_close(got[2][two], expected[2][two])
-    assert (got[2][~two] < -2.0).all()
+    limits = {"rotation_deg": 20.0, "max_angle_diff_deg": most_deg, "scale": 1.2, "max_scale_factor": factor}
+    found = way(query, train, ratio=ratio, **limits)
+    for element, part in enumerate(trains):
+        expected = plainly(query, part, ratio, 20.0, most_deg or 180.0, 1.2, factor or 1e9)
+        assert len(expected) > 3
+        assert [tuple(pair) for pair in pairs_of(found, element)] == expected
 
 
 @pytest.mark.parametrize("kind", [torch.float64, torch.float16])
@@ -114,10 +109,11 @@ def test_nothing_matches_a_map_without_features():
     assert pairs_of(match(empty, described(5, 1))) == []
 
 
-def test_distances_are_those_of_the_pairs():
+@WAYS
+def test_distances_are_those_of_the_pairs(way):
     query = all_valid(described(70, 1))
     train = all_valid(described(90, 2, like=query))
-    found = match(query, train)
+    found = way(query, train)
     full = torch.cdist(query.descriptors, train.descriptors)
     assert_close(found.distance, full.amin(2), atol=1e-4, rtol=1e-4)
     two = full.topk(2, largest=False).values
