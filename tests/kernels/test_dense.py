@@ -245,22 +245,25 @@ def test_on_a_map_that_says_it_is_exact_the_errors_fill_the_covariance(sim_fligh
     assert nees() < 0.5 * exact
 
 
+def with_noise(frame, part):
+    """A frame of which a part shows nothing."""
+    image = frame.image.copy()
+    image[part] = np.random.default_rng(0).integers(0, 255, image[part].shape)
+    return replace(frame, image=image)
+
+
 def test_a_picture_of_another_place_keeps_its_fix_or_none(ground, flat_site, camera):
     """Refinement never makes a fix of what is no fix: the other half of the picture is noise."""
-    frame = ground.frame(camera, NADIR, heading_deg=25.0)
-    image = frame.image.copy()
-    image[:, 150:] = np.random.default_rng(0).integers(0, 255, (300, 150))
-    fix = located(flat_site, camera, replace(frame, image=image), ground.prior(NADIR))
+    frame = with_noise(ground.frame(camera, NADIR, heading_deg=25.0), np.s_[:, 150:])
+    fix = located(flat_site, camera, frame, ground.prior(NADIR))
     assert ground.chi_square(fix, NADIR) < 9.0
 
 
 def test_a_tilt_that_nobody_tells_is_refused_and_not_guessed(ground, flat_site, camera):
     """Half of the picture is noise on top of a tilt of 10 degrees: the peak's place is 26 m off."""
-    frame = ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=10.0)
-    image = frame.image.copy()
-    image[150:] = np.random.default_rng(0).integers(0, 255, (150, 300))
-    untold = replace(frame, image=image, roll_deg=None, pitch_deg=None)
-    result = SceneMatcher(flat_site, camera, "ncc", "cpu").locate(untold, ground.prior(NADIR, sigma_m=25))
+    frame = with_noise(ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=10.0), np.s_[150:])
+    untold = replace(frame, roll_deg=None, pitch_deg=None)
+    result = located(flat_site, camera, untold, ground.prior(NADIR, sigma_m=25))
     assert isinstance(result, NoFix) or ground.chi_square(result, NADIR) < 9.0
 
 

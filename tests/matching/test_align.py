@@ -19,7 +19,7 @@ from engine import Attitude, Camera, Frame, MatcherOptions, OrthoMap, SceneMatch
 from engine.matching.align import FRACTION, MAX_RAY_DEG, rectify, to_gray, view_of
 from engine.options import NccOptions, SiftOptions
 from tests.support.fixes import px_off
-from tests.support.ground import ground_hits
+from tests.support.ground import rays_of
 from tests.support.rasters import write_raster
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
@@ -113,20 +113,26 @@ def test_an_off_centre_principal_point_is_honoured(ground, method):
     heading=st.floats(0.0, 360.0),
     height=st.floats(2.0, 2000.0),
     convergence=st.floats(-3.0, 3.0),
+    slope=st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1)),
 )
-def test_the_view_is_what_rays_do(roll, pitch, heading, height, convergence):
+def test_the_view_is_what_rays_do(roll, pitch, heading, height, convergence, slope):
+    """Of a plane that rises by so many metres per map pixel, half a metre, to the right and down on the map."""
     c, s = math.cos(math.radians(convergence)), math.sin(math.radians(convergence))
     jacobian = np.array([[c, s], [-s, c]]) @ UPRIGHT
-    attitude = {"roll_deg": roll, "pitch_deg": pitch, "heading_deg": heading}
-    view = view_of(CAMERA, Attitude(**attitude), height, jacobian)
+    view = view_of(CAMERA, Attitude(roll, pitch, heading), height, jacobian, np.array(slope))
+
+    def hits_of(pixels):
+        rays = rays_of(CAMERA, pixels, roll_deg=roll, pitch_deg=pitch, heading_deg=heading)
+        rise = rays[:, :2] @ np.linalg.solve(jacobian.T, slope)
+        hits_m = rays[:, :2] * (height / (rise - rays[:, 2]))[:, None]
+        return np.linalg.solve(jacobian, hits_m.T).T
+
     pixels = np.array([[0.0, 0.0], [299.0, 0.0], [40.0, 250.0], [149.5, 149.5]])
-    hits_m = ground_hits(CAMERA, pixels, height, **attitude)
-    hits_px = np.linalg.solve(jacobian, hits_m.T).T
+    hits_px = hits_of(pixels)
     seen = np.c_[hits_px, np.ones(4)] @ view.image_from_map.T
     np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], pixels, atol=1e-6)
     np.testing.assert_allclose(view.center_px, hits_px[3], atol=1e-6 * height)
-    corners = ground_hits(CAMERA, [[-0.5, -0.5], [299.5, -0.5], [299.5, 299.5], [-0.5, 299.5]], height, **attitude)
-    corners = np.linalg.solve(jacobian, corners.T).T
+    corners = hits_of([[-0.5, -0.5], [299.5, -0.5], [299.5, 299.5], [-0.5, 299.5]])
     np.testing.assert_allclose(view.footprint_px, np.ptp(corners, axis=0), rtol=1e-9)
     x, y = corners.T
     shoelace = 0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))

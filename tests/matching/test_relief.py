@@ -128,20 +128,6 @@ def test_where_nothing_is_known_the_ground_is_the_maps():
             np.testing.assert_allclose(slope, 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("slope", [(0.2, -0.1), (-0.3, 0.25), (0.0, 0.0)])
-def test_the_view_of_a_slope_is_what_rays_do(camera, slope):
-    """Slope in metres per pixel of 0.5 m, x to the east and y to the south; the plane is 150 m below."""
-    jacobian = np.diag([0.5, -0.5])
-    view = view_of(camera, Attitude(**ATTITUDE), HEIGHT_M, jacobian, np.array(slope))
-    pixels = np.array([[0.0, 0.0], [299.0, 0.0], [40.0, 250.0], [149.5, 149.5]])
-    down = rays_of(camera, pixels, **ATTITUDE)
-    rise = down[:, 0] * slope[0] / 0.5 - down[:, 1] * slope[1] / 0.5
-    hits = down[:, :2] * (HEIGHT_M / (rise - down[:, 2]))[:, None] / [0.5, -0.5]
-    image = np.c_[hits, np.ones(4)] @ view.image_from_map.T
-    np.testing.assert_allclose(image[:, :2] / image[:, 2:], pixels, atol=1e-6)
-    np.testing.assert_allclose(view.center_px, hits[3], atol=1e-6)
-
-
 def test_a_slope_that_a_corner_looks_along_has_no_view(camera):
     """Its outermost rays fall by 1 m in 0.58 m to the side: along a slope of 60 degrees."""
     level, jacobian = Attitude(0.0, 0.0, 0.0), np.diag([0.5, -0.5])

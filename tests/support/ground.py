@@ -45,12 +45,6 @@ def rays_of(camera, xy_px, *, roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0):
     return down + x[..., None] * right - y[..., None] * forward
 
 
-def ground_hits(camera, xy_px, height_m, **attitude):
-    """East and north (..., 2) in metres from the nadir where the rays of pixels (..., 2) meet flat ground."""
-    ray = rays_of(camera, xy_px, **attitude)
-    return ray[..., :2] * (height_m / -ray[..., 2:])
-
-
 def pixels_of(rows, columns):
     """(H, W, 2) x and y of every pixel."""
     return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
@@ -142,7 +136,8 @@ class Ground:
 
     def picture(self, camera, nadir_px, height_m, **attitude):
         """What the camera sees above a map pixel (x, y): one ray a pixel, onto flat ground."""
-        hits = ground_hits(camera, pixels_of(camera.height_px, camera.width_px), height_m, **attitude)
+        rays = rays_of(camera, pixels_of(camera.height_px, camera.width_px), **attitude)
+        hits = rays[..., :2] * (height_m / -rays[..., 2:])
         return self.seen_at(hits + self.enu_from_pixel(nadir_px))
 
     def frame(self, camera, nadir_px, height_m=150.0, *, timestamp_ns=0, **attitude):
