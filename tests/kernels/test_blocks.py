@@ -82,19 +82,18 @@ def test_dim_and_bright_pictures_score_as_others(scale):
 
 @given(seed=st.integers(0, 2**32 - 1), model=st.tuples(st.integers(2, 20), st.integers(2, 20)))
 @settings(max_examples=12)
-def test_a_prepared_crop_scores_as_the_tensor_ops(seed, model):
+def test_a_prepared_crop_scores_as_the_reference(seed, model):
+    """By the loops and, as on a device, by running sums, which take four times the picture's memory."""
     rng = np.random.default_rng(seed)
-    image = torch.from_numpy(rng.normal(0.0, 1.0, (60, 70)).astype(np.float32))
-    part, on_device = (
-        whole.crop(7, 3, 41, 37) for whole in (prepare(image), Search(image, sums=tensors.integrals(image)))
-    )
-    assert part.sums is None  # they take four times the picture's memory
-    templates = torch.from_numpy(rng.normal(0.0, 1.0, (2, *model)).astype(np.float32))
-    centred = templates - templates.mean(dim=(-2, -1), keepdim=True)
-    norms = tensors.inverse_norm(on_device.sums, *model)
-    for count in (1, 2):
-        expected = tensors.prepared_surface(on_device.image, norms, centred[:count])
-        assert_close(surface(part, templates[:count]), expected, rtol=0, atol=1e-5)
+    image, templates = (rng.normal(0.0, 1.0, shape).astype(np.float32) for shape in ((60, 70), (2, *model)))
+    expected = reference_scores(image[None, 3:40, 7:48], templates[None])[0]
+    picture = torch.from_numpy(image)
+    for whole, has_sums in ((prepare(picture), False), (Search(picture, sums=tensors.integrals(picture)), True)):
+        part = whole.crop(7, 3, 41, 37)
+        assert (part.sums is not None) == has_sums
+        for count in (1, 2):
+            scores = surface(part, torch.from_numpy(templates[:count]))
+            np.testing.assert_allclose(scores.numpy(), expected[:count], rtol=0, atol=1e-5)
 
 
 def test_views_are_taken():
