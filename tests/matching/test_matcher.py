@@ -60,16 +60,6 @@ def matchers(ground, camera):
     return {method: SceneMatcher(ground.site, camera, method, "cpu") for method in ("ncc", "sift", "auto")}
 
 
-@pytest.fixture(scope="module")
-def frame(ground, camera):
-    return ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0, timestamp_ns=77)
-
-
-@pytest.fixture(scope="module")
-def prior(ground):
-    return ground.prior(NADIR)
-
-
 def with_telemetry(image, height_agl_m=150.0, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0):
     return Frame(image, 77, height_agl_m, heading_deg, roll_deg, pitch_deg)
 

@@ -58,16 +58,6 @@ def make(site, camera):
     return made
 
 
-@pytest.fixture(scope="module")
-def frame(ground, camera):
-    return ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0, timestamp_ns=77)
-
-
-@pytest.fixture(scope="module")
-def prior(ground):
-    return ground.prior(NADIR)
-
-
 def off_m(ground, fix):
     return float(np.hypot(*ground.off_m(fix, NADIR)))
 
