@@ -130,7 +130,8 @@ def test_any_image_gives_finite_features(shape, spoilt_by, upright, backend):
     for name in ("xy_px", "scale_px", "angle_deg", "descriptors"):
         assert torch.isfinite(getattr(found, name)).all()
     assert found.descriptors.shape == (2, 20, 128)
-    assert not found.valid[1].any() or spoilt_by is not None  # a flat picture
+    if spoilt_by is None:
+        assert not found.valid[1].any()  # a flat picture
 
 
 def test_invalid_slots_are_zero_and_valid_ones_of_unit_norm(backend):
