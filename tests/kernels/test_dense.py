@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from engine import Fix, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
+from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
 from engine.errors import ShapeError
 from engine.geo import enu_from_body
 from engine.kernels.dense import EnhancedFrame, GaussianPrior, Pose, Samples, correlation_at, covariance_of, refine
@@ -18,6 +18,7 @@ from engine.maps.prepared import PreparedMap
 from engine.maps.samples import BLOCK_PX, SampleMap
 from engine.options import NccOptions
 from engine.values import Window
+from tests.support.towns import site_of
 
 NADIR = np.array([315.0, 296.0])
 HEIGHT_M = 150.0
@@ -59,55 +60,59 @@ def believed(pose, turn_deg=(0.0, 0.0, 0.0), moved_m=(0.0, 0.0, 0.0), precision=
     return GaussianPrior(Pose(turned, pose.center_m + moved_m, np.zeros(2)), weak)
 
 
+def fitted(camera, scene, belief, levels=None, **changed):
+    """The fit of the samples, some of their values changed, to the scene's picture or another."""
+    _, samples, own = scene
+    picture = EnhancedFrame(own if levels is None else levels, camera.matrix)
+    return refine(picture, replace(samples, **changed), belief.pose, belief)
+
+
 @pytest.mark.parametrize("turn_deg", [(0.5, -0.4, 0.6), (-0.6, 0.3, -0.8), (0.0, 0.0, 0.0)])
 @pytest.mark.parametrize(("gain", "bias"), [(1.0, 0.0), (0.4, 30.0)])
 def test_all_six_degrees_are_found_again_whatever_gain_and_bias(scene, camera, turn_deg, gain, bias):
     pose, samples, levels = scene
     belief = believed(pose, turn_deg, moved_m=(0.8, -0.6, 1.0))
-    picture = EnhancedFrame(gain * levels + np.float32(bias), camera.matrix)
-    fit = refine(picture, samples, belief.pose, belief)
-    assert fit is not None
+    levels = gain * levels + np.float32(bias)
+    fit = fitted(camera, scene, belief, levels)
     assert np.abs(fit.pose.center_m - pose.center_m).max() < 0.1
     assert np.degrees(np.arccos(np.clip((np.sum(fit.pose.rotation * pose.rotation) - 1) / 2, -1, 1))) < 0.05
-    assert fit.correlation > 0.99 > correlation_at(picture, samples, belief.pose)
+    assert fit.correlation > 0.99 > correlation_at(EnhancedFrame(levels, camera.matrix), samples, belief.pose)
 
 
 def test_outliers_do_not_move_the_pose(scene, camera):
     """A fifth of the samples show something else: cars, new roofs."""
-    pose, samples, levels = scene
+    pose, samples, _ = scene
     rng = np.random.default_rng(2)
     wrong = rng.random(len(samples.values)) < 0.2
     values = np.where(wrong, rng.uniform(-3, 3, len(wrong)), samples.values)
-    belief = believed(pose, (0.3, 0.2, -0.4), moved_m=(0.5, 0.5, -0.5))
-    fit = refine(EnhancedFrame(levels, camera.matrix), replace(samples, values=values), belief.pose, belief)
-    assert fit is not None
+    fit = fitted(camera, scene, believed(pose, (0.3, 0.2, -0.4), moved_m=(0.5, 0.5, -0.5)), values=values)
     assert np.abs(fit.pose.center_m - pose.center_m).max() < 0.3
 
 
 def test_a_slope_nobody_told_of_is_found_where_the_attitude_is_known(scene, camera):
-    pose, samples, levels = scene
+    pose, samples, _ = scene
     points = samples.points_m.copy()
     slope = np.array([0.03, -0.02])
     points[:, 2] -= (points[:, :2] - pose.center_m[:2]) @ slope
     known = np.diag([0.0, 0.0, 1e6, 1e10, 1e10, 1e10, 100.0, 100.0])
-    belief = believed(pose, precision=known)
-    fit = refine(EnhancedFrame(levels, camera.matrix), replace(samples, points_m=points), belief.pose, belief)
-    assert fit is not None
+    fit = fitted(camera, scene, believed(pose, precision=known), points_m=points)
     np.testing.assert_allclose(fit.pose.slope, slope, atol=3e-3)
+
+
+def half_a_degree(slope_precision=1e8):
+    """The precision of a belief whose attitude is that uncertain, its height by a metre."""
+    return np.diag([0.0, 0.0, 1.0, *[np.radians(0.5) ** -2] * 3, slope_precision, slope_precision])
 
 
 def test_the_covariance_knows_that_tilt_and_slope_look_alike(camera):
     """On flat ground with its slope open the position is known no better than the attitude's own error lets it."""
-    pose, samples, levels = make_scene(camera, ())
+    scene = make_scene(camera, ())
+    pose, _, levels = scene
+    noisy = levels + np.random.default_rng(1).normal(0, 0.5, levels.shape).astype(np.float32)
     sigmas = []
     for slope_precision in (1e8, 100.0):
-        precision = np.diag([0.0, 0.0, 1.0, *[np.radians(0.5) ** -2] * 3, slope_precision, slope_precision])
-        belief = believed(pose, precision=precision)
-        noisy = levels + np.random.default_rng(1).normal(0, 0.5, levels.shape).astype(np.float32)
-        fit = refine(EnhancedFrame(noisy, camera.matrix), samples, belief.pose, belief)
-        assert fit is not None
-        covariance = covariance_of(fit, belief)
-        assert covariance is not None
+        belief = believed(pose, precision=half_a_degree(slope_precision))
+        covariance = covariance_of(fitted(camera, scene, belief, noisy), belief)
         assert np.linalg.eigvalsh(covariance)[0] > 0
         sigmas.append(np.sqrt(np.diag(covariance)[:2]))
     assert (sigmas[0] < 0.3).all()
@@ -116,17 +121,13 @@ def test_the_covariance_knows_that_tilt_and_slope_look_alike(camera):
 
 def test_what_neighbours_share_widens_the_covariance(scene, camera):
     """Grain and patches of the same variance: patches pull many samples at once."""
-    pose, samples, levels = scene
-    belief = believed(pose, precision=np.diag([0.0, 0.0, 1.0, *[np.radians(0.5) ** -2] * 3, 1e8, 1e8]))
+    pose, _, levels = scene
+    belief = believed(pose, precision=half_a_degree())
     sigmas = {}
     for name, radius_px in (("grain", 0.1), ("patches", 12.0)):
-        noise = np.random.default_rng(1).normal(0, 1.0, levels.shape)
-        noise = cv2.GaussianBlur(noise, (0, 0), radius_px)
-        picture = EnhancedFrame((levels + 0.5 * noise / noise.std()).astype(np.float32), camera.matrix)
-        fit = refine(picture, samples, belief.pose, belief)
-        assert fit is not None
+        noise = cv2.GaussianBlur(np.random.default_rng(1).normal(0, 1.0, levels.shape), (0, 0), radius_px)
+        fit = fitted(camera, scene, belief, (levels + 0.5 * noise / noise.std()).astype(np.float32))
         covariance = covariance_of(fit, belief)
-        assert covariance is not None
         off = (fit.pose.center_m - pose.center_m)[:2]
         assert off @ np.linalg.solve(covariance[:2, :2], off) < 13.8  # once in a thousand
         sigmas[name] = np.sqrt(np.diag(covariance)[:2])
@@ -147,12 +148,11 @@ def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground, fla
 
 def test_no_pose_from_samples_that_are_not_seen(scene, camera):
     pose, samples, levels = scene
+    assert fitted(camera, scene, believed(pose, moved_m=(1000.0, 0.0, 0.0))) is None
+    nothing = np.zeros(len(samples.weights))
+    assert fitted(camera, scene, believed(pose), weights=nothing) is None
     picture = EnhancedFrame(levels, camera.matrix)
-    away = believed(pose, moved_m=(1000.0, 0.0, 0.0))
-    assert refine(picture, samples, away.pose, away) is None
-    blind = replace(samples, weights=np.zeros(len(samples.weights)))
-    assert refine(picture, blind, pose, believed(pose)) is None
-    assert correlation_at(picture, blind, pose) == 0.0
+    assert correlation_at(picture, replace(samples, weights=nothing), pose) == 0.0
 
 
 def test_samples_of_odd_shapes_are_refused():
@@ -165,21 +165,12 @@ def test_samples_of_odd_shapes_are_refused():
 
 @pytest.fixture(scope="module")
 def flat_site(ground):
-    """The ground's map, with a surface model that says that it is flat."""
-    heights = np.zeros(ground.gray.shape, np.float32)
-    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=heights)
+    return ground.flat_site
 
 
 def located(site, camera, frame, prior, **options):
     matcher = SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(**options)))
-    fix = matcher.locate(frame, prior)
-    assert isinstance(fix, Fix), fix
-    return fix
-
-
-def sigmas_off(ground, fix):
-    off = np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR)
-    return off, float(off @ np.linalg.solve(fix.covariance_m2[:2, :2], off))
+    return matcher.locate(frame, prior)
 
 
 def test_telemetry_that_is_wrong_is_corrected(ground, flat_site, camera):
@@ -189,10 +180,9 @@ def test_telemetry_that_is_wrong_is_corrected(ground, flat_site, camera):
     peak = located(flat_site, camera, stated, ground.prior(NADIR), refine=False)
     fix = located(flat_site, camera, stated, ground.prior(NADIR))
     assert (peak.stage, peak.up_m, fix.stage, fix.method) == ("fine", None, "refined", "ncc")
-    assert np.hypot(*sigmas_off(ground, peak)[0]) > 1.0
-    assert np.hypot(*sigmas_off(ground, fix)[0]) < 0.15
+    assert np.hypot(*ground.off_m(peak, NADIR)) > 1.0
+    assert np.hypot(*ground.off_m(fix, NADIR)) < 0.15
     assert fix.up_m == pytest.approx(HEIGHT_M, abs=0.3)
-    assert fix.attitude is not None
     assert fix.attitude.roll_deg == pytest.approx(3.0, abs=0.06)
     assert fix.attitude.pitch_deg == pytest.approx(-2.0, abs=0.06)
     assert fix.attitude.heading_deg == pytest.approx(25.0, abs=0.06)
@@ -204,28 +194,34 @@ def test_without_a_surface_model_the_covariance_stays_as_wide_as_the_tilt_is_dou
     stated = replace(true, roll_deg=3.4, pitch_deg=-2.3)
     fix = located(ground.site, camera, stated, ground.prior(NADIR))
     assert fix.sigma_m > 0.7 * HEIGHT_M * np.tan(np.radians(0.5))
-    assert sigmas_off(ground, fix)[1] < 9.0
+    assert ground.chi_square(fix, NADIR) < 9.0
 
 
 @pytest.mark.parametrize("roll_deg", [0.0, 3.0, -5.0])
 def test_without_attitude_the_tilt_is_measured(ground, flat_site, camera, roll_deg):
     frame = ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=roll_deg)
-    fix = located(
-        flat_site, camera, replace(frame, roll_deg=None, pitch_deg=None), ground.prior(NADIR, sigma_m=15)
-    )
-    assert sigmas_off(ground, fix)[1] < 9.0
-    assert fix.attitude is not None
+    untold = replace(frame, roll_deg=None, pitch_deg=None)
+    fix = located(flat_site, camera, untold, ground.prior(NADIR, sigma_m=15))
+    assert ground.chi_square(fix, NADIR) < 9.0
     assert fix.attitude.roll_deg == pytest.approx(roll_deg, abs=0.2)
 
 
-def test_errors_are_as_large_as_the_covariance_says(sim_flight, sim_site, error_m):
+def fixes_over(flight, site, method="ncc", frames=slice(None)):
+    """The answers to frames of a flight by priors some metres off, each with the truth and its place (2,)."""
+    matcher = SceneMatcher(site, flight.camera, method, "cpu")
+    for frame, truth in zip(flight.frames[frames], flight.truth[frames], strict=True):
+        place = site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg)
+        yield (
+            matcher.locate(frame, Prior(east_m=place[0] + 3.0, north_m=place[1] - 2.0, sigma_m=5.0)),
+            truth,
+            place,
+        )
+
+
+def test_errors_are_as_large_as_the_covariance_says(sim_flight, sim_site):
     """Over a flight with houses and noisy telemetry."""
-    matcher = SceneMatcher(sim_site, sim_flight.camera, "ncc", "cpu")
     errors, squared = [], []
-    for frame, truth in zip(sim_flight.frames[4:], sim_flight.truth[4:], strict=True):
-        place = sim_site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg)
-        fix = matcher.locate(frame, Prior(east_m=place[0] + 3.0, north_m=place[1] - 2.0, sigma_m=5.0))
-        assert isinstance(fix, Fix)
+    for fix, truth, place in fixes_over(sim_flight, sim_site, frames=slice(4, None)):
         assert fix.stage == "refined"
         off = np.array([fix.east_m, fix.north_m, fix.up_m - sim_site.ground_m]) - [*place, truth.height_agl_m]
         errors.append(off)
@@ -236,18 +232,10 @@ def test_errors_are_as_large_as_the_covariance_says(sim_flight, sim_site, error_
 
 def test_on_a_map_that_says_it_is_exact_the_errors_fill_the_covariance(sim_flight):
     """Mean NEES of two dimensions: 2 where it is consistent. On a map that says nothing it is far below."""
-    town = sim_flight.town
-    gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)
 
     def nees(**said):
-        site = OrthoMap.from_arrays(
-            gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=town.surface_m, **said
-        )
-        matcher, squared = SceneMatcher(site, sim_flight.camera, "ncc", "cpu"), []
-        for frame, truth in zip(sim_flight.frames, sim_flight.truth, strict=True):
-            place = site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg)
-            fix = matcher.locate(frame, Prior(east_m=place[0] + 3.0, north_m=place[1] - 2.0, sigma_m=5.0))
-            assert isinstance(fix, Fix)
+        squared = []
+        for fix, _, place in fixes_over(sim_flight, site_of(sim_flight.town, **said)):
             off = np.array([fix.east_m, fix.north_m]) - place
             squared.append(off @ np.linalg.solve(fix.covariance_m2[:2, :2], off))
         return np.mean(squared)
@@ -257,23 +245,26 @@ def test_on_a_map_that_says_it_is_exact_the_errors_fill_the_covariance(sim_fligh
     assert nees() < 0.5 * exact
 
 
+def with_noise(frame, part):
+    """A frame of which a part shows nothing."""
+    image = frame.image.copy()
+    image[part] = np.random.default_rng(0).integers(0, 255, image[part].shape)
+    return replace(frame, image=image)
+
+
 def test_a_picture_of_another_place_keeps_its_fix_or_none(ground, flat_site, camera):
     """Refinement never makes a fix of what is no fix: the other half of the picture is noise."""
-    frame = ground.frame(camera, NADIR, heading_deg=25.0)
-    image = frame.image.copy()
-    image[:, 150:] = np.random.default_rng(0).integers(0, 255, (300, 150))
-    fix = located(flat_site, camera, replace(frame, image=image), ground.prior(NADIR))
-    assert sigmas_off(ground, fix)[1] < 9.0
+    frame = with_noise(ground.frame(camera, NADIR, heading_deg=25.0), np.s_[:, 150:])
+    fix = located(flat_site, camera, frame, ground.prior(NADIR))
+    assert ground.chi_square(fix, NADIR) < 9.0
 
 
 def test_a_tilt_that_nobody_tells_is_refused_and_not_guessed(ground, flat_site, camera):
     """Half of the picture is noise on top of a tilt of 10 degrees: the peak's place is 26 m off."""
-    frame = ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=10.0)
-    image = frame.image.copy()
-    image[150:] = np.random.default_rng(0).integers(0, 255, (150, 300))
-    untold = replace(frame, image=image, roll_deg=None, pitch_deg=None)
-    result = SceneMatcher(flat_site, camera, "ncc", "cpu").locate(untold, ground.prior(NADIR, sigma_m=25))
-    assert isinstance(result, NoFix) or sigmas_off(ground, result)[1] < 9.0
+    frame = with_noise(ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=10.0), np.s_[150:])
+    untold = replace(frame, roll_deg=None, pitch_deg=None)
+    result = located(flat_site, camera, untold, ground.prior(NADIR, sigma_m=25))
+    assert isinstance(result, NoFix) or ground.chi_square(result, NADIR) < 9.0
 
 
 def test_samples_of_the_map_are_taken_once_and_lie_where_the_map_shows_them(flat_site):
@@ -295,10 +286,9 @@ def test_samples_of_the_map_are_taken_once_and_lie_where_the_map_shows_them(flat
 def test_rough_ground_counts_less(ground):
     heights = np.zeros(ground.gray.shape, np.float32)
     heights[200:260, 200:260] = 12.0
-    site = OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=heights)
-    samples = SampleMap(site, PreparedMap(site, torch.device("cpu"), 8).enhanced).find(
-        Window(160, 160, 140, 140), 0
-    )
+    site = ground.map_of(surface_m=heights)
+    enhanced = PreparedMap(site, torch.device("cpu"), 8).enhanced
+    samples = SampleMap(site, enhanced).find(Window(160, 160, 140, 140), 0)
     x, y = site.pixel_from_enu(samples.points_m[:, :2]).T
     wall = (np.minimum(abs(x - 199.5), abs(x - 259.5)) < 1.0) & (y > 203) & (y < 256)
     level = (np.abs(x - 230) > 34) | (np.abs(y - 230) > 34)
@@ -308,16 +298,11 @@ def test_rough_ground_counts_less(ground):
 
 
 @pytest.mark.parametrize(("method", "has_surface"), [("ncc", True), ("ncc", False), ("sift", True)])
-def test_attitudes_are_as_wrong_as_their_covariance_says(sim_flight, sim_site, method, has_surface):
+def test_attitudes_are_as_wrong_as_their_covariance_says(sim_flight, method, has_surface):
     """Normalised squared errors of three angles: 3 in the mean where consistent, less where cautious."""
-    site, town = sim_site, sim_flight.town
-    if not has_surface:
-        gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)
-        site = OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}")
-    matcher, squared = SceneMatcher(site, sim_flight.camera, method, "cpu"), []
-    for frame, truth in zip(sim_flight.frames[::2], sim_flight.truth[::2], strict=True):
-        place = site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg)
-        fix = matcher.locate(frame, Prior(east_m=place[0] + 3.0, north_m=place[1] - 2.0, sigma_m=5.0))
+    squared = []
+    site = site_of(sim_flight.town, surface=has_surface)
+    for fix, truth, _ in fixes_over(sim_flight, site, method, slice(None, None, 2)):
         if not isinstance(fix, Fix) or fix.attitude_covariance_deg2 is None:
             continue  # a peak that was not refined has no whole pose
         off = [fix.attitude.roll_deg - truth.roll_deg, fix.attitude.pitch_deg - truth.pitch_deg,

@@ -49,11 +49,15 @@ def reference(window, valid, templates, min_overlap):
     return masked_tensors.ncc_surface(*tensors, min_overlap=min_overlap)[0].numpy()
 
 
-@pytest.mark.parametrize(("small_px", "min_overlap"), [(0, 0.3001), (1 << 17, 0.8999)])
+@pytest.mark.parametrize("divisions", [(1,), (3,), (16,), None], ids=["whole", "in 3", "in 16", "small"])
+@pytest.mark.parametrize("min_overlap", [0.3001, 0.8999])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("size", "model"), [((230, 317), (48, 61)), ((400, 260), (21, 20)), ((97, 90), (90, 90))])
-def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, model, small_px, monkeypatch):
-    monkeypatch.setattr(masked_blocks, "_SMALL_PX", small_px)
+def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, model, divisions, monkeypatch):
+    """Windows that count as small are neither divided nor scored in two ways."""
+    if divisions is not None:
+        monkeypatch.setattr(masked_blocks, "_SMALL_PX", 0)
+        monkeypatch.setattr(masked_blocks, "_DIVISIONS", divisions)
     window, valid, templates = drawn(kind, size, model)
     window, templates = (values.astype(np.float32).astype(np.float64) for values in (window, templates))
     expected = reference(window, valid, templates, min_overlap)
@@ -63,31 +67,6 @@ def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, mod
         assert scores.dtype == dtype
         np.testing.assert_array_equal(scores == -1.0, expected == -1.0)
         np.testing.assert_allclose(scores, expected, rtol=0, atol=tolerance)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_division_changes_no_score(kind, monkeypatch):
-    window, valid, templates = drawn(kind, (230, 317), (48, 61), mean=40.0)
-    found = []
-    monkeypatch.setattr(masked_blocks, "_SMALL_PX", 0)
-    for divisions in ((1,), (3,), (16,)):
-        monkeypatch.setattr(masked_blocks, "_DIVISIONS", divisions)
-        found.append(masked_blocks.ncc_surface(window[None], valid[None], templates[None], min_overlap=0.5)[0])
-    for other in found[1:]:
-        np.testing.assert_allclose(other, found[0], rtol=0, atol=1e-10)
-
-
-def test_what_is_wholly_valid_is_scored_as_without_a_mask():
-    window, valid, templates = (v.astype(np.float32) for v in drawn("holes", (230, 317), (48, 61)))
-    valid = valid.astype(bool)
-    scores = ncc(window[None], templates[None], search_valid=valid[None])[0]
-    plain = ncc(window[None], templates[None])[0]
-    whole = (
-        cv2.erode(valid.astype(np.uint8), np.ones((48, 61), np.uint8), anchor=(0, 0))[: 230 - 47, : 317 - 60] > 0
-    )
-    assert whole.any()
-    assert not whole.all()
-    np.testing.assert_allclose(scores[:, whole], plain[:, whole], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("level", [0.1, 77.0, -3.3])

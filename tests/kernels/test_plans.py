@@ -4,17 +4,10 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import torch
 
 from engine.kernels import tensors
 from engine.window import place_window, window_size_px
-
-
-def test_window_sides_from_64_to_1024_px_share_61_lengths():
-    lengths = {side: cv2.getOptimalDFTSize(side) for side in range(64, 1025)}
-    assert len(set(lengths.values())) == 61
-    assert max(length / side for side, length in lengths.items()) < 1.11  # what sharing costs
 
 
 def adaptive_windows(count):

@@ -21,12 +21,12 @@ def pixels_of(points, rotation, center):
     return cv2.projectPoints(points.T.copy(), rotvec, shift, MATRIX, None)[0][:, 0].T.copy()
 
 
-def fitted(points, pixels, *, attitude=None, precision=None, turn=(0.02, -0.015, 0.03), shift=(2.0, -1.0, 3.0)):
-    start = cv2.Rodrigues(np.array(turn))[0] @ ROTATION
-    known = np.zeros((3, 3)) if precision is None else precision
+def fitted(points, pixels, *, precision=0.0, min_inliers=6):
+    """From an attitude 2 degrees off and a place 4 m off; the true attitude may be known to a precision."""
+    start = cv2.Rodrigues(np.array([0.02, -0.015, 0.03]))[0] @ ROTATION
     return fit_pose(
-        points, pixels, MATRIX, np.ones(points.shape[1]), start if attitude is None else attitude, known,
-        20.0, 0.1, 6, start, CENTER + shift, 30, 3.0, 4.0, 1e-6,
+        points, pixels, MATRIX, np.ones(points.shape[1]), ROTATION, precision * np.eye(3),
+        20.0, 0.1, min_inliers, start, CENTER + np.array([2.0, -1.0, 3.0]), 30, 3.0, 4.0, 1e-6,
     )  # fmt: skip
 
 
@@ -77,13 +77,10 @@ def test_a_pose_is_found_again_among_wrong_matches(points):
 def test_a_known_attitude_determines_what_two_points_do_not(points):
     few = points[:, :2].copy()
     pixels = pixels_of(few, ROTATION, CENTER)
-    known = 1e8 * np.eye(3)
-    args = (few, pixels, MATRIX, np.ones(2), ROTATION)
-    rest = (20.0, 0.1, 2, ROTATION, CENTER + np.array([1.0, 1.0, -2.0]), 30, 3.0, 4.0, 1e-6)
-    found, _, center, *_ = fit_pose(*args, known, *rest)
+    found, _, center, *_ = fitted(few, pixels, precision=1e8, min_inliers=2)
     assert found
     np.testing.assert_allclose(center, CENTER, atol=1e-3)
-    assert not fit_pose(*args, np.zeros((3, 3)), *rest)[0]
+    assert not fitted(few, pixels, min_inliers=2)[0]
 
 
 def test_too_few_inliers_have_no_pose(points):

@@ -1,13 +1,22 @@
-"""The map that several methods are tested on."""
+"""The map that several methods are tested on, and a frame with its prior."""
 
 import numpy as np
 import pytest
 
-from engine import OrthoMap
+NADIR = np.array([315.0, 296.0])
 
 
 @pytest.fixture(scope="module")
 def site(ground):
-    """The ground with a surface model that says how flat it is: only then is a pose refined."""
-    flat = np.zeros(ground.gray.shape, np.float32)
-    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=flat)
+    return ground.flat_site
+
+
+@pytest.fixture(scope="session")
+def frame(ground, camera):
+    """Taken above pixel (315, 296) of the ground's map."""
+    return ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0, timestamp_ns=77)
+
+
+@pytest.fixture(scope="session")
+def prior(ground):
+    return ground.prior(NADIR)

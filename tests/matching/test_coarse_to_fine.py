@@ -20,6 +20,7 @@ from engine.ncc_fft import match_template, prepare
 from tests.support.towns import drawn_town
 
 KINDS = ("fine", "broad", "mixed", "town", "tiles", "flat")
+DETAIL_PX = {"fine": (0.8, 2.5), "broad": (4.0, 12.0)}
 CASES_A_KIND = 30
 EXCLUSION_PX = (12.0, 5.0)
 
@@ -35,10 +36,8 @@ def town():
 
 
 def ground(rng, kind, size, town):
-    if kind == "fine":
-        return texture(rng, size, rng.uniform(0.8, 2.5))
-    if kind == "broad":
-        return texture(rng, size, rng.uniform(4.0, 12.0))
+    if kind in DETAIL_PX:
+        return texture(rng, size, rng.uniform(*DETAIL_PX[kind]))
     if kind == "mixed":
         return texture(rng, size, 1.5) // 2 + texture(rng, size, 8.0) // 2
     if kind == "town":

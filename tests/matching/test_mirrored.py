@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from engine import Fix, MatcherOptions, NoFix, Reason, SceneMatcher
+from engine import MatcherOptions, NoFix, Reason, SceneMatcher
+from tests.support.fixes import px_off
 from tests.support.ground import Ground
-
-NADIR = np.array([310.0, 305.0])
-ON_AXIS = np.array([319.5, 305.0])
 
 
 class SymmetricalGround(Ground):
@@ -19,29 +16,19 @@ class SymmetricalGround(Ground):
         return super().levels(np.abs(east_m), north_m)
 
 
-@pytest.fixture(scope="module")
-def symmetrical():
-    return SymmetricalGround()
-
-
-NEARLY_NONE = 1e-20  # a risk that leaves nothing beyond doubt
-
-
-def locate(ground, camera, nadir, risk):
-    options = MatcherOptions(risk=risk)
-    return SceneMatcher(ground.site, camera, "sift", "cpu", options).locate(
-        ground.frame(camera, nadir), ground.prior(nadir)
-    )
+def locate(ground, camera, nadir_px, risk):
+    matcher = SceneMatcher(ground.site, camera, "sift", "cpu", MatcherOptions(risk=risk))
+    return matcher.locate(ground.frame(camera, nadir_px), ground.prior(nadir_px))
 
 
 def test_a_frame_of_the_map_beats_its_mirror_image(ground, camera):
-    result = locate(ground, camera, NADIR, NEARLY_NONE)
-    assert isinstance(result, Fix)
-    assert np.hypot(*(np.array(result.map_xy_px) - NADIR)) < 0.3
+    """At a risk that leaves nothing beyond doubt."""
+    nadir_px = np.array([310.0, 305.0])
+    assert px_off(locate(ground, camera, nadir_px, 1e-20), nadir_px) < 0.3
 
 
-def test_a_frame_that_is_its_own_mirror_image_is_refused(symmetrical, camera):
-    result = locate(symmetrical, camera, ON_AXIS, 1e-4)
+def test_a_frame_that_is_its_own_mirror_image_is_refused(camera):
+    result = locate(SymmetricalGround(), camera, np.array([319.5, 305.0]), 1e-4)
     assert isinstance(result, NoFix)
     assert result.reason is Reason.AMBIGUOUS
     assert "the mirrored frame fits the map as well" in result.detail

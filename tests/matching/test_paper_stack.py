@@ -45,11 +45,8 @@ def test_files_that_are_named_are_there():
     text = "".join(f.read_text(encoding="utf-8") for f in FILES)
     for name in re.findall(r"\$\(find scenematch_ros\)/([\w./]+)", text):
         assert (STACK / name).is_file(), name
-    assert set(re.findall(r"model://(\w+)<", text)) == {
-        "iris_with_ardupilot",
-        "iris_with_nadir_camera",
-        "map_ground",
-    }
+    models = {"iris_with_ardupilot", "iris_with_nadir_camera", "map_ground"}
+    assert set(re.findall(r"model://(\w+)<", text)) == models
     for kind in re.findall(r'pkg="scenematch_ros" type="(\w+)"', text):
         assert (STACK / "scripts" / kind).stat().st_mode & 0o111
     installed = (STACK / "CMakeLists.txt").read_text(encoding="utf-8")
@@ -153,10 +150,8 @@ def ground(tmp_path_factory, sim_town):
     """The model of a simulated town, the map that it was made of, and the mesh as a reader of the file has it."""
     module = loaded(STACK / "make_world.py")
     folder = tmp_path_factory.mktemp("world")
-    write_geotiff(folder / "map.tif", sim_town.ortho, sim_town.pixel_to_crs, sim_town.crs_epsg)
-    write_geotiff(
-        folder / "dsm.tif", sim_town.surface_m.astype(np.float32), sim_town.pixel_to_crs, sim_town.crs_epsg
-    )
+    for name, raster in (("map", sim_town.ortho), ("dsm", sim_town.surface_m.astype(np.float32))):
+        write_geotiff(folder / f"{name}.tif", raster, sim_town.pixel_to_crs, sim_town.crs_epsg)
     site = module.write_ground(folder / "map.tif", folder / "dsm.tif", folder / "models", 64)
     return folder / "models" / "map_ground", site
 
@@ -179,8 +174,7 @@ def test_the_ground_is_the_map(ground):
     lon = site.frame.lon_deg + places[:, 0] / scale / np.cos(middle)
     assert np.abs(site.pixel_from_geodetic(lat, lon) - xy).max() < 0.01
     assert np.abs(site.surface_at(xy) - site.ground_m - places[:, 2]).max() < 0.01
-    assert picture.min() == 0.0
-    assert picture.max() == 1.0
+    assert (picture.min(), picture.max()) == (0.0, 1.0)
     a, b, c = (places[faces[:, k], :2] for k in range(3))
     area_m2 = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
     assert (area_m2 > 0).all()  # seen from above
@@ -203,14 +197,13 @@ def test_the_picture_is_the_maps(ground, sim_town):
 @pytest.fixture
 def truth_script(monkeypatch):
     """scripts/truth without ROS."""
-    for name in ("rospy", "geometry_msgs", "nav_msgs", "sensor_msgs", "std_msgs"):
-        monkeypatch.setitem(sys.modules, name, ModuleType(name))
-    for name, classes in (("geometry_msgs", ["Quaternion"]), ("nav_msgs", ["Odometry"]),
-                          ("sensor_msgs", ["Imu", "NavSatFix"]), ("std_msgs", ["Float64"])):  # fmt: skip
-        module = ModuleType(f"{name}.msg")
-        for one in classes:
-            setattr(module, one, SimpleNamespace)
-        monkeypatch.setitem(sys.modules, f"{name}.msg", module)
+    packages = {"rospy": [], "geometry_msgs": ["Quaternion"], "nav_msgs": ["Odometry"],
+                "sensor_msgs": ["Imu", "NavSatFix"], "std_msgs": ["Float64"]}  # fmt: skip
+    for name, classes in packages.items():
+        messages = ModuleType(f"{name}.msg")
+        vars(messages).update(dict.fromkeys(classes, SimpleNamespace))
+        for module in (ModuleType(name), messages):
+            monkeypatch.setitem(sys.modules, module.__name__, module)
     return loaded(STACK / "scripts/truth")
 
 
@@ -232,21 +225,19 @@ def test_the_truths_attitude_is_turned_from_north_west_to_east_north(truth_scrip
 def test_positions_in_a_bag_are_compared_with_its_truth(tmp_path, capsys, monkeypatch):
     types = get_typestore(Stores.ROS1_NOETIC)
     maker = BagMessages(types.types.__getitem__, True)
-    frame = LocalFrame(48.0, 15.0)
+    frame, connections = LocalFrame(48.0, 15.0), {}
+    off_m = {"/truth/fix": 0.0, "/scenematch/fix": 1.5, "/mavros/global_position/global": 6.0}
     with Writer(tmp_path / "flight.bag") as writer:
-
-        def write(topic, message, time_ns, known={}):  # noqa: B006
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, message.__msgtype__, typestore=types)
-            writer.write(known[topic], time_ns, types.serialize_ros1(message, message.__msgtype__))
-
         for k in range(20):
             time_ns = 10**9 + k * 10**8
-            autopilot = "/mavros/global_position/global"
-            for topic, off_m in (("/truth/fix", 0.0), ("/scenematch/fix", 1.5), (autopilot, 6.0)):
-                place = frame.geodetic_from_enu(7.0 * k, off_m)
-                write(topic, maker.position(time_ns, "", *map(float, place), np.eye(3)), time_ns)
-            write("/truth/height_agl", maker.float64(100.0), time_ns)
+            messages = {"/truth/height_agl": maker.float64(100.0)}
+            for topic, north_m in off_m.items():
+                place = map(float, frame.geodetic_from_enu(7.0 * k, north_m))
+                messages[topic] = maker.position(time_ns, "", *place, np.eye(3))
+            for topic, message in messages.items():
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=types)
+                writer.write(connections[topic], time_ns, types.serialize_ros1(message, message.__msgtype__))
     monkeypatch.setattr(sys, "argv", ["compare", str(tmp_path / "flight.bag")])
     loaded(STACK / "scripts/compare").main()
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[1:]]

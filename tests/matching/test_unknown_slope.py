@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, MatcherOptions, OrthoMap, SceneMatcher
+from engine import MatcherOptions, SceneMatcher
 from engine.kernels.dense import Pose
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.options import NccOptions
@@ -47,7 +47,6 @@ def test_exchanging_the_prior_equals_inference_with_each_and_their_mean_by_evide
     pose = Pose(np.eye(3), mean[:3], mean[6:])
     free, _, _ = inferred(measured, 1e6)
     found = over_unknown_slope(pose, covariance, free[:2], HEIGHT_M, 2.0)
-    assert found is not None
     parts = [inferred(measured, tangent(sigma)) for sigma in (0.35, 0.7, 1.4, 2.8)]
     weights = np.array([part[2] for part in parts])
     weights /= weights.sum()
@@ -74,24 +73,25 @@ def test_a_pose_that_is_not_the_peak_s_is_not_confirmed():
 
 @pytest.fixture(scope="module")
 def site(ground):
-    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", georeference_sigma_m=0.1)
+    return ground.map_of(georeference_sigma_m=0.1)
+
+
+def matcher_of(site, camera, refine):
+    return SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=refine)))
 
 
 @pytest.fixture(scope="module")
 def level_fixes(ground, site, camera):
     """Over level ground, by telemetry whose tilt is off as assumed: fix and (2,) error, by peak and refined."""
     frame = ground.frame(camera, NADIR, HEIGHT_M, **TRUE)
-    out = []
-    for refine in (False, True):
-        matcher = SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=refine)))
-        rows = []
+    by_peak, refined = [], []
+    for rows, refine in ((by_peak, False), (refined, True)):
+        matcher = matcher_of(site, camera, refine)
         for roll_deg, pitch_deg in OFF_DEG:
             tilt = {"roll_deg": TRUE["roll_deg"] + roll_deg, "pitch_deg": TRUE["pitch_deg"] + pitch_deg}
             fix = matcher.locate(replace(frame, **tilt), ground.prior(NADIR))
-            assert isinstance(fix, Fix)
-            rows.append((fix, np.array([fix.east_m, fix.north_m]) - ground.enu_from_pixel(NADIR)))
-        out.append(rows)
-    return out
+            rows.append((fix, ground.off_m(fix, NADIR)))
+    return by_peak, refined
 
 
 def test_over_level_ground_a_map_alone_gives_less_than_the_peak_s_error(level_fixes):
@@ -106,19 +106,12 @@ def test_the_refined_fix_states_a_smaller_error_and_keeps_to_it(level_fixes):
     for fix, off in level_fixes[1]:
         assert fix.stage == "refined"
         assert off @ np.linalg.solve(fix.relative_covariance_m2, off) < 9.0
-        assert fix.up_m is not None
         assert abs(fix.up_m - HEIGHT_M) < 3.0 * np.sqrt(fix.covariance_m2[2, 2])
 
 
 @pytest.mark.parametrize("shape", [plane, hill])
 def test_over_slopes_the_peak_s_fix_stands(ground, site, camera, shape):
     frame, _ = seen(ground, camera, shape)
-    nadir_prior = ground.prior(np.array([315.0, 296.0]))
-    fixes = []
-    for refine in (False, True):
-        matcher = SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=refine)))
-        fixes.append(matcher.locate(frame, nadir_prior))
-    peak, fix = fixes
-    assert isinstance(peak, Fix)
-    assert isinstance(fix, Fix)
+    prior = ground.prior(np.array([315.0, 296.0]))
+    peak, fix = (matcher_of(site, camera, refine).locate(frame, prior) for refine in (False, True))
     assert off_m(ground, fix) < off_m(ground, peak) + 0.5

@@ -31,7 +31,7 @@ def picture(height: int, width: int, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(image.clip(0, 1))[None]
 
 
-@pytest.fixture(scope="module", params=[(64, 80), (33, 121), (150, 149), (12, 12)], ids=str)
+@pytest.fixture(scope="module", params=[(64, 80), (33, 121), (150, 149), (3, 60)], ids=str)
 def shape(request):
     return request.param
 
@@ -98,16 +98,6 @@ def test_angles_and_descriptors_are_those_of_the_reference(plan, both, turn_rad)
     ]
     got = loops.describe(buffer, rows, turns.astype(np.float32), plan)
     np.testing.assert_allclose(got, np.array(described).reshape(-1, 128), atol=3e-4)
-
-
-def test_a_filter_at_the_edge_has_the_weight_of_one_inside():
-    """A picture of one grey level keeps it, at every level, also where it is a few pixels wide."""
-    for inputs in (3, 12, 40):
-        for upsample in (1, 2):
-            plan = loops.plan_loops(inputs, 60, upsample)
-            levels, _ = loops.detect(np.full((inputs, 60), 0.7, np.float32), plan, 0.02)
-            for level in shaped(levels, plan):
-                np.testing.assert_allclose(level, 0.7, atol=2e-6)
 
 
 def test_directions_are_the_arc_tangents():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from engine.errors import OptionError
 from engine.features import Features, match
 from engine.sift import matching, matching_tensors
 from engine.sift.values import fields_of
@@ -29,6 +30,10 @@ def described(count, seed, *, like=None):
     )
 
 
+def all_valid(features):
+    return replace(features, valid=torch.ones_like(features.valid))
+
+
 def plainly(query, train, ratio, turn_deg, most_deg, scale, factor):
     """Pair by pair, in float64: nearest, ratio and mutual test among the pairs that are allowed."""
     q, t = query.descriptors[0].double().numpy(), train.descriptors[0].double().numpy()
@@ -48,38 +53,35 @@ def plainly(query, train, ratio, turn_deg, most_deg, scale, factor):
     return pairs
 
 
+def by_tensor_ops(query, train, *, ratio=0.8, rotation_deg=0.0, max_angle_diff_deg=None, scale=1.0,
+                  max_scale_factor=None):  # fmt: skip
+    """As on a device."""
+    limits = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor)
+    return matching_tensors.match_tensors(query, train, limits, ratio)
+
+
+WAYS = pytest.mark.parametrize("way", [match, by_tensor_ops], ids=["loops", "tensor ops"])
+
+
+@WAYS
 @pytest.mark.parametrize("chunk", [7, 64, 4096])
-@pytest.mark.parametrize(("most_deg", "factor"), [(180.0, 1e9), (60.0, 1e9), (180.0, 1.5), (75.0, 2.0)])
-def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, chunk, most_deg, factor):
-    monkeypatch.setattr(matching, "TRAIN_CHUNK", chunk)
+@pytest.mark.parametrize(
+    ("ratio", "most_deg", "factor"),
+    [(1.0, None, None), (0.9, None, None), (0.9, 60.0, None), (0.9, None, 1.5), (0.9, 75.0, 2.0)],
+)
+def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, way, chunk, ratio, most_deg, factor):
+    """Of one frame with two parts of the map."""
+    for module in (matching, matching_tensors):
+        monkeypatch.setattr(module, "TRAIN_CHUNK", chunk)
     query = described(60, 1)
-    train = described(333, 2, like=query)
-    found = match(
-        query, train, ratio=0.9, rotation_deg=20.0, max_angle_diff_deg=most_deg, scale=1.2, max_scale_factor=factor
-    )
-    expected = plainly(query, train, 0.9, 20.0, most_deg, 1.2, factor)
-    assert len(expected) > 3
-    assert [tuple(pair) for pair in pairs_of(found)] == expected
-
-
-@pytest.mark.parametrize(("most_deg", "factor"), [(None, None), (60.0, None), (None, 1.5), (75.0, 2.0)])
-@pytest.mark.parametrize("batch", [1, 3])
-def test_the_loops_find_what_the_tensor_ops_find(batch, most_deg, factor):
-    query = described(50, 3)
-    trains = [described(90, seed, like=query) for seed in range(batch)]
+    trains = [described(333, seed, like=query) for seed in (2, 3)]
     train = Features(*(torch.cat(values) for values in zip(*map(fields_of, trains), strict=True)))
-    limits = (20.0, most_deg, 1.2, factor)
-    found = matching._nearest_by_loops(matching._as_arrays(query), matching._as_arrays(train), limits)
-    got, expected = tuple(map(torch.from_numpy, found)), matching_tensors._nearest(query, train, limits)
-    allowed = expected[0] > -2.0
-    assert allowed.sum() > 20 * batch
-    assert_close(got[0][allowed], expected[0][allowed])
-    assert torch.equal(got[1][allowed], expected[1][allowed])
-    assert torch.equal(got[3][allowed], expected[3][allowed])
-    assert (got[0][~allowed] < -2.0).all()
-    two = expected[2] > -2.0
-    assert_close(got[2][two], expected[2][two])
-    assert (got[2][~two] < -2.0).all()
+    limits = {"rotation_deg": 20.0, "max_angle_diff_deg": most_deg, "scale": 1.2, "max_scale_factor": factor}
+    found = way(query, train, ratio=ratio, **limits)
+    for element, part in enumerate(trains):
+        expected = plainly(query, part, ratio, 20.0, most_deg or 180.0, 1.2, factor or 1e9)
+        assert len(expected) > 3
+        assert [tuple(pair) for pair in pairs_of(found, element)] == expected
 
 
 @pytest.mark.parametrize("kind", [torch.float64, torch.float16])
@@ -105,3 +107,45 @@ def test_nothing_matches_a_map_without_features():
     empty = described(0, 3)
     assert pairs_of(match(described(5, 1), empty)) == []
     assert pairs_of(match(empty, described(5, 1))) == []
+
+
+@WAYS
+def test_distances_are_those_of_the_pairs(way):
+    query = all_valid(described(70, 1))
+    train = all_valid(described(90, 2, like=query))
+    found = way(query, train)
+    full = torch.cdist(query.descriptors, train.descriptors)
+    assert_close(found.distance, full.amin(2), atol=1e-4, rtol=1e-4)
+    two = full.topk(2, largest=False).values
+    assert_close(found.ratio, two[..., 0] / two[..., 1], atol=1e-4, rtol=1e-4)
+
+
+def test_invalid_slots_never_match():
+    query = all_valid(described(70, 1))
+    train = described(90, 2, like=query)
+    blind = replace(train, valid=torch.zeros_like(train.valid))
+    assert not match(query, blind).valid.any()
+    assert not match(blind, query).valid.any()
+    assert pairs_of(match(query, replace(train, valid=torch.arange(90)[None] == 10))) == [[10, 10]]
+
+
+@pytest.mark.parametrize("stored", [torch.float32, torch.float16], ids=str)
+def test_of_two_alike_neither_is_matched(stored):
+    """Nothing tells which of them is right, also where rounding puts one at 0 and the other a hair off."""
+    query = all_valid(described(300, 4))
+    first = query.descriptors.to(stored).float()
+    twins = Features(*(torch.cat([values, values], dim=1) for values in fields_of(query)))
+    twins = replace(twins, descriptors=torch.cat([first, torch.nextafter(first, torch.ones(()))], dim=1))
+    found = match(query, twins)
+    assert found.distance.max() < 0.02
+    assert not found.valid.any()
+    assert_close(found.ratio, torch.ones(1, 300), atol=0.1, rtol=0)
+    lone = match(query, replace(twins, valid=torch.arange(600)[None] < 300))
+    assert lone.valid.all()
+    assert lone.ratio.max() < 0.05
+    assert pairs_of(lone) == [[n, n] for n in range(300)]
+
+
+def test_a_wrong_ratio_is_named():
+    with pytest.raises(OptionError, match="ratio"):
+        match(described(5, 1), described(5, 1), ratio=1.5)

@@ -1,4 +1,4 @@
-"""Fixes for tests that need one, whatever it says."""
+"""Fixes for tests that need one, whatever it says, and what is asked of one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from engine import Fix, Timings, Window
+from engine import Fix, NoFix, Timings, Window
 
 
 def a_fix(east_m: float = 0.0, north_m: float = 0.0, sigma_m: float = 1.0, **stated: Any) -> Fix:
@@ -17,3 +17,17 @@ def a_fix(east_m: float = 0.0, north_m: float = 0.0, sigma_m: float = 1.0, **sta
         "window": Window(0, 0, 1, 1), "timings": Timings(), "map_xy_px": (0.0, 0.0),
     }  # fmt: skip
     return Fix(**(usual | stated))
+
+
+def px_off(fix: Fix | NoFix, nadir_px: Any) -> float:
+    """How many map pixels a fix lies off the place that its frame was taken above."""
+    assert isinstance(fix, Fix), fix
+    return float(np.hypot(*(np.array(fix.map_xy_px) - nadir_px)))
+
+
+def values_of(result: Fix | NoFix) -> tuple[Any, ...]:
+    """Everything in an answer that does not tell the time."""
+    if isinstance(result, NoFix):
+        return result.timestamp_ns, result.reason, result.detail, result.score, result.window, result.method
+    place = (result.lat_deg, result.lon_deg, result.up_m, result.map_xy_px, result.covariance_m2.tolist())
+    return result.timestamp_ns, *place, result.score, result.window, result.stage, result.confidence

@@ -14,7 +14,7 @@ import numpy as np
 from pyproj import Transformer
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from engine import Camera, Frame, OrthoMap, Prior
+from engine import Camera, Fix, Frame, OrthoMap, Prior
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 """The paper's: straight down."""
@@ -33,8 +33,8 @@ def body_axes(roll_deg, pitch_deg, heading_deg):
     return forward, right, down
 
 
-def ground_hits(camera, xy_px, height_m, *, roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0):
-    """East and north (..., 2) in metres from the nadir where the rays of pixels (..., 2) meet flat ground.
+def rays_of(camera, xy_px, *, roll_deg=0.0, pitch_deg=0.0, heading_deg=0.0):
+    """Rays (..., 3) of pixels (..., 2) in east-north-up.
 
     The camera hangs below the body and its picture's top points to the nose: right in the picture is right of
     the body, down in the picture is to the tail, into the picture is down.
@@ -42,8 +42,12 @@ def ground_hits(camera, xy_px, height_m, *, roll_deg=0.0, pitch_deg=0.0, heading
     forward, right, down = body_axes(roll_deg, pitch_deg, heading_deg)
     x = (np.asarray(xy_px, float)[..., 0] - camera.matrix[0, 2]) / camera.matrix[0, 0]
     y = (np.asarray(xy_px, float)[..., 1] - camera.matrix[1, 2]) / camera.matrix[1, 1]
-    ray = down + x[..., None] * right - y[..., None] * forward
-    return ray[..., :2] * (height_m / -ray[..., 2:])
+    return down + x[..., None] * right - y[..., None] * forward
+
+
+def pixels_of(rows, columns):
+    """(H, W, 2) x and y of every pixel."""
+    return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
 
 
 @lru_cache(maxsize=8)
@@ -110,21 +114,31 @@ class Ground:
 
     @cached_property
     def gray(self):
-        rows, columns = self.size
-        x, y = np.meshgrid(np.arange(columns), np.arange(rows))
-        enu = self.enu_from_pixel(np.stack([x, y], axis=-1))
-        return np.clip(np.rint(self.levels(enu[..., 0], enu[..., 1])), 0, 255).astype(np.uint8)
+        return self.seen_at(self.enu_from_pixel(pixels_of(*self.size)))
+
+    def map_of(self, gray=None, **more):
+        """Its map, or one of another picture in its place, with what more there is of it."""
+        gray = self.gray if gray is None else gray
+        return OrthoMap.from_arrays(gray, self.pixel_to_crs, f"EPSG:{self.epsg}", **more)
 
     @cached_property
     def site(self):
-        return OrthoMap.from_arrays(self.gray, self.pixel_to_crs, f"EPSG:{self.epsg}")
+        return self.map_of()
+
+    @cached_property
+    def flat_site(self):
+        """With a surface model that says how flat it is: only then is a pose refined."""
+        return self.map_of(surface_m=np.zeros(self.size, np.float32))
+
+    def seen_at(self, enu_m):
+        """A picture (H, W) of the places (H, W, 2) that its pixels show."""
+        return np.clip(np.rint(self.levels(enu_m[..., 0], enu_m[..., 1])), 0, 255).astype(np.uint8)
 
     def picture(self, camera, nadir_px, height_m, **attitude):
         """What the camera sees above a map pixel (x, y): one ray a pixel, onto flat ground."""
-        x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-        hits = ground_hits(camera, np.stack([x, y], axis=-1), height_m, **attitude)
-        hits = hits + self.enu_from_pixel(nadir_px)
-        return np.clip(np.rint(self.levels(hits[..., 0], hits[..., 1])), 0, 255).astype(np.uint8)
+        rays = rays_of(camera, pixels_of(camera.height_px, camera.width_px), **attitude)
+        hits = rays[..., :2] * (height_m / -rays[..., 2:])
+        return self.seen_at(hits + self.enu_from_pixel(nadir_px))
 
     def frame(self, camera, nadir_px, height_m=150.0, *, timestamp_ns=0, **attitude):
         """The picture with the telemetry that is true of it."""
@@ -136,3 +150,13 @@ class Ground:
         """A prior some metres off a map pixel."""
         east, north = self.enu_from_pixel(nadir_px) + off_m
         return Prior(east_m=float(east), north_m=float(north), sigma_m=sigma_m)
+
+    def off_m(self, fix, nadir_px):
+        """(2,) metres east and north of a map pixel."""
+        assert isinstance(fix, Fix), fix
+        return np.array([fix.east_m, fix.north_m]) - self.enu_from_pixel(nadir_px)
+
+    def chi_square(self, fix, nadir_px):
+        """The squared error of a fix in sigmas of its own, of two degrees of freedom."""
+        off_m = self.off_m(fix, nadir_px)
+        return float(off_m @ np.linalg.solve(fix.covariance_m2[:2, :2], off_m))

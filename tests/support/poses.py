@@ -1,4 +1,4 @@
-"""Matches with a known pose and matches with none, drawn, and what the solver makes of many of them."""
+"""Matches with a known pose and matches with none, drawn."""
 
 from __future__ import annotations
 
@@ -10,21 +10,19 @@ from functools import cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
 
 from engine import Camera
-from engine.matching.pose import AttitudePrior, solve_pose
+from engine.matching.pose import AttitudePrior
 
 Array = NDArray[np.float64]
 Matches = tuple[Array, Array]  # (N, 3) metres, (N, 2) pixels
 
 SIZE_PX = 300
 CAMERA = Camera(SIZE_PX, SIZE_PX, np.array([[259.8, 0, 149.5], [0, 259.8, 149.5], [0, 0, 1]]))
-CHI2_3_SIGMA = float(chi2.ppf(norm.cdf(3) - norm.cdf(-3), 3))  # three degrees of freedom, 99.73 %
 GROUNDS = ("planar nadir", "tilted", "high relief", "distorted")
 
 
-@dataclass(frozen=True)
+@dataclass
 class Scene:
     """Matches of a camera whose pose is known; some of them are wrong."""
 
@@ -32,27 +30,50 @@ class Scene:
     points_px: Array
     rotation: Array
     center_m: Array
-    prior: AttitudePrior | None
+    wrong: NDArray[np.bool_]
 
 
-def scene(rng: np.random.Generator, ground: str, *, with_prior: bool) -> Scene:
-    """A camera 60 to 300 m up, 15 to 300 matches, noise of 0.3 to 1 px, up to 60 % of them wrong."""
-    height_m, count = rng.uniform(60, 300), int(rng.integers(15, 301))
-    noise_px, wrong = rng.uniform(0.3, 1.0), rng.uniform(0, 0.6)
-    tilt_deg = rng.uniform(10, 30) if ground == "tilted" else rng.uniform(0, 3)
-    rotation = attitude(rng, tilt_deg)
-    center = np.array([*rng.uniform(-50, 50, 2), height_m])
-    pixels = rng.uniform(0, SIZE_PX - 1, (count, 2))
-    rays = np.c_[pixels, np.ones(count)] @ np.linalg.inv(CAMERA.matrix).T @ rotation
-    heights = np.zeros(count)
-    if ground == "high relief":  # streets, and roofs up to 40 m
-        heights = np.where(rng.random(count) < 0.5, rng.uniform(5, 40, count), 0.0)
+def scene(
+    rng: np.random.Generator, count: int = 60, *, noise_px: float = 0.0, wrong: float = 0.0, relief_m: float = 0.0,
+    tilt_deg: float = 3.0, height_m: float = 150.0, matrix: Array = CAMERA.matrix, is_distorted: bool = False,
+) -> Scene:  # fmt: skip
+    """Points all over the image of a camera that is tilted to any side, half of them on the ground.
+
+    Args:
+        rng: what it is drawn with.
+        count: of matches.
+        noise_px: of a pixel.
+        wrong: share of the matches that point anywhere.
+        relief_m: height of the highest roofs.
+        tilt_deg: off the vertical.
+        height_m: above the ground.
+        matrix: of the camera.
+        is_distorted: whether the pixels went through a lens and back.
+    """
+    rotation, center = attitude(rng, tilt_deg), np.array([*rng.uniform(-50, 50, 2), height_m])
+    pixels = _image_points(rng, count)
+    rays = np.c_[pixels, np.ones(count)] @ np.linalg.inv(matrix).T @ rotation
+    heights = np.where(rng.random(count) < 0.5, rng.uniform(0, relief_m, count), 0.0)
     points = center + rays * ((heights - height_m) / rays[:, 2])[:, None]
     noise = rng.normal(0, noise_px, pixels.shape)
-    pixels = through_the_lens(pixels, noise) if ground == "distorted" else pixels + noise
-    astray = rng.random(count) < wrong
-    pixels[astray] = rng.uniform(0, SIZE_PX - 1, (int(astray.sum()), 2))
-    return Scene(points, pixels, rotation, center, measured(rng, rotation) if with_prior else None)
+    pixels = through_the_lens(pixels, noise) if is_distorted else pixels + noise
+    astray = rng.permutation(count) < round(wrong * count)
+    pixels[astray] = _image_points(rng, int(astray.sum()))
+    return Scene(points, pixels, rotation, center, astray)
+
+
+def any_scene(rng: np.random.Generator, ground: str) -> Scene:
+    """A camera 60 to 300 m up, 15 to 300 matches, noise of 0.3 to 1 px, up to 60 % of them wrong."""
+    return scene(
+        rng,
+        int(rng.integers(15, 301)),
+        noise_px=rng.uniform(0.3, 1.0),
+        wrong=rng.uniform(0, 0.6),
+        relief_m=40.0 if ground == "high relief" else 0.0,
+        tilt_deg=rng.uniform(10, 30) if ground == "tilted" else rng.uniform(0, 3),
+        height_m=rng.uniform(60, 300),
+        is_distorted=ground == "distorted",
+    )
 
 
 def attitude(rng: np.random.Generator, tilt_deg: float) -> Array:
@@ -142,25 +163,16 @@ def _repeated(rng: np.random.Generator) -> Matches:
     return points[index], pixels[index] + jitter
 
 
-def _one_to_many(rng: np.random.Generator) -> Matches:
-    """A few map points that many points of the frame take for theirs."""
-    count = int(rng.integers(10, 150))
-    return _map_points(rng, max(count // 6, 3), 20.0)[rng.integers(0, max(count // 6, 3), count)], _image_points(
-        rng, count
-    )
+def _shared(of: str) -> Callable[[np.random.Generator], Matches]:
+    """A few points of the map, or of the frame, are each matched to many of the other."""
 
+    def draw(rng: np.random.Generator) -> Matches:
+        count = int(rng.integers(10, 150))
+        few = rng.integers(0, max(count // 6, 3), count)
+        points, pixels = _map_points(rng, count, 20.0), _image_points(rng, count)
+        return (points[few], pixels) if of == "map" else (points, pixels[few])
 
-def _many_to_one(rng: np.random.Generator) -> Matches:
-    """A few points of the frame, each matched to many of the map."""
-    count = int(rng.integers(10, 150))
-    pixels = _image_points(rng, max(count // 6, 3))[rng.integers(0, max(count // 6, 3), count)]
-    return _map_points(rng, count, 20.0), pixels
-
-
-def _permuted(rng: np.random.Generator) -> Matches:
-    """The right points of both, in the wrong pairs."""
-    points, pixels = _seen(rng, _map_points(rng, int(rng.integers(10, 200)), rng.choice([0.0, 30.0])))
-    return points, rng.permutation(pixels)
+    return draw
 
 
 def _periodic(rng: np.random.Generator) -> Matches:
@@ -170,9 +182,8 @@ def _periodic(rng: np.random.Generator) -> Matches:
     cells = rng.integers(0, int(SIZE_PX / period_px) + 1, (count, 2)) * period_px
     on_map = rng.integers(0, int(200 / period_m) + 1, (count, 2)) * period_m - 100
     jitter = rng.uniform(0, 1)
-    return np.c_[on_map + rng.normal(0, 0.7 * jitter, (count, 2)), np.zeros(count)], cells + rng.normal(
-        0, jitter, (count, 2)
-    )
+    on_map = on_map + rng.normal(0, 0.7 * jitter, (count, 2))
+    return np.c_[on_map, np.zeros(count)], cells + rng.normal(0, jitter, (count, 2))
 
 
 def _false_cluster(rng: np.random.Generator) -> Matches:
@@ -187,73 +198,10 @@ def _false_cluster(rng: np.random.Generator) -> Matches:
     return np.r_[points, np.c_[on_map, np.zeros(count)]], np.r_[pixels, noisy]
 
 
-def _seen(rng: np.random.Generator, points: Array) -> Matches:
-    """Those of the map points that a camera 150 m up sees, and where."""
-    rotation = attitude(rng, rng.uniform(0, 10))
-    x = (points - [0, 0, 150.0]) @ rotation.T
-    pixels = (x @ CAMERA.matrix.T)[:, :2] / x[:, 2:]
-    inside = ((pixels >= 0) & (pixels <= SIZE_PX - 1)).all(axis=1)
-    return points[inside], pixels[inside]
-
-
 WRONG: dict[str, Callable[[np.random.Generator], Matches]] = {
     "plane": _anywhere(10, 150, 0.0), "relief": _anywhere(10, 150, 40.0), "4 to 10": _anywhere(4, 11, 0.0, 40.0),
     "200 to 300": _anywhere(200, 301, 0.0, 40.0), "clustered": _clustered,
-    "on a road": _line, "repeated": _repeated, "one to many": _one_to_many, "many to one": _many_to_one,
-    "permuted": _permuted, "another period": _periodic, "a false cluster": _false_cluster,
+    "on a road": _line, "repeated": _repeated, "one to many": _shared("map"), "many to one": _shared("frame"),
+    "another period": _periodic, "a false cluster": _false_cluster,
 }  # fmt: skip
 """Ways to draw matches that no pose explains."""
-
-
-# ------------------------------------------------------------------------------------------- many of them
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """How errors lie within their covariance, over the frames that gave a pose."""
-
-    cases: int
-    accepted: int
-    off: int  # accepted more than 10 m and 3 sigma off
-    within: float  # share within 3 sigma in the sense of Mahalanobis, of the centre
-    within_axis: float  # the same, the worst of east, north and up
-    nees: float  # mean; 3 is consistent
-    within_turn: float  # of the attitude
-    nees_turn: float
-
-
-def accepted(kind: str, sets: int, seed: int) -> int:
-    """How many sets of wrong matches gave a pose; every other one comes with telemetry."""
-    rng, count = np.random.default_rng([seed, list(WRONG).index(kind)]), 0
-    for i in range(sets):
-        points, pixels = WRONG[kind](rng)
-        prior = measured(rng, attitude(rng, rng.uniform(0, 10))) if i % 2 else None
-        count += solve_pose(points, pixels, CAMERA.matrix, prior=prior) is not None
-    return count
-
-
-def coverage(ground: str, with_prior: bool, cases: int, seed: int) -> Coverage:
-    """Errors of many simulated frames against their own covariance."""
-    rng, rows = np.random.default_rng([seed, GROUNDS.index(ground), with_prior]), []
-    for _ in range(cases):
-        s = scene(rng, ground, with_prior=with_prior)
-        pose = solve_pose(s.points_m, s.points_px, CAMERA.matrix, prior=s.prior)
-        if pose is None:
-            continue
-        error = pose.center_m - s.center_m
-        turn = cv2.Rodrigues(s.rotation @ pose.rotation.T)[0][:, 0]
-        within = np.abs(error) < 3 * np.sqrt(np.diag(pose.covariance_center_m2))
-        nees = error @ np.linalg.solve(pose.covariance_center_m2, error)
-        off = nees > CHI2_3_SIGMA and np.linalg.norm(error) > 10
-        rows.append([nees, turn @ np.linalg.solve(pose.covariance[3:, 3:], turn), off, *within])
-    table = np.array(rows, dtype=float)
-    return Coverage(
-        cases=cases,
-        accepted=len(table),
-        off=int(table[:, 2].sum()),
-        within=float(np.mean(table[:, 0] < CHI2_3_SIGMA)),
-        within_axis=float(table[:, 3:].mean(axis=0).min()),
-        nees=float(table[:, 0].mean()),
-        within_turn=float(np.mean(table[:, 1] < CHI2_3_SIGMA)),
-        nees_turn=float(table[:, 1].mean()),
-    )

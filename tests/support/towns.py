@@ -47,11 +47,11 @@ def _drawn(options: tuple[tuple[str, Any], ...]) -> Town:
     return pickle.loads(path.read_bytes())
 
 
-def site_of(town, *, surface=True):
-    """The map that a simulated town is photographed as."""
+def site_of(town, *, surface=True, **said):
+    """The map that a simulated town is photographed as, and what it says of its own errors."""
     gray = cv2.cvtColor(town.ortho, cv2.COLOR_RGB2GRAY)
     heights = town.surface_m if surface else None
-    return OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=heights)
+    return OrthoMap.from_arrays(gray, town.pixel_to_crs, f"EPSG:{town.crs_epsg}", surface_m=heights, **said)
 
 
 def under_map(town, raster):
