@@ -234,7 +234,7 @@ def test_a_bias_within_what_the_frame_states_of_itself_is_left():
 def test_the_baseline_takes_telemetry_as_it_is():
     _, frames = flown((0.0, 0.0, -6.0), lag_s=0.1, options=ACCEPT_ALL)
     for k, frame in enumerate(frames):
-        stated = angles(k * INTERVAL_S - 0.1) + [0.0, 0.0, -6.0]
+        stated = np.add(angles(k * INTERVAL_S - 0.1), [0.0, 0.0, -6.0])
         assert errors_of(frame, stated) == pytest.approx([0.0] * 3)
         assert (frame.tilt_sigma_deg or ASSUMED.tilt_deg) == pytest.approx(ASSUMED.tilt_deg)
 
