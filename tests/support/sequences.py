@@ -55,16 +55,6 @@ class Step:
     telemetry: str
 
 
-def random_steps(rng: np.random.Generator, count: int) -> list[Step]:
-    """Steps of which so many, drawn once for all, are as they should be in each respect."""
-    right = rng.choice([0.3, 0.8, 0.95])
-
-    def word(words: Sequence[str]) -> str:
-        return words[0] if rng.random() < right else str(rng.choice(words))
-
-    return [Step(*map(word, (IMAGES, STAMPS, PRIORS, TELEMETRY))) for _ in range(count)]
-
-
 class Ground:
     """A tiny map with its matchers, and the frames that are taken over it."""
 
