@@ -3,6 +3,7 @@
 import pickle
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -108,22 +109,19 @@ def test_a_cell_of_loftr_lies_on_its_eighth_pixel():
         assert (touched[0] + touched[-1]) / 2 == 8 * cell
 
 
-class Corners(nn.Module):
-    """Stands for DISK: keypoints at given pixels."""
+def corners(*points):
+    """Stands for DISK: keypoints at given pixels of one picture after the other."""
+    left = list(points)
 
-    def __init__(self, points):
-        super().__init__()
-        self.points = points
-
-    def forward(self, images, n, pad_if_not_divisible):
+    def network(images, n, pad_if_not_divisible):
         assert pad_if_not_divisible
         assert images.shape[1] == 3
-        points = self.points.pop(0)
-        features = type("Features", (), {})()
-        features.keypoints = torch.tensor(points).reshape(-1, 2)
-        features.descriptors = torch.ones(len(points), 128)
-        features.detection_scores = torch.arange(len(points), 0, -1)
-        return [features]
+        at = left.pop(0)
+        strength, descriptors = torch.arange(len(at), 0, -1), torch.ones(len(at), 128)
+        keypoints = torch.tensor(at).reshape(-1, 2)
+        return [SimpleNamespace(keypoints=keypoints, descriptors=descriptors, detection_scores=strength)]
+
+    return network
 
 
 class Reversed(nn.Module):
@@ -142,9 +140,9 @@ class Reversed(nn.Module):
 
 
 def test_sparse_points_come_back_in_pairs_and_unmoved():
-    points = [[[0.0, 0.0], [5.0, 6.0], [9.0, 3.0]], [[1.0, 1.0], [20.0, 30.0], [40.0, 7.0]]]
+    points = [[0.0, 0.0], [5.0, 6.0], [9.0, 3.0]], [[1.0, 1.0], [20.0, 30.0], [40.0, 7.0]]
     lightglue = Reversed()
-    matcher = KeypointMatcher(Disk(Corners(points)), lightglue, 2048)
+    matcher = KeypointMatcher(Disk(corners(*points)), lightglue, 2048)
     first, second = matcher(torch.zeros(1, 1, 45, 61), torch.zeros(1, 1, 50, 70))
     assert first.tolist() == [[0, 0], [5, 6]]
     assert second.tolist() == [[40, 7], [20, 30]]
@@ -152,7 +150,7 @@ def test_sparse_points_come_back_in_pairs_and_unmoved():
 
 
 def test_nothing_found_is_no_match():
-    matcher = KeypointMatcher(Disk(Corners([[[0.0, 0.0]], []])), Reversed(), 2048)
+    matcher = KeypointMatcher(Disk(corners([[0.0, 0.0]], [])), Reversed(), 2048)
     first, second = matcher(torch.zeros(1, 1, 45, 61), torch.zeros(1, 1, 50, 70))
     assert first.shape == second.shape == (0, 2)
 
@@ -304,7 +302,6 @@ def test_wrong_arguments_are_named(files):
         matcher(good, good.expand(2, -1, -1, -1))
     with pytest.raises(DtypeError, match="crop: expected floating point"):
         matcher(good, good.to(torch.uint8))
-    with pytest.raises(OptionError, match="min_confidence"):
-        load_matcher([files / "loftr.ckpt"], min_confidence=1.5)
-    with pytest.raises(OptionError, match="max_keypoints"):
-        load_matcher([files / "disk.pth", files / "lightglue.pth"], max_keypoints=1)
+    for name, value in (("min_confidence", 1.5), ("max_keypoints", 1)):
+        with pytest.raises(OptionError, match=name):
+            load_matcher([files / "loftr.ckpt"], **{name: value})
