@@ -70,12 +70,6 @@ def covered(_):
     return NoFix(reason=Reason.NO_TEXTURE)
 
 
-def test_true_fixes_are_trusted_with_and_without_a_measured_velocity():
-    flight = Flight()
-    assert all(flight.fly(20.0, true))
-    assert all(flight.fly(20.0, true, velocity=False))
-
-
 @pytest.mark.parametrize("cover_s", [5.0, 10.0, 20.0])
 def test_the_first_fix_after_a_covered_camera_is_trusted(flight, cover_s):
     flight.fly(min(cover_s, 7.0), covered)
@@ -92,10 +86,15 @@ def test_a_map_that_shifts_in_flight_is_never_followed_however_long_it_agrees_wi
     assert flight.guard.is_disputed
 
 
-def test_matches_that_return_to_the_track_end_the_dispute(flight):
-    assert not any(flight.fly(2.0, lambda east_m: refused(shifted(east_m))))
+@pytest.mark.parametrize(
+    ("seconds", "wrong"),
+    [(2.0, lambda east_m: refused(shifted(east_m))), (0.3, lambda east_m: fix(east_m + 30.0))],
+    ids=["refused for long", "three fixes"],
+)
+def test_matches_that_return_to_the_track_end_the_dispute(flight, seconds, wrong):
+    assert not any(flight.fly(seconds, wrong))
     answers = flight.fly(1.0, true)
-    assert answers[:2] == [False, False]
+    assert not any(answers[:2])
     assert all(answers[3:])
 
 
@@ -178,13 +177,6 @@ def test_a_map_that_shifts_is_not_explained_by_a_velocity_that_is_known_to_be_wr
     assert all(flight.fly(5.0, true, off_mps=4.3))
     assert not any(flight.fly(20.0, shifted, off_mps=4.3))
     assert not any(flight.fly(20.0, shifted, off_mps=8.0))
-
-
-def test_a_jump_of_three_frames_is_not_sent_and_forgotten(flight):
-    assert not any(flight.fly(0.3, lambda east_m: fix(east_m + 30.0)))
-    answers = flight.fly(1.0, true)
-    assert not any(answers[:2])
-    assert all(answers[2:])
 
 
 @pytest.mark.parametrize(("sigma_mps", "contradicts"), [(None, True), (0.1, True), (5.0, False)])
