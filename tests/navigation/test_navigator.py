@@ -131,13 +131,6 @@ def test_the_tighter_of_its_own_prediction_and_a_given_prior_is_used(sigma_m, us
     assert (matcher.priors[1] == given) == used
 
 
-def test_a_given_prior_is_used_where_it_knows_nothing_itself(sim_site):
-    matcher = script(None, site=sim_site)
-    given = Prior(lat_deg=48.0, lon_deg=15.0, sigma_m=900.0)
-    Navigator(matcher).update(at(0.0), given)
-    assert matcher.priors == [replace(given, sigma_m=math.hypot(900.0, 3.0))]  # of a map that states nothing
-
-
 # Belief
 
 
