@@ -54,14 +54,6 @@ def test_what_opencv_writes_is_read_to_the_last_digit(tmp_path, suffix, shape):
     np.testing.assert_array_equal(read.mount, mount_rotation())
 
 
-def test_the_first_line_of_older_opencv_is_no_hindrance(tmp_path):
-    path = opencvs(tmp_path / "camera.yml", **SAMPLES)
-    text = path.read_text(encoding="utf-8")
-    older = "%YAML:1.0\n---\n" + text.split("---\n", 1)[1]
-    path.write_text(older, encoding="utf-8")
-    np.testing.assert_array_equal(Camera.load(path).matrix, K)
-
-
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
 def test_names_of_the_tutorials_and_a_mount(tmp_path, suffix):
     path = opencvs(
@@ -103,7 +95,8 @@ def test_a_camchain_by_the_call_with_which_kalibr_writes_it(tmp_path, kalibrs, r
     np.testing.assert_array_equal(read.distortion, FISHEYE)
 
 
-def test_openvins_first_line_and_a_mount_in_a_camchain(tmp_path):
+def test_a_first_line_that_is_no_yaml_and_a_mount_in_a_camchain(tmp_path):
+    """Of older OpenCV, and of OpenVINS."""
     read = Camera.load(saved(tmp_path, "%YAML:1.0 # as OpenVINS wants it\n\n" + KALIBR + "mount: nadir-left\n"))
     np.testing.assert_array_equal(read.mount, mount_rotation("nadir-left"))
 
