@@ -40,12 +40,6 @@ def test_an_extent_that_is_none_is_refused(extent):
         window_size_px(extent, (0.0, 0.0))
 
 
-def test_a_window_inside_the_map_holds_the_pixels_whose_area_it_touches():
-    # 10 wide about pixel 20 reaches from 15.0 to 25.0: the areas of pixels 15 to 25.
-    assert place_window((20.0, 30.0), (10.0, 4.0), (100, 100)) == Window(15, 28, 11, 5)
-    assert place_window((20.25, 30.0), (10.0, 4.0), (100, 100)) == Window(15, 28, 11, 5)
-
-
 @given(
     center=st.tuples(st.floats(-80.0, 180.0), st.floats(-80.0, 180.0)),
     size=st.tuples(st.floats(0.5, 150.0), st.floats(0.5, 150.0)),
