@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from engine import Fix, Frame, NoFix, OptionError, Prior, SceneMatcher, Window
+from engine import Fix, Frame, NoFix, OptionError, Prior, SceneMatcher
 from engine.window import MARGIN, place_window, window_size_px
 
 SIDE_PX = 300.0
