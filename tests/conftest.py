@@ -37,29 +37,25 @@ def pytest_collection():
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _one_thread():
-    """Results do not depend on the number of cores, and test runs side by side do not fight for them."""
+def _surroundings(tmp_path_factory):
+    """What holds for all tests of a process; those of towns call `build_town` themselves."""
     import torch
-
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _transformers_made_once():
-    """PROJ looks for the way between two systems for tens of milliseconds, and the tests ask for the same few."""
     from pyproj import Transformer
 
+    # Results do not depend on the number of cores, and test runs side by side do not fight for them.
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    if "PYTEST_XDIST_WORKER" in os.environ:  # each worker has a folder of its own in that of the run
+        towns.kept_in = tmp_path_factory.getbasetemp().parent
     with pytest.MonkeyPatch.context() as patch:
+        # PROJ looks for the way between two systems for tens of milliseconds, and the tests ask for the same few.
         patch.setattr(Transformer, "from_crs", staticmethod(lru_cache(maxsize=64)(Transformer.from_crs)))
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _no_home_directory(tmp_path_factory):
-    """Resampled maps stay out of the home directory."""
-    with pytest.MonkeyPatch.context() as patch:
+        # Resampled maps stay out of the home directory.
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        # Who draws a town below the tests takes the one that was drawn before.
+        for module in ("simulator", "simulator.flight", "runs.simulation"):
+            patch.setattr(f"scenematch.{module}.build_town", drawn_once)
+        patch.setattr("bench.inputs.scenes.build_town", drawn_once)
         yield
 
 
@@ -69,27 +65,6 @@ def _bare_runs():
     from tests.support.runs import bare_runs
 
     with bare_runs():
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _workers_share_towns(tmp_path_factory):
-    """Each worker has a folder of its own in that of the run."""
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        towns.kept_in = tmp_path_factory.getbasetemp().parent
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _towns_drawn_once(_workers_share_towns):
-    """Who draws a town below the tests takes the one that was drawn before; tests of towns call `build_town`."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (
-            "scenematch.simulator",
-            "scenematch.simulator.flight",
-            "scenematch.runs.simulation",
-            "bench.inputs.scenes",
-        ):
-            patch.setattr(f"{module}.build_town", drawn_once)
         yield
 
 

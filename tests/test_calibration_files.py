@@ -13,7 +13,7 @@ PLUMB_BOB = np.array([-0.28, 0.09, 0.0007, -4e-20, -0.01])
 FISHEYE = np.array([0.03, -0.012, 0.004, -0.001])
 SAMPLES = {"image_width": 640, "image_height": 480, "camera_matrix": K, "distortion_coefficients": PLUMB_BOB}
 
-# As kalibr_calibrate_cameras wrote it of one fisheye lens, and the head of one of a stereo pair.
+# As kalibr_calibrate_cameras wrote it of one fisheye lens.
 KALIBR = """\
 cam0:
   cam_overlaps: []
@@ -24,7 +24,6 @@ cam0:
   resolution: [720, 540]
   rostopic: /cam_1
 """
-RADTAN = KALIBR.replace("equidistant", "radtan")
 
 
 def opencvs(path, **content):
@@ -41,11 +40,6 @@ def saved(tmp_path, text):
     return path
 
 
-def texture():
-    noise = np.random.default_rng(5).integers(0, 256, (540, 720), dtype=np.uint8)
-    return cv2.GaussianBlur(noise, (0, 0), 3.0)
-
-
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
 @pytest.mark.parametrize("shape", [(1, 5), (5, 1)])
 def test_what_opencv_writes_is_read_to_the_last_digit(tmp_path, suffix, shape):
@@ -58,14 +52,6 @@ def test_what_opencv_writes_is_read_to_the_last_digit(tmp_path, suffix, shape):
     np.testing.assert_array_equal(read.matrix, K)
     np.testing.assert_array_equal(read.distortion, PLUMB_BOB)
     np.testing.assert_array_equal(read.mount, mount_rotation())
-
-
-def test_the_first_line_of_older_opencv_is_no_hindrance(tmp_path):
-    path = opencvs(tmp_path / "camera.yml", **SAMPLES)
-    text = path.read_text(encoding="utf-8")
-    older = "%YAML:1.0\n---\n" + text.split("---\n", 1)[1]
-    path.write_text(older, encoding="utf-8")
-    np.testing.assert_array_equal(Camera.load(path).matrix, K)
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
@@ -92,39 +78,25 @@ def test_fourteen_coefficients_are_eight_where_the_others_are_zero(tmp_path):
         Camera.load(opencvs(tmp_path / "camera.yml", **written))
 
 
-@pytest.mark.parametrize(("text", "model"), [(KALIBR, "equidistant"), (RADTAN, "plumb_bob")])
-def test_kalibrs_camchain_undistorts_as_opencv_with_its_numbers(tmp_path, text, model):
-    read = Camera.load(saved(tmp_path, text))
-    assert (read.width_px, read.height_px, read.distortion_model) == (720, 540, model)
-    lens = np.array([-0.037616380662515145, -0.01017328830844074, 0.0021156274599045564, -0.00041016163581791436])
-    matrix = np.array(
-        [[348.9572868848721, 0, 356.0925444657544], [0, 351.98561676978676, 238.4353424788532], [0, 0, 1]]
-    )
-    image = texture()
-    if model == "equidistant":
-        wanted = cv2.fisheye.undistortImage(image, matrix, lens, Knew=matrix)
-    else:
-        wanted = cv2.undistort(image, matrix, lens)
-    assert np.abs(read.undistort(image).astype(int) - wanted).mean() < 0.5
-
-
-def test_a_camchain_by_the_call_with_which_kalibr_writes_it(tmp_path):
+@pytest.mark.parametrize(("kalibrs", "ros"), [("equidistant", "equidistant"), ("radtan", "plumb_bob")])
+def test_a_camchain_by_the_call_with_which_kalibr_writes_it(tmp_path, kalibrs, ros):
     """Kalibr's ConfigReader.writeYaml, of what kalibr_calibrate_imu_camera puts into a camera's block."""
     chain = {
         "cam0": {
             "T_cam_imu": np.eye(4).tolist(), "cam_overlaps": [], "camera_model": "pinhole",
-            "distortion_coeffs": FISHEYE.tolist(), "distortion_model": "equidistant",
+            "distortion_coeffs": FISHEYE.tolist(), "distortion_model": kalibrs,
             "intrinsics": [500.0, 505.0, 319.5, 239.5], "line_delay": 0, "resolution": [640, 480],
             "rostopic": "/camera/image_raw", "timeshift_cam_imu": -0.0042,
         }
     }  # fmt: skip
     read = Camera.load(saved(tmp_path, yaml.dump(chain, default_flow_style=None, width=2147483647)))
-    assert (read.width_px, read.height_px, read.distortion_model) == (640, 480, "equidistant")
+    assert (read.width_px, read.height_px, read.distortion_model) == (640, 480, ros)
     np.testing.assert_array_equal(read.matrix, K)
     np.testing.assert_array_equal(read.distortion, FISHEYE)
 
 
-def test_openvins_first_line_and_a_mount_in_a_camchain(tmp_path):
+def test_a_first_line_that_is_no_yaml_and_a_mount_in_a_camchain(tmp_path):
+    """Of older OpenCV, and of OpenVINS."""
     read = Camera.load(saved(tmp_path, "%YAML:1.0 # as OpenVINS wants it\n\n" + KALIBR + "mount: nadir-left\n"))
     np.testing.assert_array_equal(read.mount, mount_rotation("nadir-left"))
 
@@ -143,11 +115,7 @@ BAD = {
     "fov": (KALIBR.replace("equidistant", "fov"), "distortion_model: expected one of radtan, equidistant, none"),
     "intrinsics": (KALIBR.replace("[348.9572868848721, ", "["), "cam0: intrinsics: expected 4 numbers"),
     "no resolution": (KALIBR.replace("resolution", "size"), "cam0: resolution: expected 2 numbers, got None"),
-    "words": (KALIBR.replace("348.9572868848721", "wide"), "camera_matrix: expected numbers"),
     "xml": ("<opencv_storage><K>", "not a readable XML file"),
-    "other xml": ("<a><b>1</b></a>", "lacks the field camera_matrix"),
-    "xml of a word": ("<a>1</a>", "no camera_info mapping"),
-    "no size": ("K: [500, 0, 319, 0, 500, 239, 0, 0, 1]\n", "lacks the field image_width"),
     "no matrix": ("camera_matrix: !!opencv-matrix 3\n", "not a readable YAML file"),
 }
 

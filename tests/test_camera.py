@@ -12,6 +12,12 @@ from engine.errors import CalibrationError
 K = [500.0, 0.0, 319.5, 0.0, 505.0, 239.5, 0.0, 0.0, 1.0]
 PLUMB_BOB = [-0.28, 0.09, 0.0007, -0.0004, -0.01]
 FISHEYE = [0.03, -0.012, 0.004, -0.001]
+LENSES = {
+    "plumb_bob": PLUMB_BOB,
+    "rational_polynomial": [0.2, 0.05, 0.0005, -0.0003, 0.01, 0.45, 0.1, 0.02],
+    "equidistant": FISHEYE,
+    "fisheye": FISHEYE,
+}
 
 INFO = """\
 image_width: 640
@@ -39,8 +45,8 @@ def save(tmp_path):
     return write
 
 
-def camera(model="plumb_bob", distortion=PLUMB_BOB, matrix=K):
-    return Camera(640, 480, np.reshape(matrix, (3, 3)), model, np.array(distortion))
+def camera(model="plumb_bob", distortion=PLUMB_BOB):
+    return Camera(640, 480, np.reshape(K, (3, 3)), model, np.array(distortion))
 
 
 def texture(shape=(480, 640, 3)):
@@ -54,18 +60,7 @@ def test_reads_camera_info_with_the_default_mount(save):
     np.testing.assert_array_equal(read.matrix.ravel(), K)
     np.testing.assert_array_equal(read.distortion, PLUMB_BOB)
     assert read.focal_px == 502.5
-    # The top of the picture looks to the nose, the right of it to the right, and the axis down.
-    np.testing.assert_array_equal(read.mount @ [0, -1, 0], [1, 0, 0])
-    np.testing.assert_array_equal(read.mount @ [1, 0, 0], [0, 1, 0])
-    np.testing.assert_array_equal(read.mount @ [0, 0, 1], [0, 0, 1])
-
-
-def test_reads_a_mount_and_plain_lists(save):
-    turned = "mount: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
-    plain = INFO.replace("\n  rows: 3\n  cols: 3\n  data:", "")
-    read = Camera.load(save(plain + turned))
-    np.testing.assert_array_equal(read.mount, np.eye(3))
-    np.testing.assert_array_equal(read.matrix.ravel(), K)
+    np.testing.assert_array_equal(read.mount, mount_rotation("nadir"))
 
 
 @pytest.mark.parametrize("zeros", ["[]", "[0, 0, 0, 0]", "[0, 0, 0, 0, 0]"])
@@ -96,45 +91,14 @@ def test_an_impossible_field_of_view_is_refused(fov_deg):
 
 
 @pytest.mark.parametrize("shape", [(480, 640), (480, 640, 3)])
-def test_plumb_bob_undistortion_is_opencvs(shape):
-    image, lens = texture(shape), camera()
-    expected = cv2.undistort(image, lens.matrix, lens.distortion)
+@pytest.mark.parametrize("model", LENSES)
+def test_undistortion_is_opencvs(model, shape):
+    image, lens = texture(shape), camera(model, LENSES[model])
+    if model in ("equidistant", "fisheye"):
+        expected = cv2.fisheye.undistortImage(image, lens.matrix, lens.distortion, Knew=lens.matrix)
+    else:
+        expected = cv2.undistort(image, lens.matrix, lens.distortion)
     np.testing.assert_allclose(lens.undistort(image).astype(int), expected, atol=1)
-
-
-def test_rational_undistortion_is_opencvs():
-    image = texture()
-    lens = camera("rational_polynomial", [0.2, 0.05, 0.0005, -0.0003, 0.01, 0.45, 0.1, 0.02])
-    expected = cv2.undistort(image, lens.matrix, lens.distortion)
-    np.testing.assert_allclose(lens.undistort(image).astype(int), expected, atol=1)
-
-
-@pytest.mark.parametrize("model", ["equidistant", "fisheye"])
-def test_fisheye_undistortion_is_opencvs(model):
-    image, lens = texture(), camera(model, FISHEYE)
-    expected = cv2.fisheye.undistortImage(image, lens.matrix, lens.distortion, Knew=lens.matrix)
-    np.testing.assert_allclose(lens.undistort(image).astype(int), expected, atol=1)
-
-
-def blob(at):
-    y, x = np.mgrid[:480, :640]
-    return np.round(255 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 18.0)).astype(np.uint8)
-
-
-def centroid(image):
-    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
-    return np.array([(x * image.astype(float)).sum(), (y * image.astype(float)).sum()]) / image.sum()
-
-
-@pytest.mark.parametrize("ray", [(0.0, 0.0), (0.3, -0.2), (-0.35, 0.25)])
-@pytest.mark.parametrize(("model", "coefficients"), [("plumb_bob", PLUMB_BOB), ("equidistant", FISHEYE)])
-def test_a_point_in_the_world_lands_where_the_pinhole_puts_it(model, coefficients, ray):
-    lens = camera(model, coefficients)
-    point = np.array([[[*ray, 1.0]]])
-    project = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints
-    seen = project(point, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)[0]
-    pinhole = lens.matrix @ [*ray, 1.0]
-    np.testing.assert_allclose(centroid(lens.undistort(blob(seen.ravel()))), pinhole[:2], atol=0.25)
 
 
 def test_a_frame_of_another_size_is_refused():
@@ -165,6 +129,12 @@ BAD = {
     "mount": (INFO + "mount: [1, 0, 0, 0, 2, 0, 0, 0, 1]\n", "not orthonormal"),
     "reflection": (INFO + "mount: [1, 0, 0, 0, 1, 0, 0, 0, -1]\n", "reflection"),
     "short mount": (INFO + "mount: [1, 0, 0]\n", "mount: expected 9 numbers, got 3"),
+    "unknown mount": (INFO + "mount: up\n", "mount: expected one of nadir"),
+    "pitch of numbers": (
+        INFO + "mount: [1, 0, 0, 0, 1, 0, 0, 0, 1]\ncamera_pitch_deg: -30\n",
+        "camera_pitch_deg: expected a mount by",
+    ),
+    "pitch in words": (INFO + "camera_pitch_deg: steep\n", "could not convert"),
     "empty": ("", "no camera_info mapping"),
     "list": ("- 1\n- 2\n", "no camera_info mapping"),
     "not yaml": ("image_width: [1, 2\n", "not a readable YAML file"),
@@ -235,21 +205,13 @@ def test_a_mount_that_is_none_is_refused(arguments, words):
         mount_rotation(*arguments)
 
 
-def test_a_calibration_may_name_its_mount(save):
+def test_a_calibration_may_state_its_mount_by_name_or_numbers(save):
     assert np.allclose(Camera.load(save(INFO + "mount: nadir-tail\n")).mount, mount_rotation("nadir-tail"))
     pitched = Camera.load(save(INFO + "mount: nadir\ncamera_pitch_deg: -30\n"))
     assert np.allclose(pitched.mount, mount_rotation("nadir", -30.0))
     assert np.allclose(Camera.load(save(INFO + "camera_pitch_deg: -30\n")).mount, pitched.mount)
-    for text, words in (
-        ("mount: up\n", "mount: expected one of nadir"),
-        (
-            "mount: [1, 0, 0, 0, 1, 0, 0, 0, 1]\ncamera_pitch_deg: -30\n",
-            "camera_pitch_deg: expected a mount by",
-        ),
-        ("camera_pitch_deg: steep\n", "could not convert"),
-    ):
-        with pytest.raises(CalibrationError, match=words):
-            Camera.load(save(INFO + text))
+    by_numbers = Camera.load(save(INFO + "mount: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"))
+    np.testing.assert_array_equal(by_numbers.mount, np.eye(3))
 
 
 # ------------------------------------------------------------------------------------------- another frame size
@@ -266,15 +228,13 @@ def test_a_scaled_camera_sees_the_same_through_the_same_place_of_its_frame(size)
     assert np.allclose(lens.scaled_to(*size).scaled_to(640, 480).matrix, lens.matrix)
 
 
-@pytest.mark.parametrize(("model", "distortion"), [("plumb_bob", PLUMB_BOB), ("fisheye", FISHEYE)])
-def test_undistortion_of_a_smaller_picture_is_the_smaller_undistorted_picture(model, distortion):
-    lens = camera(model, distortion)
+@pytest.mark.parametrize("model", ["plumb_bob", "fisheye"])
+def test_undistortion_of_a_smaller_picture_is_the_smaller_undistorted_picture(model):
+    lens = camera(model, LENSES[model])
     image = cv2.GaussianBlur(texture((480, 640)), (0, 0), 4.0)
     smaller = lens.scaled_to(320, 240).undistort(cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA))
     wanted = cv2.resize(lens.undistort(image), (320, 240), interpolation=cv2.INTER_AREA)
     assert np.abs(smaller[40:-40, 40:-40].astype(int) - wanted[40:-40, 40:-40]).mean() < 1.0
-    unscaled = camera(model, distortion, matrix=np.array(K) * [0.5, 1, 0.5, 1, 0.5, 0.5, 1, 1, 1])
-    assert not np.allclose(unscaled.matrix, lens.scaled_to(320, 240).matrix)  # the half pixel of the centres
 
 
 @pytest.mark.parametrize("size", [(640, 360), (320, 320), (480, 640)])

@@ -146,16 +146,12 @@ def test_floors_on_the_page_are_those_that_import_linter_keeps():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)
-def test_files_that_a_page_names_are_there(page):
-    named = PATH.findall(page.read_text(encoding="utf-8"))
+def test_files_and_benchmarks_that_a_page_names_are_there(page):
+    text = page.read_text(encoding="utf-8")
+    benchmarks = re.findall(r"python\s+-m\s+(bench(?:\.\w+)+)", text)
+    named = [*PATH.findall(text), *(f"{name.replace('.', '/')}.py" for name in benchmarks)]
     assert [name for name in named if not (ROOT / name).exists()] == []
     assert named or page.name != "architecture.md"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=page_name)
-def test_benchmarks_that_a_page_names_are_there(page):
-    named = re.findall(r"python\s+-m\s+(bench(?:\.\w+)+)", page.read_text(encoding="utf-8"))
-    assert [name for name in named if not (ROOT / name.replace(".", "/")).with_suffix(".py").is_file()] == []
 
 
 # ------------------------------------------------------------------------------------------ lists and values

@@ -11,6 +11,7 @@ import time
 import types
 from contextlib import suppress
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -183,49 +184,32 @@ def test_a_camera_is_followed(name, flight, monkeypatch):
     assert all(abs(float(lat) - start.lat_deg) < 1e-3 for lat, _ in fixes)
 
 
-class NodeOfNoRos:
-    """:mod:`scenematch.bridges.ros1` without ROS: it plays three pictures and keeps what is published."""
+@pytest.mark.slow
+def test_in_ros_the_topics_are_heard_and_every_picture_is_answered(flight, monkeypatch, capsys):
+    """A node without ROS plays one picture and keeps what is published."""
+    typesys = pytest.importorskip("rosbags.typesys", reason="rosbags is not installed")
+    from scenematch.files.ros.messages import MessageFactory
 
-    made = None
+    types_of = typesys.get_typestore(typesys.Stores.ROS1_NOETIC).types
+    node = SimpleNamespace(messages=MessageFactory(types_of.__getitem__, True), published=[], topics={})
 
-    def __init__(self, name, arguments=()):
-        from rosbags.typesys import Stores, get_typestore
-
-        from scenematch.files.ros.messages import MessageFactory
-
-        self.messages = MessageFactory(get_typestore(Stores.ROS1_NOETIC).types.__getitem__, True)
-        self.published, self.topics = [], None
-        type(self).made = self
-
-    def now_ns(self):
-        return 1_000_000_000
-
-    def has_subscribers(self, output):
-        return False
-
-    def publish(self, output, message):
-        self.published.append(output)
-
-    def spin(self, handlers, beat, seconds):
-        self.topics = {topic: kind for topic, (kind, _) in handlers.items()}
-        picture = self.messages.image(1_000_000_000, "camera", np.zeros((300, 300), np.uint8))
+    def spin(handlers, beat, seconds):
+        node.topics.update({topic: kind for topic, (kind, _) in handlers.items()})
+        picture = node.messages.image(1_000_000_000, "camera", np.zeros((300, 300), np.uint8))
         handlers["/down/image_raw"][1](picture)
         end = time.monotonic() + 60.0
-        while not self.published and time.monotonic() < end:
+        while not node.published and time.monotonic() < end:
             time.sleep(0.01)
         beat()
 
-
-@pytest.mark.slow
-def test_in_ros_the_topics_are_heard_and_every_picture_is_answered(flight, monkeypatch, capsys):
-    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    node.now_ns, node.has_subscribers, node.spin = lambda: 1_000_000_000, lambda output: False, spin
+    node.publish = lambda output, message: node.published.append(output)
     module = types.ModuleType("scenematch.bridges.ros1")
-    module.Node = NodeOfNoRos
+    module.Node = lambda name, arguments=(): node
     monkeypatch.setitem(sys.modules, "scenematch.bridges.ros1", module)
     monkeypatch.setattr(sys, "argv", ["in_ros.py", "1"])
     monkeypatch.chdir(flight)
     runpy.run_path(str(EXAMPLES / "in_ros.py"))
-    node = NodeOfNoRos.made
     assert node.topics["/down/image_raw"] == "sensor_msgs/msg/Image"
     assert "/mavros/global_position/compass_hdg" not in node.topics
     assert node.published == ["diagnostics"]  # a black picture has no pose

@@ -10,87 +10,61 @@ import pytest
 
 from tests.support.paths import ROOT
 
-FIGURES = {  # page: claim: the rows that state it, by results page, heading and words of the row
+FIGURES = {  # page: claim: results page, heading and words of each row that states it
     "README.md": {
-        "| beach, 9 photographs | 9 | 0.37 | 0 | 0.91 |": [
-            ("field.md", "`brighton`", "| auto |"),
-            ("field.md", "`brighton`", "| plain classical recipe"),
-        ],
-        "| fields, infrared, 82 photographs | 81 | 0.73 | 0 | 1.19 |": [
-            ("field.md", "`seneca`", "| auto |"),
-            ("field.md", "`seneca`", "| plain classical recipe"),
-        ],
-        "| bare ground, 37 photographs | 37 | 0.25 | 0 | 0.71 |": [
-            ("field.md", "`caliterra`", "| auto |"),
-            ("field.md", "`caliterra`", "| plain classical recipe"),
-        ],
-        "| campus, 271 video frames, map of another date | 271 | 1.12 | 0 | 1.15 |": [
-            ("field.md", "`nust`", "| auto |"),
-            ("field.md", "`nust`", "| paper's NCC, OpenCV |"),
-        ],
-        "| Gazebo and ArduPilot, 79 frames | 79 | 0.18 | 0 | 1.23 |": [
-            ("field.md", "`gazebo-a1`:", "| auto,"),
-            ("field.md", "The paper's recipe", "| `gazebo-a1` |"),
-        ],
-        "| the same, evening, map of noon | 79 | 0.23 | 0 | 1.31 |": [
-            ("field.md", "`gazebo-a1-evening`", "| auto,"),
-            ("field.md", "`gazebo-a1-evening`", "| plain classical recipe"),
-        ],
-        "39 ms to 1.1 s a frame": [
-            ("field.md", "`gazebo-a1`:", "| auto,"),
-            ("field.md", "`brighton`", "| auto |"),
-        ],
-        "from 30 to 150 m up": [
-            ("field.md", "`caliterra`", "survey photographs"),
-            ("paper-stack.md", "The paper's stack", "The world is"),
-        ],
+        "| beach, 9 photographs | 9 | 0.37 | 0 | 0.91 |":
+            [("field.md", "`brighton`", "| auto |", "| plain classical recipe")],
+        "| fields, infrared, 82 photographs | 81 | 0.73 | 0 | 1.19 |":
+            [("field.md", "`seneca`", "| auto |", "| plain classical recipe")],
+        "| bare ground, 37 photographs | 37 | 0.25 | 0 | 0.71 |":
+            [("field.md", "`caliterra`", "| auto |", "| plain classical recipe")],
+        "| campus, 271 video frames, map of another date | 271 | 1.12 | 0 | 1.15 |":
+            [("field.md", "`nust`", "| auto |", "| paper's NCC, OpenCV |")],
+        "| Gazebo and ArduPilot, 79 frames | 79 | 0.18 | 0 | 1.23 |":
+            [("field.md", "`gazebo-a1`:", "| auto,"), ("field.md", "The paper's recipe", "| `gazebo-a1` |")],
+        "| the same, evening, map of noon | 79 | 0.23 | 0 | 1.31 |":
+            [("field.md", "`gazebo-a1-evening`", "| auto,", "| plain classical recipe")],
+        "39 ms to 1.1 s a frame":
+            [("field.md", "`gazebo-a1`:", "| auto,"), ("field.md", "`brighton`", "| auto |")],
+        "from 30 to 150 m up":
+            [("field.md", "`caliterra`", "survey photographs"),
+             ("paper-stack.md", "The paper's stack", "The world is")],
         "was 0.11 m RMS off": [("mavlink.md", "ArduCopter SITL", "| NCC, `vision_position_estimate`, 5 min |")],
         "PX4's 0.24 m": [("mavlink.md", "PX4 SITL", "| `odometry`, 5 min |")],
         "NCC 2.4 m at 40 ms": [("latency.md", "Table I", "| NCC, as published |")],
         "SIFT 2.1 m at 121 ms": [("latency.md", "Table I", "| SIFT, as published |")],
     },
     "docs/budget.md": {
-        "from 16.2 to 13.7 ms": [
-            ("latency.md", "Table I", "| auto, scenematch | 1 |"),
-            ("latency.md", "Table I", "| auto, scenematch | 2 |"),
-        ]
+        "from 16.2 to 13.7 ms":
+            [("latency.md", "Table I", "| auto, scenematch | 1 |", "| auto, scenematch | 2 |")],
     },
     "docs/calibrate.md": {
-        "300 x 300 px were enough from 100 m": [("mavlink.md", "ArduCopter SITL", "ArduCopter 4.8-dev")]
+        "300 x 300 px were enough from 100 m": [("mavlink.md", "ArduCopter SITL", "ArduCopter 4.8-dev")],
     },
     "docs/embed.md": {"takes `auto` 16 ms": [("latency.md", "Table I", "| auto, scenematch | 1 |")]},
     "docs/datasets.md": {"by 26 degrees": [("datasets.md", "Published", "The 26 degrees")]},
     "docs/first-hour.md": {
-        "300 of 300 frames were fixed, with 0.22 m RMS and 1.22 m at most": [
-            ("simulator.md", "The first hour", "| `track`")
-        ]
+        "300 of 300 frames were fixed, with 0.22 m RMS and 1.22 m at most":
+            [("simulator.md", "The first hour", "| `track`")],
     },
     "docs/how-ncc-works.md": {"from 1.4 to 0.15 m": [("ncc.md", "Dense refinement", "| `gazebo-a1` |")]},
     "docs/mavlink.md": {
         "0.24 m RMS off in simulation": [("mavlink.md", "PX4 SITL", "| `odometry`, 5 min |")],
         "by `global_position_sensor` 1.4 m": [("mavlink.md", "PX4 SITL", "| `global_position_sensor`, 1")],
         "some 0.1 s": [("vehicle.md", "The unit of systemd", "| worker killed |")],
-        "takes 3.2 s by NCC and 6.2 s by `auto`": [
-            ("mavlink.md", "Flights with faults", "| NCC | 5.0"),
-            ("mavlink.md", "Flights with faults", "| `auto` | 9.0"),
-        ],
+        "takes 3.2 s by NCC and 6.2 s by `auto`":
+            [("mavlink.md", "Flights with faults", "| NCC | 5.0", "| `auto` | 9.0")],
     },
     "docs/odometry.md": {
-        "Drift over 5 s without a match was 2 m per 100 m": [
-            ("odometry.md", "Gaps", "Velocities are withheld"),
-            ("odometry.md", "Gaps", "| gazebo-a1 | odometry |"),
-        ],
+        "Drift over 5 s without a match was 2 m per 100 m":
+            [("odometry.md", "Gaps", "Velocities are withheld", "| gazebo-a1 | odometry |")],
         "4 m on real video": [("odometry.md", "Gaps", "| nust | odometry |")],
     },
     "docs/seasons.md": {
-        "NCC answered 93 to 100 %": [
-            ("seasons.md", "First draw", "| naip-cities (900) | **NCC**"),
-            ("seasons.md", "First draw", "| naip (900) | **NCC**"),
-        ],
-        "SIFT 89 to 95 %": [
-            ("seasons.md", "Second draw", "| naip-cities (5,000) | SIFT"),
-            ("seasons.md", "Second draw", "| naip (2,000) | SIFT"),
-        ],
+        "NCC answered 93 to 100 %":
+            [("seasons.md", "First draw", "| naip-cities (900) | **NCC**", "| naip (900) | **NCC**")],
+        "SIFT 89 to 95 %":
+            [("seasons.md", "Second draw", "| naip-cities (5,000) | SIFT", "| naip (2,000) | SIFT")],
     },
     "docs/vehicle.md": {
         "some 0.1 s": [("vehicle.md", "The unit of systemd", "| worker killed |")],
@@ -98,17 +72,13 @@ FIGURES = {  # page: claim: the rows that state it, by results page, heading and
         "1.5 GB on disk": [("vehicle.md", "On disk", "| plain |")],
         "0.3 GB of memory for NCC": [("vehicle.md", "To the first fix", "| ncc | all kept |")],
         "0.6 GB for `auto`": [("vehicle.md", "To the first fix", "| auto | all kept |")],
-        "1 to 3 s to the first fix": [
-            ("vehicle.md", "To the first fix", "| ncc | all kept |"),
-            ("vehicle.md", "To the first fix", "| auto | all kept |"),
-        ],
+        "1 to 3 s to the first fix":
+            [("vehicle.md", "To the first fix", "| ncc | all kept |", "| auto | all kept |")],
         "35 s before that": [("vehicle.md", "To the first fix", "| auto | nothing kept |")],
     },
     "docs/walkthrough-photographs.md": {
-        "nine photographs from 44 m SIFT fixed 6 on a map of 0.41 m/px (1.83 m RMS)": [
-            ("photographs.md", "Photographs", "`brighton`"),
-            ("photographs.md", "The map", "| 0.41"),
-        ],
+        "nine photographs from 44 m SIFT fixed 6 on a map of 0.41 m/px (1.83 m RMS)":
+            [("photographs.md", "Photographs", "`brighton`"), ("photographs.md", "The map", "| 0.41")],
         "all on one of 0.10 (0.91 m": [("photographs.md", "The map", "| 0.10")],
         "RMS error 0.95 m median error 0.82 m": [("photographs.md", "The map", "| `track")],
         "within 1.35 m largest error 1.37 m": [("photographs.md", "The map", "| `track")],
@@ -118,7 +88,7 @@ FIGURES = {  # page: claim: the rows that state it, by results page, heading and
         "3 degrees of heading": [("wrong-inputs.md", "Faults", "| heading off by 3 |")],
         "5 % of the focal length": [("wrong-inputs.md", "Faults", "| focal length off by 5 % |")],
     },
-}
+}  # fmt: skip
 
 FIGURE = re.compile(
     r"(?<![\w.])(\d+(?:\.\d+)?)(?= (?:m|mm|ms|s|GB|MB|degrees|%|of \d+|RMS)(?!\w)| to [\d.]+ (?:m|ms|s|%))"
@@ -135,13 +105,13 @@ def page(name):
     return " ".join((ROOT / name).read_text(encoding="utf-8").split())
 
 
-def result(name, heading, words):
-    """The first row or paragraph with these words, from the heading on that begins with those."""
+def results(name, heading, *words):
+    """The first row or paragraph with each of these words, from the heading on that begins with those."""
     text = (ROOT / "docs" / "results" / name).read_text(encoding="utf-8")
     section = re.search(rf"^#+ ({re.escape(heading)}.*?)(?=^#|\Z)", text, re.MULTILINE | re.DOTALL)
     assert section, f"{name}: no heading begins with {heading}"
-    rows = re.split(r"\n\n|\n(?=\|)", section[1])
-    return next(" ".join(row.split()) for row in rows if words in row)
+    rows = [" ".join(row.split()) for row in re.split(r"\n\n|\n(?=\|)", section[1])]
+    return [next(row for row in rows if each in row) for each in words]
 
 
 def numbers(text):
@@ -160,7 +130,7 @@ CLAIMS = [(name, claim) for name, claims in FIGURES.items() for claim in claims]
 @pytest.mark.parametrize(("name", "claim"), CLAIMS)
 def test_a_quoted_figure_is_that_of_the_results(name, claim):
     assert claim in page(name), f"{name} does not say: {claim}"
-    rows = [number for where in FIGURES[name][claim] for number in numbers(result(*where))]
+    rows = [number for where in FIGURES[name][claim] for number in numbers(" ".join(results(*where)))]
     assert numbers(claim)
     assert [word for word in numbers(claim) if not states(rows, word)] == []
 

@@ -58,27 +58,23 @@ def test_ecef_round_trip_closes_to_a_micrometre(lat_deg, lon_deg, height_m):
 
 @pytest.mark.parametrize(("lat_deg", "lon_deg"), PLACES)
 def test_enu_agrees_with_proj_topocentric(lat_deg, lon_deg):
-    lat = lat_deg + np.array([0.0, 0.02, -0.03, 0.05])
-    lon = lon_deg + np.array([0.0, 0.01, 0.04, -0.05])
-    east, north, _ = topocentric(lat_deg, lon_deg).transform(lon, lat, np.zeros(4))
+    lat = lat_deg + np.array([[0.0, 0.02], [-0.03, 0.05]])
+    lon = lon_deg + np.array([[0.0, 0.01], [0.04, -0.05]])
+    east, north, _ = topocentric(lat_deg, lon_deg).transform(lon, lat, np.zeros((2, 2)))
     enu = LocalFrame(lat_deg, lon_deg).enu_from_geodetic(lat, lon)
     np.testing.assert_allclose(enu, np.stack([east, north], axis=-1), atol=1e-6)
 
 
-@given(st.floats(-85.0, 85.0), LONGITUDES, st.floats(-20_000.0, 20_000.0), st.floats(-20_000.0, 20_000.0))
+OFFSETS_M = arrays(np.float64, (2, 3), elements=st.floats(-20_000.0, 20_000.0))
+
+
+@given(st.floats(-85.0, 85.0), LONGITUDES, OFFSETS_M, OFFSETS_M)
 @settings(max_examples=80, deadline=None)
 def test_enu_round_trip_closes_to_a_micrometre(lat_deg, lon_deg, east_m, north_m):
     frame = LocalFrame(lat_deg, lon_deg)
     lat, lon = frame.geodetic_from_enu(east_m, north_m)
-    np.testing.assert_allclose(frame.enu_from_geodetic(lat, lon), [east_m, north_m], atol=1e-6)
-
-
-def test_enu_takes_arrays_of_any_shape():
-    frame = LocalFrame(-33.9, 151.2)
-    east, north = np.meshgrid(np.linspace(-500, 500, 4), np.linspace(-300, 300, 3))
-    lat, lon = frame.geodetic_from_enu(east, north)
-    assert lat.shape == lon.shape == (3, 4)
-    np.testing.assert_allclose(frame.enu_from_geodetic(lat, lon), np.stack([east, north], axis=-1), atol=1e-7)
+    assert lat.shape == lon.shape == (2, 3)
+    np.testing.assert_allclose(frame.enu_from_geodetic(lat, lon), np.stack([east_m, north_m], axis=-1), atol=1e-6)
 
 
 @given(st.floats(-89.9, 89.9), LONGITUDES, st.floats(-0.5, 0.5), st.floats(-1.0, 1.0))
@@ -99,31 +95,23 @@ def test_true_north_is_the_planes_at_its_origin(lat_deg, lon_deg):
 FORWARD, RIGHT, DOWN = np.eye(3)
 
 
+C, S = math.cos(math.radians(20.0)), math.sin(math.radians(20.0))
+
+
 @pytest.mark.parametrize(
-    ("heading_deg", "nose"),
-    [(0.0, [0, 1, 0]), (90.0, [1, 0, 0]), (180.0, [0, -1, 0]), (270.0, [-1, 0, 0])],
+    ("angles_deg", "axis", "expected"),
+    [
+        ((0.0, 0.0, 0.0), FORWARD, [0, 1, 0]),
+        ((0.0, 0.0, 90.0), FORWARD, [1, 0, 0]),  # the heading turns clockwise from north
+        ((0.0, 0.0, 180.0), FORWARD, [0, -1, 0]),
+        ((0.0, 0.0, 270.0), DOWN, [0, 0, -1]),
+        ((0.0, 20.0, 0.0), FORWARD, [0, C, S]),  # positive pitch lifts the nose
+        ((20.0, 0.0, 0.0), RIGHT, [C, 0, -S]),  # positive roll lowers the right side
+        ((35.0, 20.0, 90.0), FORWARD, [C, 0, S]),  # the roll is about the nose, and leaves it where it is
+    ],
 )
-def test_heading_turns_clockwise_from_north(heading_deg, nose):
-    rotation = enu_from_body(0.0, 0.0, heading_deg)
-    np.testing.assert_allclose(rotation @ FORWARD, nose, atol=1e-12)
-    np.testing.assert_allclose(rotation @ DOWN, [0, 0, -1], atol=1e-12)
-
-
-def test_positive_pitch_lifts_the_nose():
-    nose = enu_from_body(0.0, 10.0, 0.0) @ FORWARD
-    np.testing.assert_allclose(nose, [0.0, math.cos(math.radians(10)), math.sin(math.radians(10))], atol=1e-12)
-
-
-def test_positive_roll_lowers_the_right_side():
-    right = enu_from_body(10.0, 0.0, 0.0) @ RIGHT
-    np.testing.assert_allclose(right, [math.cos(math.radians(10)), 0.0, -math.sin(math.radians(10))], atol=1e-12)
-
-
-def test_angles_compose_as_heading_then_pitch_then_roll():
-    # With the nose to the east and up, a roll is about the nose and leaves it where it is.
-    nose = enu_from_body(0.0, 20.0, 90.0) @ FORWARD
-    np.testing.assert_allclose(enu_from_body(35.0, 20.0, 90.0) @ FORWARD, nose, atol=1e-12)
-    np.testing.assert_allclose(nose, [math.cos(math.radians(20)), 0.0, math.sin(math.radians(20))], atol=1e-12)
+def test_angles_turn_heading_then_pitch_then_roll(angles_deg, axis, expected):
+    np.testing.assert_allclose(enu_from_body(*angles_deg) @ axis, expected, atol=1e-12)
 
 
 @given(st.floats(-179.0, 179.0), st.floats(-89.0, 89.0), st.floats(0.0, 359.999))
@@ -139,11 +127,11 @@ def test_attitude_round_trip(roll_deg, pitch_deg, heading_deg):
     assert abs((heading - heading_deg + 180.0) % 360.0 - 180.0) < 1e-7
 
 
-@pytest.mark.parametrize(
-    ("given_deg", "expected_deg"), [(-1e-17, 0.0), (360.0, 0.0), (-90.0, 270.0), (725.0, 5.0), (0.0, 0.0)]
-)
-def test_heading_never_wraps_to_360(given_deg, expected_deg):
-    assert wrap_heading_deg(given_deg) == expected_deg
+@given(heading_deg=st.floats(-1e4, 1e4) | st.sampled_from([-1e-17, -5e-324, 360.0, -360.0]))
+def test_a_heading_lies_in_the_half_open_circle(heading_deg):
+    wrapped_deg = wrap_heading_deg(heading_deg)
+    assert 0.0 <= wrapped_deg < 360.0
+    assert math.remainder(wrapped_deg - heading_deg, 360.0) == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -162,19 +150,6 @@ def test_heading_of_a_rotation_a_hair_west_of_north_is_below_360():
 
 def test_chi_square_counts_in_standard_deviations():
     assert chi_square(np.array([3.0, 8.0]), np.diag([9.0, 16.0])) == pytest.approx(5.0)
-
-
-@pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, 1.0), (3.0, 4.0), (-1.0, 2.0)])
-def test_chi_square_of_a_singular_covariance_is_the_limit_of_regular_ones(direction):
-    along = np.array(direction)
-    across = np.array([-along[1], along[0]])
-    singular = 4.0 * np.outer(along, along)
-    for difference in (np.zeros(2), along, -3.0 * along):
-        regular = chi_square(difference, singular + 1e-6 * np.eye(2))
-        assert chi_square(difference, singular) == pytest.approx(regular, rel=1e-5)
-    for difference in (across, along + 1e-3 * across):
-        assert chi_square(difference, singular) == math.inf
-        assert chi_square(difference, singular + 1e-9 * np.eye(2)) > 900.0
 
 
 def test_chi_square_along_any_direction_that_a_singular_covariance_allows_is_finite():

@@ -20,6 +20,8 @@ LEVELS = {
     "uint8": (0, 256),
     "int16": (-3000, 3000),
     "uint16": (0, 65536),
+    "int32": (-100_000, 100_000),
+    "float16": (-50, 200),
     "float32": (-50, 200),
     "float64": (-50, 200),
 }
@@ -56,6 +58,13 @@ def test_ncc_equals_opencv(size, model, dtype, zero_mean):
                 search[b].astype(np.float32), templates[b, t].astype(np.float32), MODES[zero_mean]
             )
             np.testing.assert_allclose(scores[b, t].numpy(), expected, rtol=0, atol=1e-5)
+
+
+def test_whole_numbers_are_not_rounded_to_float32():
+    """Which holds steps of 32 at this height."""
+    low = torch.randint(0, 64, (1, 20, 24), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
+    scores = ncc(low + 2**28, low[:, None, 5:13, 6:14].contiguous())
+    assert float(scores[0, 0, 5, 6]) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_dark_window_in_a_batch_does_not_disturb_a_bright_one():

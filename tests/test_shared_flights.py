@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.accuracy.flights import moved_to_middle
-from engine import Camera, Fix, Frame, OrthoMap, Prior, SceneMatcher
+from engine import Camera, Fix, OrthoMap, Prior, SceneMatcher
 from engine.values import Truth
 from scenematch.files.flight import Flight, open_flight
 from scenematch.files.truth import interpolate_truth, read_truth
@@ -24,14 +24,6 @@ class Recorded:
     flight: Flight
     truth: list[Truth]
 
-    def frame(self, index: int) -> tuple[Frame, Truth]:
-        row = self.flight.rows[index]
-        names = ("timestamp_ns", "height_agl_m", "heading_deg", "roll_deg", "pitch_deg")
-        frame = Frame(self.flight.source.read(row.frame), **{name: getattr(row, name) for name in names})
-        truth = interpolate_truth(self.truth, row.timestamp_ns)
-        assert truth is not None
-        return frame, truth
-
     def errors(self, method, error_m, indices, *, sigma_m=5.0, middle=False):
         """Metres from the truth, infinite where a frame was refused; without a sigma nothing is known before.
 
@@ -40,7 +32,8 @@ class Recorded:
         matcher = SceneMatcher(self.site, self.camera, method, "cpu")
         errors = []
         for index in indices:
-            frame, truth = self.frame(index)
+            frame = self.flight.read(index).frame
+            truth = interpolate_truth(self.truth, frame.timestamp_ns)
             prior = sigma_m and Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=sigma_m)
             result = matcher.locate(frame, prior or None)
             if isinstance(result, Fix) and middle:

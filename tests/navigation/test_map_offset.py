@@ -7,16 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from engine import Fix, Frame, Navigator, Prior, Window
+from engine import Fix, Navigator, Prior, Window
 from engine.geo import LocalFrame
 from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
 from engine.navigation.motion import PositionEstimate
 from tests.support.fixes import a_fix
-from tests.support.matchers import ScriptedMatcher, a_site
+from tests.support.matchers import ScriptedMatcher, a_site, at
 
-IMAGE = np.zeros((8, 8), np.uint8)
-SECOND = 1_000_000_000
-STILL = {"east_velocity_mps": 0.0, "north_velocity_mps": 0.0}
+STILL = (0.0, 0.0)
 
 
 def fix_at(east_m, north_m, sigma_m=0.5, map_sigma_m=3.0):
@@ -29,13 +27,11 @@ def scripted(*places):
     return ScriptedMatcher(*(fix_at(*place) for place in places), site=a_site(georeference_sigma_m=None))
 
 
-def fly(places, given=None, seconds=1.0):
+def fly(places, given=None):
+    """What comes of frames a second apart, what was asked, and the navigator."""
     script = scripted(*places)
     navigator = Navigator(script, Prior(east_m=0.0, north_m=0.0, sigma_m=5.0))
-    results = []
-    for k in range(len(places)):
-        frame = Frame(IMAGE, round(k * seconds * SECOND), 100.0, 0.0, **STILL)
-        results.append(navigator.update(frame, None if given is None else given[k]))
+    results = [navigator.update(at(k, STILL), given and given[k]) for k in range(len(places))]
     return results, script.priors, navigator
 
 
@@ -60,7 +56,7 @@ def test_a_position_of_another_source_is_searched_with_the_maps_error(is_start):
     """Known to centimetres in the world, it is known to 3 m on a map that states nothing."""
     known, matcher = Prior(east_m=4.0, north_m=3.0, sigma_m=0.02), scripted((0.0, 0.0))
     start, given = (known, None) if is_start else (None, known)
-    assert isinstance(Navigator(matcher, start).update(Frame(IMAGE, 0, 100.0, 0.0, **STILL), given), Fix)
+    assert isinstance(Navigator(matcher, start).update(at(0.0, STILL), given), Fix)
     assert matcher.priors[0].sigma_m == pytest.approx(3.0, rel=1e-3)
 
 

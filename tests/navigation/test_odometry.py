@@ -56,33 +56,22 @@ def frame(image, seconds=0.0, attitude=LEVEL, height_m=HEIGHT_M, **more):
     return Frame(image, round(seconds * 1e9), height_m, *angles_deg, **more)
 
 
-def motion_between(first: Frame, second: Frame, camera=CAMERA):
+def motion_between(first, second, camera=CAMERA):
+    """Of two frames, or of two pictures that are an interval apart."""
     odometry = VisualOdometry(camera)
-    assert isinstance(odometry.update(first), NoMotion)
-    return odometry.update(second)
-
-
-def seen(moved_m, begin=LEVEL, end=None):
-    end = end or begin
-    shown = (
-        frame(picture((0.0, 0.0), begin), 0.0, begin),
-        frame(noisy(picture(moved_m, end), 1.0), INTERVAL_S, end),
+    begin, end = (
+        one if isinstance(one, Frame) else frame(one, k * INTERVAL_S) for k, one in enumerate((first, second))
     )
-    return motion_between(*shown)
+    assert isinstance(odometry.update(begin), NoMotion)
+    return odometry.update(end)
 
 
-def noisy(image, sigma, rng=None):
-    rng = rng or np.random.default_rng(9)
+def noisy(image, sigma, rng):
     return np.clip(np.round(image + rng.normal(0.0, sigma, image.shape)), 0, 255).astype(np.uint8)
 
 
-def between(first, second, camera=CAMERA):
-    """The motion between two pictures."""
-    return motion_between(frame(first), frame(second, INTERVAL_S), camera)
-
-
 def refused(first, second, reason):
-    motion = between(first, second) if isinstance(first, np.ndarray) else motion_between(first, second)
+    motion = motion_between(first, second)
     assert isinstance(motion, NoMotion)
     assert reason in motion.reason
 
@@ -98,7 +87,8 @@ angles = st.floats(-12.0, 12.0)
 def test_a_known_motion_is_found_at_every_attitude(east_m, north_m, heading_deg, roll_deg, pitch_deg, turn_deg):
     begin = Attitude(roll_deg, pitch_deg, heading_deg)
     end = Attitude(pitch_deg, roll_deg, (heading_deg + turn_deg) % 360.0)
-    motion = seen((east_m, north_m), begin, end)
+    second = noisy(picture((east_m, north_m), end), 1.0, np.random.default_rng(9))
+    motion = motion_between(frame(picture((0.0, 0.0), begin), 0.0, begin), frame(second, INTERVAL_S, end))
     assert isinstance(motion, GroundMotion)
     off_m = motion.moved_m - [east_m, north_m]
     assert np.hypot(*off_m) < 0.3  # three quarters of a pixel on the ground
@@ -139,25 +129,22 @@ def test_a_distorting_lens_shows_the_same_motion():
     assert again[:, 0] == pytest.approx(np.column_stack([columns.ravel(), rows.ravel()]), abs=0.01)
     wide = Camera.from_fov(480, 360, 80.0)
     at = (flat @ wide.matrix[:2, :2].T + wide.matrix[:2, 2]).astype(np.float32).reshape(240, 320, 2)
-    images = [
-        cv2.remap(picture(place, LEVEL, camera=wide), at, None, cv2.INTER_LINEAR) for place in ((0, 0), (9, 5))
-    ]
-    motion = between(*images, camera=lens)
-    assert motion.moved_m == pytest.approx([9.0, 5.0], abs=0.3)
+    shown = (picture(place, LEVEL, camera=wide) for place in ((0, 0), (9, 5)))
+    images = [cv2.remap(one, at, None, cv2.INTER_LINEAR) for one in shown]
+    assert motion_between(*images, camera=lens).moved_m == pytest.approx([9.0, 5.0], abs=0.3)
 
 
 def test_large_pictures_are_followed_smaller_with_the_same_answer():
     camera = Camera.from_fov(1280, 960, 60.0)
     images = [picture(place, LEVEL, camera=camera) for place in ((0, 0), (6, -7))]
-    motion = between(*images, camera=camera)
-    assert motion.moved_m == pytest.approx([6.0, -7.0], abs=0.3)
+    assert motion_between(*images, camera=camera).moved_m == pytest.approx([6.0, -7.0], abs=0.3)
 
 
 def test_something_fixed_to_the_camera_does_not_stop_the_ground():
     moved = [picture(place, LEVEL) for place in ((0, 0), (10, 0))]
     for image in moved:
         image[:80, :120] = GROUND[:80, :120]
-    assert between(*moved).moved_m == pytest.approx([10, 0], abs=0.3)
+    assert motion_between(*moved).moved_m == pytest.approx([10, 0], abs=0.3)
 
 
 # What is refused
@@ -194,7 +181,7 @@ def test_telemetry_that_does_not_support_a_motion_is_refused():
 
 def test_a_velocity_that_is_too_uncertain_is_refused(monkeypatch):
     monkeypatch.setattr("engine.navigation.odometry._MAX_SIGMA_MPS", 1e-6)
-    assert "uncertain" in between(picture((0, 0), LEVEL), picture((5, 0), LEVEL)).reason
+    refused(picture((0, 0), LEVEL), picture((5, 0), LEVEL), "uncertain")
 
 
 @pytest.mark.parametrize("as_given", [np.asarray, torch.from_numpy])
@@ -215,25 +202,33 @@ def test_the_way_after_a_picture_that_repeats_is_unknown():
 
 # Dead reckoning
 
+MOTION = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
+START = Prior(east_m=0.0, north_m=0.0, sigma_m=2.0)
 
-def test_motions_add_up_and_so_do_their_errors():
-    """Four of 5 m: the share of height and heading lasts, the rest does not."""
-    motion = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
-    track = Track(np.zeros(2), motion.velocity_mps, np.diag([0.0, 0.1**2]), 20.0, trusts_velocity=True, number=0)
-    for _ in range(4):
-        track = track.carried(Ways(1.0, seen=motion.step(motion.velocity_mps)), NavigatorOptions())
-    assert track.en_m == pytest.approx([12.0, 16.0])
-    assert track.estimate.sigma_m == pytest.approx(math.hypot(0.02 * 20.0, 0.2 * math.sqrt(4)))
+
+def blind(**known):
+    """A matcher that refuses all."""
+    matcher = ScriptedMatcher(*[Reason.NO_TEXTURE] * 9, site=a_site(is_searchable=False, has_surface=False))
+    vars(matcher).update(known)
+    return matcher
 
 
 def still(seconds, **velocity):
     return Frame(np.zeros((2, 2), np.uint8), round(seconds * 1e9), **velocity)
 
 
+def test_motions_add_up_and_so_do_their_errors():
+    """Four of 5 m: the share of height and heading lasts, the rest does not."""
+    track = Track(np.zeros(2), MOTION.velocity_mps, np.diag([0.0, 0.1**2]), 20.0, trusts_velocity=True, number=0)
+    for _ in range(4):
+        track = track.carried(Ways(1.0, seen=MOTION.step(MOTION.velocity_mps)), NavigatorOptions())
+    assert track.en_m == pytest.approx([12.0, 16.0])
+    assert track.estimate.sigma_m == pytest.approx(math.hypot(0.02 * 20.0, 0.2 * math.sqrt(4)))
+
+
 def test_a_motion_counts_over_its_own_interval_only(monkeypatch):
     """The frame at 1 s failed: what the pictures show is not the way of two seconds."""
-    motion = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
-    monkeypatch.setattr(VisualOdometry, "update", lambda *_: motion)
+    monkeypatch.setattr(VisualOdometry, "update", lambda *_: MOTION)
     for seconds, moved_m in ((1.0, 3.0), (2.0, 0.0)):
         navigator = Navigator(blind(camera=CAMERA), START, options=NavigatorOptions(odometry=True))
         for stamp in (0.0, seconds):
@@ -249,34 +244,21 @@ def test_a_velocity_with_its_own_accuracy_is_taken_at_its_word(sigma_mps, expect
     assert clock.told(still(1.0, **stated)).sigma_mps == expected_mps
 
 
-def blind(**known):
-    """A matcher that refuses all."""
-    matcher = ScriptedMatcher(*[Reason.NO_TEXTURE] * 9, site=a_site(is_searchable=False, has_surface=False))
-    vars(matcher).update(known)
-    return matcher
-
-
-START = Prior(east_m=0.0, north_m=0.0, sigma_m=2.0)
-
-
-@pytest.mark.parametrize("odometry", [True, False])
-def test_a_navigator_follows_the_ground_where_it_is_asked_to(odometry):
-    navigator = Navigator(blind(camera=CAMERA), START, options=NavigatorOptions(odometry=odometry))
+def test_a_navigator_follows_the_ground_where_it_is_asked_to():
+    navigator = Navigator(blind(camera=CAMERA), START, options=NavigatorOptions(odometry=True))
     for k in range(6):
         navigator.update(frame(picture((3.0 * k, -2.0 * k), LEVEL), INTERVAL_S * k))
     predicted = navigator.prediction
-    assert (navigator.ground_motion is not None) == odometry
-    if odometry:
-        assert (predicted.east_m, predicted.north_m) == pytest.approx((15.0, -10.0), abs=0.5)
-        assert predicted.sigma_m < 3.0
-    else:
-        assert (predicted.east_m, predicted.north_m) == (0.0, 0.0)
-        assert predicted.sigma_m > 15.0
+    assert navigator.ground_motion is not None
+    assert (predicted.east_m, predicted.north_m) == pytest.approx((15.0, -10.0), abs=0.5)
+    assert predicted.sigma_m < 3.0
 
 
 def test_only_odometry_needs_a_camera_of_the_matcher():
     matcher = blind()
-    assert isinstance(Navigator(matcher, START).update(frame(picture((0, 0), LEVEL))), NoFix)
+    navigator = Navigator(matcher, START)
+    assert isinstance(navigator.update(frame(picture((0, 0), LEVEL))), NoFix)
+    assert navigator.ground_motion is None
     with pytest.raises(OptionError, match=r"^odometry: expected a matcher with a `camera`, got ScriptedM"):
         Navigator(matcher, START, options=NavigatorOptions(odometry=True))
 

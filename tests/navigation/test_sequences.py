@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine import Fix, Navigator, NavigatorState
 from tests.support.sequences import (
     IMAGES,
     METHODS,
@@ -19,12 +17,12 @@ from tests.support.sequences import (
     Ground,
     Step,
     fly,
-    is_sound,
-    random_steps,
 )
 
 RIGHT = Step("right", "next", "none", "right")
-STEPS = st.builds(Step, *map(st.sampled_from, (IMAGES, STAMPS, PRIORS, TELEMETRY)))
+WORDS = (IMAGES, STAMPS, PRIORS, tuple(TELEMETRY))
+STEPS = st.just(RIGHT) | st.builds(Step, *(st.just(words[0]) | st.sampled_from(words) for words in WORDS))
+"""Half of them as they should be, that a flight is followed, and others wrong in some respects."""
 
 
 @pytest.fixture(scope="module")
@@ -32,25 +30,10 @@ def tiny():
     return Ground()
 
 
-@given(steps=st.lists(STEPS, min_size=1, max_size=10), method=st.sampled_from(METHODS), start=st.booleans())
-@settings(max_examples=30)
+@given(steps=st.lists(STEPS, min_size=1, max_size=16), method=st.sampled_from(METHODS), start=st.booleans())
+@settings(max_examples=60)
 def test_any_sequence_ends_in_documented_ways(tiny, steps, method, start):
     fly(tiny, steps, method, start=start)
-
-
-@pytest.mark.parametrize(
-    "method", [method if method == "sift" else pytest.param(method, marks=pytest.mark.slow) for method in METHODS]
-)
-def test_random_sequences_end_in_documented_ways_and_some_in_fixes(tiny, method):
-    endings = sum((sequence(tiny, seed, method) for seed in range(6)), start=sequence(tiny, 99, method))
-    assert endings["fix"] > 0
-    assert endings["TelemetryError"] > 0
-    assert endings["no_texture"] > 0
-
-
-def sequence(tiny, seed, method):
-    rng = np.random.default_rng(seed)
-    return fly(tiny, random_steps(rng, int(rng.integers(1, 24))), method, start=bool(rng.integers(2)))
 
 
 @pytest.mark.parametrize(
@@ -71,16 +54,3 @@ def test_a_call_that_is_an_error_costs_nothing(tiny, words):
     endings = fly(tiny, steps, "ncc", start=True)
     assert endings["fix"] == 7
     assert endings.total() == 37
-
-
-def test_a_flight_over_the_tiny_map_is_found_from_nowhere(tiny):
-    """A fix a frame from the first on, each where the frame was cut out."""
-    navigator = Navigator(tiny.matchers["ncc"])
-    for number in range(8):
-        stamp = 200_000_000 * number
-        result = navigator.update(tiny.frame(RIGHT, stamp, stamp))
-        assert isinstance(result, Fix), (number, result)
-        true = tiny.prior(replace(RIGHT, prior="right"), stamp)
-        assert np.hypot(result.east_m - true.east_m, result.north_m - true.north_m) < 1.0
-        assert is_sound(result.covariance_m2)
-    assert navigator.state is NavigatorState.TRACKING

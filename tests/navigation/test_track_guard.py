@@ -49,6 +49,14 @@ def true(east_m):
     return fix(east_m)
 
 
+@pytest.fixture
+def flight():
+    """A flight of five seconds with true fixes."""
+    begun = Flight()
+    begun.fly(5.0, true)
+    return begun
+
+
 def shifted(east_m):
     return fix(east_m, 40.0)
 
@@ -62,25 +70,15 @@ def covered(_):
     return NoFix(reason=Reason.NO_TEXTURE)
 
 
-def test_true_fixes_are_trusted_with_and_without_a_measured_velocity():
-    flight = Flight()
-    assert all(flight.fly(20.0, true))
-    assert all(flight.fly(20.0, true, velocity=False))
-
-
 @pytest.mark.parametrize("cover_s", [5.0, 10.0, 20.0])
-def test_the_first_fix_after_a_covered_camera_is_trusted(cover_s):
-    flight = Flight()
-    flight.fly(5.0, true)
+def test_the_first_fix_after_a_covered_camera_is_trusted(flight, cover_s):
     flight.fly(min(cover_s, 7.0), covered)
     flight.fly(cover_s - min(cover_s, 7.0), covered, velocity=False)
     assert flight.step(true, velocity=cover_s <= 7.0)
 
 
 @pytest.mark.slow
-def test_a_map_that_shifts_in_flight_is_never_followed_however_long_it_agrees_with_itself():
-    flight = Flight()
-    flight.fly(5.0, true)
+def test_a_map_that_shifts_in_flight_is_never_followed_however_long_it_agrees_with_itself(flight):
     answers = flight.fly(7.0, lambda east_m: refused(shifted(east_m)))
     answers += flight.fly(8.0, lambda east_m: refused(shifted(east_m)), velocity=False)
     answers += flight.fly(60.0, shifted, velocity=False)  # the navigator has given in
@@ -88,26 +86,25 @@ def test_a_map_that_shifts_in_flight_is_never_followed_however_long_it_agrees_wi
     assert flight.guard.is_disputed
 
 
-def test_matches_that_return_to_the_track_end_the_dispute():
-    flight = Flight()
-    flight.fly(5.0, true)
-    assert not any(flight.fly(2.0, lambda east_m: refused(shifted(east_m))))
+@pytest.mark.parametrize(
+    ("seconds", "wrong"),
+    [(2.0, lambda east_m: refused(shifted(east_m))), (0.3, lambda east_m: fix(east_m + 30.0))],
+    ids=["refused for long", "three fixes"],
+)
+def test_matches_that_return_to_the_track_end_the_dispute(flight, seconds, wrong):
+    assert not any(flight.fly(seconds, wrong))
     answers = flight.fly(1.0, true)
-    assert answers[:2] == [False, False]
+    assert not any(answers[:2])
     assert all(answers[3:])
 
 
-def test_an_operators_word_ends_the_dispute():
-    flight = Flight()
-    flight.fly(5.0, true)
+def test_an_operators_word_ends_the_dispute(flight):
     assert not any(flight.fly(20.0, shifted))
     flight.guard.confirm()
     assert all(flight.fly(5.0, shifted))
 
 
-def test_a_contradiction_below_the_tolerance_is_left_to_the_estimator():
-    flight = Flight()
-    flight.fly(5.0, true)
+def test_a_contradiction_below_the_tolerance_is_left_to_the_estimator(flight):
     assert all(flight.fly(1.0, lambda east_m: fix(east_m, 4.0)))
 
 
@@ -169,10 +166,8 @@ def test_an_outage_with_a_wrong_velocity_is_recovered_from(off_mps, sigma_m):
 
 
 @pytest.mark.parametrize(("cover_s", "sigma_m"), [(0.0, 1.0), (5.0, 0.05), (10.0, 0.05), (10.0, 1.0)])
-def test_a_map_that_shifts_is_not_explained_by_a_velocity_that_is_right(cover_s, sigma_m):
+def test_a_map_that_shifts_is_not_explained_by_a_velocity_that_is_right(flight, cover_s, sigma_m):
     noise_m = np.random.default_rng(2).normal((0.0, 40.0), sigma_m, (400, 2))
-    flight = Flight()
-    flight.fly(5.0, true)
     flight.fly(cover_s, covered, off_mps=0.5)
     assert not any(flight.fly(20.0, lambda east_m: noisy(east_m, flight, noise_m, sigma_m), off_mps=0.5))
 
@@ -182,15 +177,6 @@ def test_a_map_that_shifts_is_not_explained_by_a_velocity_that_is_known_to_be_wr
     assert all(flight.fly(5.0, true, off_mps=4.3))
     assert not any(flight.fly(20.0, shifted, off_mps=4.3))
     assert not any(flight.fly(20.0, shifted, off_mps=8.0))
-
-
-def test_a_jump_of_three_frames_is_not_sent_and_forgotten():
-    flight = Flight()
-    flight.fly(5.0, true)
-    assert not any(flight.fly(0.3, lambda east_m: fix(east_m + 30.0)))
-    answers = flight.fly(1.0, true)
-    assert not any(answers[:2])
-    assert all(answers[2:])
 
 
 @pytest.mark.parametrize(("sigma_mps", "contradicts"), [(None, True), (0.1, True), (5.0, False)])

@@ -101,7 +101,8 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         self.server.asked.append(self.path)
         self.server.agents.add(self.headers["User-Agent"])
-        path, query = urlsplit(self.path).path, dict(parse_qsl(urlsplit(self.path).query))
+        asked = urlsplit(self.path)
+        path, query = asked.path, {name.upper(): value for name, value in parse_qsl(asked.query)}
         for index, (part, what) in enumerate(self.server.trouble):
             if part in self.path:
                 del self.server.trouble[index]
@@ -117,9 +118,9 @@ class _Handler(BaseHTTPRequestHandler):
             column, row = (int("".join(str(int(d) >> axis & 1) for d in digits), 2) for axis in (0, 1))
             self._tile(len(digits), column, row)
         elif path.startswith("/wmts"):
-            self._wmts(path, {name.upper(): value for name, value in query.items()})
+            self._wmts(path, query)
         elif path.startswith("/wms"):
-            self._wms({name.upper(): value for name, value in query.items()})
+            self._wms(query)
         elif path.startswith("/files/"):
             self._file(self.server.files / Path(path).name)
         else:
@@ -130,11 +131,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _misbehave(self, what) -> None:
         if what == "break":
-            self.send_response(200)
-            self.send_header("Content-Type", "image/png")
-            self.send_header("Content-Length", "5000")
-            self.end_headers()
-            self.wfile.write(b"\x89PNG only the beginning")
+            self._send(200, b"\x89PNG only the beginning", "image/png", {"Content-Length": "5000"})
             self.close_connection = True
         elif what == "silence":
             self.server.over.wait()
@@ -161,14 +158,15 @@ class _Handler(BaseHTTPRequestHandler):
             Image.fromarray(pixels).save(file, "PNG", compress_level=1)
         self._send(200, file.getvalue(), kind)
 
-    def _picture_or_none(self, pixels: np.ndarray) -> None:
+    def _tile(self, zoom: int, column: int, row: int) -> None:
+        self._drawn_tile("EPSG:3857", _tile_bounds(zoom, column, row), 256)
+
+    def _drawn_tile(self, crs: str, bounds: tuple[float, ...], side_px: int) -> None:
+        pixels = drawn(self.server, crs, bounds, side_px, side_px)
         if pixels[..., 3].any():
             self._picture(pixels)
         else:
             self._send(404, b"no such tile", "text/plain")
-
-    def _tile(self, zoom: int, column: int, row: int) -> None:
-        self._picture_or_none(drawn(self.server, "EPSG:3857", _tile_bounds(zoom, column, row), 256, 256))
 
     def _wms(self, query: dict[str, str]) -> None:
         version = self.server.wms_version
@@ -198,8 +196,7 @@ class _Handler(BaseHTTPRequestHandler):
             row, column = int(row), int(column)
         step = MATRICES[name]
         west, north = MATRIX_CORNER[0] + column * 100 * step, MATRIX_CORNER[1] - row * 100 * step
-        bounds = (west, north - 100 * step, west + 100 * step, north)
-        self._picture_or_none(drawn(self.server, "EPSG:31256", bounds, 100, 100))
+        self._drawn_tile("EPSG:31256", (west, north - 100 * step, west + 100 * step, north), 100)
 
     def _file(self, file: Path) -> None:
         if not file.is_file():
@@ -218,28 +215,25 @@ def wms_capabilities(server: MapServer) -> str:
     """As the standards have it: the layers inherit the coordinate systems of the one around them."""
     with rasterio.open(server.raster) as source:
         west, south, east, north = transform_bounds(source.crs, "EPSG:4326", *source.bounds)
-    new = server.wms_version == "1.3.0"
-    tag, codes = ("CRS", WMS_CRS) if new else ("SRS", WMS_CRS[:-1])
-    box = (
-        f"<EX_GeographicBoundingBox><westBoundLongitude>{west}</westBoundLongitude><eastBoundLongitude>{east}"
-        f"</eastBoundLongitude><southBoundLatitude>{south}</southBoundLatitude><northBoundLatitude>{north}"
-        "</northBoundLatitude></EX_GeographicBoundingBox>"
-        if new
-        else f'<LatLonBoundingBox minx="{west}" miny="{south}" maxx="{east}" maxy="{north}"/>'
-    )
-    most = f"<MaxWidth>{server.most_px}</MaxWidth><MaxHeight>{server.most_px}</MaxHeight>" if new else ""
     layers = "".join(f"<Layer><Name>{name}</Name><Title>{name}</Title></Layer>" for name in server.layers)
-    root = (
-        '<WMS_Capabilities version="1.3.0" xmlns="http://www.opengis.net/wms">'
-        if new
-        else '<WMT_MS_Capabilities version="1.1.1">'
-    )
-    return f"""{root}<Service><Name>WMS</Name><Title>The town</Title><Fees>none</Fees>
+    if server.wms_version == "1.3.0":
+        name, root = "WMS_Capabilities", 'version="1.3.0" xmlns="http://www.opengis.net/wms"'
+        codes = "".join(f"<CRS>{code}</CRS>" for code in WMS_CRS)
+        most = f"<MaxWidth>{server.most_px}</MaxWidth><MaxHeight>{server.most_px}</MaxHeight>"
+        box = (
+            f"<EX_GeographicBoundingBox><westBoundLongitude>{west}</westBoundLongitude><eastBoundLongitude>{east}"
+            f"</eastBoundLongitude><southBoundLatitude>{south}</southBoundLatitude><northBoundLatitude>{north}"
+            "</northBoundLatitude></EX_GeographicBoundingBox>"
+        )
+    else:
+        name, root, most = "WMT_MS_Capabilities", 'version="1.1.1"', ""
+        codes = "".join(f"<SRS>{code}</SRS>" for code in WMS_CRS[:-1])
+        box = f'<LatLonBoundingBox minx="{west}" miny="{south}" maxx="{east}" maxy="{north}"/>'
+    return f"""<{name} {root}><Service><Name>WMS</Name><Title>The town</Title><Fees>none</Fees>
 <AccessConstraints>only for tests</AccessConstraints>{most}</Service>
 <Capability><Request><GetMap><Format>image/jpeg</Format><Format>image/png</Format></GetMap></Request>
-<Layer><Title>all</Title>{"".join(f"<{tag}>{code}</{tag}>" for code in codes)}{box}
-<Attribution><Title>the town's surveyor</Title></Attribution>{layers}</Layer></Capability>
-{root.split()[0].replace("<", "</")}>"""
+<Layer><Title>all</Title>{codes}{box}
+<Attribution><Title>the town's surveyor</Title></Attribution>{layers}</Layer></Capability></{name}>"""
 
 
 MATRICES = {"coarse": 2.0, "fine": 0.5, "finest": 0.25}

@@ -37,12 +37,24 @@ METHODS = ("ncc", "sift", "auto")
 
 LEVELS = {"flat": 90, "black": 0, "saturated": 255}
 IMAGES = ("right", "noise", *LEVELS, "small", "float", "rgba", "empty")
-STAMPS = ("next", "gap", "same", "before", "long before", "none", "far future")
+STAMPS_S = {"next": 0.2, "gap": 60.0, "same": 0.0, "before": -0.3, "long before": -500.0, "far future": 1e8}
+STAMPS = (*STAMPS_S, "none")
 PRIORS = ("none", "right", "wide", "wrong", "off the map", "far away", "NaN", "both", "negative")
-TELEMETRY = (
-    "right", "no heading", "no height", "nothing", "wrong heading", "tilted", "upside down", "tiny", "huge", "NaN",
-    "below ground", "fast", "faster than light",
-)  # fmt: skip
+TELEMETRY: dict[str, dict[str, float | None]] = {
+    "right": {},
+    "no heading": {"heading_deg": None},
+    "no height": {"height_agl_m": None},
+    "nothing": dict.fromkeys(("height_agl_m", "heading_deg", "roll_deg", "pitch_deg")),
+    "wrong heading": {"heading_deg": -1e9},
+    "tilted": {"roll_deg": 85.0, "pitch_deg": -70.0},
+    "upside down": {"roll_deg": 180.0},
+    "tiny": {"height_agl_m": 1e-9},
+    "huge": {"height_agl_m": 1e12},
+    "NaN": {"pitch_deg": math.nan},
+    "below ground": {"height_agl_m": -3.0},
+    "fast": {"east_velocity_mps": 3.5, "north_velocity_mps": -3.5},
+    "faster than light": {"east_velocity_mps": 1e12, "north_velocity_mps": -1e12},
+}
 
 
 @dataclass(frozen=True)
@@ -53,16 +65,6 @@ class Step:
     stamp: str
     prior: str
     telemetry: str
-
-
-def random_steps(rng: np.random.Generator, count: int) -> list[Step]:
-    """Steps of which so many, drawn once for all, are as they should be in each respect."""
-    right = rng.choice([0.3, 0.8, 0.95])
-
-    def word(words: Sequence[str]) -> str:
-        return words[0] if rng.random() < right else str(rng.choice(words))
-
-    return [Step(*map(word, (IMAGES, STAMPS, PRIORS, TELEMETRY))) for _ in range(count)]
 
 
 class Ground:
@@ -93,26 +95,8 @@ class Ground:
             "rgba": np.repeat(image[..., None], 4, axis=2),
             "empty": image[:0],
         }
-        return Frame(images[step.image], stamp_ns, **self.telemetry(step))
-
-    def telemetry(self, step: Step) -> dict[str, float | None]:
-        """Of a step, by the names of :class:`engine.Frame`."""
         right = {"height_agl_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0}
-        wrong: dict[str, dict[str, float | None]] = {
-            "no heading": {"heading_deg": None},
-            "no height": {"height_agl_m": None},
-            "nothing": dict.fromkeys(right),
-            "wrong heading": {"heading_deg": -1e9},
-            "tilted": {"roll_deg": 85.0, "pitch_deg": -70.0},
-            "upside down": {"roll_deg": 180.0},
-            "tiny": {"height_agl_m": 1e-9},
-            "huge": {"height_agl_m": 1e12},
-            "NaN": {"pitch_deg": math.nan},
-            "below ground": {"height_agl_m": -3.0},
-            "fast": {"east_velocity_mps": 3.5, "north_velocity_mps": -3.5},
-            "faster than light": {"east_velocity_mps": 1e12, "north_velocity_mps": -1e12},
-        }
-        return {**right, **wrong.get(step.telemetry, {})}
+        return Frame(images[step.image], stamp_ns, **(right | TELEMETRY[step.telemetry]))
 
     def prior(self, step: Step, time_ns: int) -> Prior | None:
         """The prior of a step."""
@@ -136,10 +120,9 @@ class Ground:
 
 def stamp_after(kind: str, newest_ns: int, number: int) -> int | None:
     """The stamp of a step after the newest that came."""
-    steps_s = {"next": 0.2, "gap": 60.0, "same": 0.0, "before": -0.3, "long before": -500.0, "far future": 1e8}
     if kind == "none":
         return None
-    return newest_ns + round(steps_s[kind] * SECOND) + number * (kind == "before")
+    return newest_ns + round(STAMPS_S[kind] * SECOND) + number * (kind == "before")
 
 
 def fly(ground: Ground, steps: Sequence[Step], method: str, *, start: bool) -> Counter[str]:
