@@ -98,6 +98,11 @@ def test_matches_that_return_to_the_track_end_the_dispute(flight, seconds, wrong
     assert all(answers[3:])
 
 
+def test_a_refused_match_is_never_sent_however_well_it_agrees(flight):
+    assert not any(flight.fly(2.0, lambda east_m: refused(true(east_m))))
+    assert flight.step(true)
+
+
 def test_an_operators_word_ends_the_dispute(flight):
     assert not any(flight.fly(20.0, shifted))
     flight.guard.confirm()
