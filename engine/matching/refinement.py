@@ -78,7 +78,7 @@ class Refinement:
         If the picture hardly confirms the telemetry's attitude, the pose is refined once more as if roll and pitch
         were hardly known; the result counts if the picture confirms it. An attitude that it does not confirm
         counts only if the position agrees with the prior. If roll and pitch are unknown, the picture must
-        determine them over a surface model; without one the fix stays as it was.
+        determine them over a surface model. Without one, where relief may be the reason, the fix stays as it was.
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
         refined = self._through_all(fix)
@@ -94,11 +94,14 @@ class Refinement:
         if not (has_tilt or query.site.has_surface):
             return fix
         off = query.prior_chi_square(fix)
-        if has_tilt and (off is None or off <= chi_square_of(CHANCE, 2)):
+        agrees = off <= chi_square_of(CHANCE, 2) if off is not None else not query.site.has_surface
+        if has_tilt and agrees:
             wider = with_unconfirmed_tilt(query, fix) if query.site.has_surface else fix
             return replace(wider, stage="unconfirmed")
-        known = f"chi-square {off:.0f} from the prior" if has_tilt else "roll and pitch are unknown"
-        detail = f"the picture does not confirm the attitude ({known})"
+        against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
+        detail = "roll and pitch are unknown, and the picture does not determine them"
+        if has_tilt:
+            detail = f"the picture does not confirm the attitude, and {against}"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
     def refine_at_once(self, fix: Fix) -> Fix | None:
