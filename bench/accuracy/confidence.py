@@ -1,6 +1,6 @@
 """Calibrate the evidence that a place is right (:mod:`engine.matching.evidence`).
 
-    python -m bench.accuracy.confidence [--matches N] [--method "NCC, first look"|"NCC, second look"|SIFT]
+    python -m bench.accuracy.confidence [--matches N] [--method "NCC, grey levels"|"NCC, structure"|SIFT]
 
 On towns that no other benchmark reports on, and as many matches of one year on the map of another: over the
 cities' half for fitting, and for SIFT over the farmland's. Half of the matches have an answer; what is left out of
@@ -17,14 +17,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.accuracy.judged import FIRST_LOOK, SECOND_LOOK, Bench, Row
+from bench.accuracy.judged import GREY, STRUCTURE, Bench, Row
 from bench.accuracy.trials import Trial, ground
 from bench.accuracy.year_pairs import matched as year_matched
 from engine.options import SiftOptions
 from engine.runtime.threads import set_threads
 
 FIT_SEEDS = (21, 22, 23, 24, 25, 26)
-METHODS = (FIRST_LOOK, SECOND_LOOK, "SIFT")
+METHODS = (GREY, STRUCTURE, "SIFT")
 UNTOLD = 0.25  # how often something is left out
 SCALES = (0.5, 0.35, 0.25)  # of the frame, as a budget asks for
 
@@ -50,7 +50,7 @@ def matched(job: tuple[int, int, int, str]) -> list[Row]:
     set_threads(1)
     bench, rng = Bench(ground(seed), ground(other, map_only=True)), np.random.default_rng(seed)
     trials = bench.trials(range(count), rng)
-    if method in (FIRST_LOOK, SECOND_LOOK):
+    if method in (GREY, STRUCTURE):
         return [bench.judged(made, method) for made in trials]
     return [_by_sift(bench, made, rng) for made in trials]
 

@@ -33,7 +33,7 @@ SCORES = {
     "SIFT": ("probability", "false alarms", "share of inliers"),
     "auto": ("probability",),
 }
-FIRST_LOOK, SECOND_LOOK = "NCC, first look", "NCC, second look"
+GREY, STRUCTURE = "NCC, grey levels", "NCC, structure"
 """Methods for fits: the parts of NCC, of which the second is asked where the first is refused."""
 LOOSE = PoseOptions(min_inliers=4, max_log10_nfa=2.0)  # poses that chance may make, so that there is what to judge
 _PSR_PX = 11.0
@@ -93,7 +93,7 @@ class Bench:
         matcher = self.matcher(made.on, method)
         if method == "NCC":
             return self.peaked(made)
-        if method in (FIRST_LOOK, SECOND_LOOK):
+        if method in (GREY, STRUCTURE):
             return self.looked(made, method)
         if method == "SIFT":
             return self.posed(made, made.frame, made.prior, matcher.options.sift)
@@ -103,18 +103,18 @@ class Bench:
         return self.row(made, method, fix, True, [fix.confidence or 0.0], [])
 
     def peak(self, made: Trial) -> tuple[Query, Ncc, PeakCandidate | NoFix]:
-        """The highest peak of a match by NCC at the first look, accepted or not."""
+        """The highest peak of a match by NCC's grey levels, accepted or not."""
         matcher = self.matcher(made.on, "NCC")
         query, ncc = _query(matcher, made.frame, made.prior), _part(matcher, "ncc", Ncc)
         return query, ncc, ncc.find(query)
 
     def peaked(self, made: Trial) -> Row:
-        """The match by NCC alone: by its second look where the first one's peak is refused."""
+        """The match by NCC alone: by structure where the peak by grey levels is refused."""
         query, ncc, found = self.peak(made)
         if isinstance(found, NoFix):
             return self.row(made, "NCC", None, False, [], [])
         result = ncc.judge(query, found)
-        again = None if isinstance(result, Fix) else ncc.look_again(query, found, found.fix.window)
+        again = None if isinstance(result, Fix) else ncc.match_structure(query, found, found.fix.window)
         if again is not None:
             found, result = again, ncc.judge(query, again)
         ratio = math.sqrt(found.evidence.rival / max(found.evidence.surprise, 1e-6))
@@ -125,8 +125,8 @@ class Bench:
         """The match by one look of NCC alone."""
         query, ncc, peak = self.peak(made)
         found = None if isinstance(peak, NoFix) else peak
-        if found is not None and method == SECOND_LOOK:
-            found = ncc.look_again(query, found, found.fix.window)
+        if found is not None and method == STRUCTURE:
+            found = ncc.match_structure(query, found, found.fix.window)
         if found is None:
             return self.row(made, method, None, False, [], [])
         accepted, scores = (

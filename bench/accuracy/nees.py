@@ -175,7 +175,7 @@ def _matcher(flight: Flight, method: str, errors: AssumedErrors) -> SceneMatcher
 
 
 def _with_own_attitude(flight: Flight, frame: Frame, prior: Prior) -> Frame:
-    """The frame with the attitude that SIFT finds, so that a second look asks only where its middle lies."""
+    """The frame with the attitude that SIFT finds, so that only the place of its middle is asked."""
     found = _matcher(flight, "SIFT", flight.known.errors).locate(frame, prior)
     if not isinstance(found, Fix) or found.attitude is None:
         return frame

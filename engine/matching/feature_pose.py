@@ -123,7 +123,7 @@ class FeatureMatcher:
         if drawn and level_at(query, known.heights_m[0], options.scale) > level_at(query, known.heights_m[0], 1.0):
             yield replace(self, options=replace(options, scale=1.0)), known
         wide = TelemetryHypothesis(unknown if height_m is None else (height_m / factor, height_m * factor), None)
-        if options.second_look and wide != known:
+        if options.search_widely and wide != known:
             yield self, wide
 
     def is_doubtful(self, found: PoseCandidate) -> bool:

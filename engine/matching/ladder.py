@@ -1,4 +1,4 @@
-"""The ladder: the one loop that looks at a frame in one way after another, cheap ones first, while time allows."""
+"""The ladder: the one loop that makes one effort on a frame after another, cheap ones first, while time allows."""
 
 from __future__ import annotations
 

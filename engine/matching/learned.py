@@ -41,8 +41,8 @@ class Learned(Method):
         matcher = load_matcher(own.weights, device=device)
         self.keypoints = KeypointMap(site, matcher) if isinstance(matcher, KeypointMatcher) else None
         self.finder = PointFinder(matcher, self.keypoints, own)
-        # The frame is turned upright for the network; without the heading a second look would see less.
-        self.options = replace(options.sift, second_look=False, tolerance_px=own.tolerance_px)
+        # The frame is turned upright for the network; without the heading it would see less.
+        self.options = replace(options.sift, search_widely=False, tolerance_px=own.tolerance_px)
         self.max_picture_px = own.max_picture_px
 
     warmup_rounds = 1  # each takes seconds without a GPU

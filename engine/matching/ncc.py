@@ -25,7 +25,7 @@ from engine.matching.peak_evidence import (
 )
 from engine.matching.query import Query
 from engine.matching.refinement import Refinement, with_unconfirmed_tilt
-from engine.matching.second_look import second_look
+from engine.matching.structure import match_structure
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
@@ -33,7 +33,7 @@ from engine.values import Fix, NoFix, Prior, Reason, Result, Window
 
 MAX_WINDOW_PX = 8 << 20
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
-_SEARCH, _SECOND_LOOK, _HYPOTHESES = "ncc search", "ncc second look", "ncc hypotheses"  # steps
+_SEARCH, _STRUCTURE, _HYPOTHESES = "ncc search", "ncc structure", "ncc hypotheses"  # steps
 _AT_ONCE, _REFINEMENT = "refinement at once", "refinement"
 _SURROUNDINGS_SIGMA_M = 30.0  # of the window around a place found by a search, in which it must stand out
 
@@ -70,22 +70,22 @@ class Ncc(Method):
     def warmup(self, query: Query) -> None:
         """Run every variant of every step, so that it is compiled and its cost known."""
         untilted = replace(query, frame=replace(query.frame, roll_deg=None, pitch_deg=None))
-        for looks in (Looks(self, query), Looks(self, untilted)):
-            for answer in rehearse(looks.query, looks.levels, None):
-                rehearse(looks.query, looks.refinement, answer)
-        looks = Looks(self, query)
-        looks.refuse(self.find(query))  # as if it were refused
-        rehearse(query, looks.second, None)
+        for efforts in (Efforts(self, query), Efforts(self, untilted)):
+            for answer in rehearse(efforts.query, efforts.levels, None):
+                rehearse(efforts.query, efforts.refinement, answer)
+        efforts = Efforts(self, query)
+        efforts.refuse(self.find(query))  # as if it were refused
+        rehearse(query, efforts.structure, None)
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map, or headings and heights about the prior."""
         if query.prior is None:
             self.locate(query)
         else:
-            looks = Looks(self, query)
-            looks.refuse(self.find(query))
-            rehearse(query, looks.search, None)
-            rehearse(query, looks.second, None)
+            efforts = Efforts(self, query)
+            efforts.refuse(self.find(query))
+            rehearse(query, efforts.search, None)
+            rehearse(query, efforts.structure, None)
 
     def locate(self, query: Query, *, widely: bool = True) -> Result:
         """A fix on the finest level of the map that time allows, refined if time remains.
@@ -96,8 +96,8 @@ class Ncc(Method):
         """
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
-        looks = Looks(self, query)
-        return looks.settled(climb(query, METHOD, looks.rungs(widely=widely)))
+        efforts = Efforts(self, query)
+        return efforts.settled(climb(query, METHOD, efforts.rungs(widely=widely)))
 
     def works(self, query: Query) -> Works:
         """Correlation on each level, the frame's own first; or the search of the whole map."""
@@ -167,22 +167,22 @@ class Ncc(Method):
             return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
         return found.fix
 
-    def look_again(self, query: Query, found: PeakCandidate, window: Window) -> PeakCandidate | None:
-        """The highest peak of the second look, see :mod:`engine.matching.second_look`.
+    def match_structure(self, query: Query, found: PeakCandidate, window: Window) -> PeakCandidate | None:
+        """The highest peak by structure as well, see :mod:`engine.matching.structure`.
 
         Args:
             query: the frame.
-            found: the candidate of the first look.
-            window: to look at; the fix names that of the first look in any case.
+            found: the candidate by grey levels.
+            window: to match in; the fix names that of the candidate in any case.
 
         Returns:
             PeakCandidate | None: None if the template is nowhere on the map.
         """
-        with query.scheduler.stage("second look"):
-            return second_look(self._correlator(query), found, window)
+        with query.scheduler.stage("structure"):
+            return match_structure(self._correlator(query), found, window)
 
     def surroundings(self, query: Query, found: PeakCandidate) -> Window:
-        """The window of a second look: the first one's; after a search, the surroundings of the place."""
+        """The window to match structure in: the first one's; after a search, the surroundings of the place."""
         if found.is_tested:
             return found.fix.window
         place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
@@ -213,8 +213,8 @@ class Ncc(Method):
             return correlator.align(pose, level)
 
 
-class Looks:
-    """All looks at one frame: the rungs of NCC's ladder and what they leave to each other.
+class Efforts:
+    """The efforts on one frame: the rungs of NCC's ladder and what they leave to each other.
 
     Args:
         ncc: the method.
@@ -224,13 +224,13 @@ class Looks:
     def __init__(self, ncc: Ncc, query: Query) -> None:
         self.query, self._ncc = query, ncc
         self._refused: PeakCandidate | None = None  # the newest peak, if it was not accepted
-        self._is_new = False  # whether it had no second look
+        self._is_new = False  # whether its structure was not matched yet
         self._refusal: NoFix | None = None  # of the frame at its own heading and height
         self._works, frame_px = ncc.works(query), float(query.gray.size)
-        self.coarsest = Rung(self._if_coarse_suffices, self._look_coarsely)
+        self.coarsest = Rung(self._if_coarse_suffices, self._search_coarsely)
         self.at_once = Rung(lambda answer: {_AT_ONCE: frame_px} if is_coarse(answer) else {}, self._refine_at_once)
         self.levels = Rung(self._finer, self._correlate)
-        self.second = Rung(self._if_unseen, self._look_again)
+        self.structure = Rung(self._if_unseen, self._match_structure)
         self.search = Rung(self._if_refused, self._search)
         self.refinement = Rung(
             lambda answer: {_REFINEMENT: frame_px} if self._is_refinable(answer) else {}, self._refine
@@ -238,8 +238,8 @@ class Looks:
 
     def rungs(self, *, widely: bool) -> list[Rung]:
         """In their order; ``widely`` is that of :meth:`Ncc.locate`."""
-        wide = [self.search, self.second] if widely else []
-        return [self.coarsest, self.at_once, self.levels, self.second, *wide, self.refinement]
+        wide = [self.search, self.structure] if widely else []
+        return [self.coarsest, self.at_once, self.levels, self.structure, *wide, self.refinement]
 
     def settled(self, answer: Result) -> Result:
         """The ladder's answer, or the refusal of the finer level if that contradicts a coarse fix."""
@@ -280,7 +280,7 @@ class Looks:
         *finer, _ = self._works.items()
         return {step: work for step, work in finer if self.query.scheduler.can_afford({step: work})}
 
-    def _look_coarsely(self, answer: Result | None, step: Hashable) -> Result | None:
+    def _search_coarsely(self, answer: Result | None, step: Hashable) -> Result | None:
         """The peak of the coarsest level, if it is accepted; a refusal says nothing, as finer levels show more."""
         result = self._ncc.judge(self.query, self._find(step))
         return replace(result, stage="coarse") if isinstance(result, Fix) else None
@@ -295,11 +295,11 @@ class Looks:
         assert isinstance(step, tuple)
         return self._ncc.find(self.query, coarser=step[1])
 
-    def _look_again(self, answer: Result | None, step: Hashable) -> Result | None:
-        """The second look at the refused peak."""
+    def _match_structure(self, answer: Result | None, step: Hashable) -> Result | None:
+        """Structure where the refused peak lies."""
         query, first, self._is_new = self.query, self._refused, False
         assert first is not None  # or it was not offered
-        again = self._ncc.look_again(query, first, self._ncc.surroundings(query, first))
+        again = self._ncc.match_structure(query, first, self._ncc.surroundings(query, first))
         if again is None:
             return None
         if not first.searched:
@@ -313,7 +313,7 @@ class Looks:
     def _judged(
         self, answer: Result | None, found: PeakCandidate | NoFix, first: PeakCandidate | NoFix
     ) -> Result | None:
-        """The fix of a peak, or its refusal, which names the first look's match and leaves a coarse fix alone."""
+        """The fix of a peak, or its refusal, which names the match by grey levels and leaves a coarse fix."""
         query, height_m = self.query, self.query.telemetry.height_agl_m
         result = self._ncc.judge(query, found)
         if isinstance(result, NoFix):
@@ -328,18 +328,18 @@ class Looks:
         return with_unconfirmed_tilt(query, result) if is_coarse(answer) else result
 
     def _if_unseen(self, answer: Result | None) -> Works:
-        """The second look at a refused peak that had none."""
+        """Structure about a refused peak, once."""
         found = self._refused
         if found is None or not self._is_new:
             return {}
-        return {_SECOND_LOOK: found.aligned.work_px(self._ncc.surroundings(self.query, found))}
+        return {_STRUCTURE: found.aligned.work_px(self._ncc.surroundings(self.query, found))}
 
     def _if_refused(self, answer: Result | None) -> Works:
         """The search of headings and heights, if a peak is refused."""
         return {} if self._refused is None else {_HYPOTHESES: max(self._works.values())}
 
     def _search(self, answer: Result | None, step: Hashable) -> None:
-        """The best of all headings and heights within three sigmas; only a second look can accept it.
+        """The best of all headings and heights within three sigmas; only structure can accept it.
 
         A compass near motors is often off by more than a patch tolerates.
         """

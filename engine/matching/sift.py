@@ -88,10 +88,10 @@ class Sift(Method):
         longest_px = 3 * max(query.gray.shape)
         if chosen_backend(self.options.backend, self.landmarks.device) == "compiled":
             prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX))
-        looks = Looks(self, query)
-        rehearse(query, looks.few, None)
-        for answer in rehearse(query, looks.all, None):
-            rehearse(query, Looks(self, query).refinement, answer)
+        efforts = Efforts(self, query)
+        rehearse(query, efforts.few, None)
+        for answer in rehearse(query, efforts.all, None):
+            rehearse(query, Efforts(self, query).refinement, answer)
             if isinstance(answer, Fix) and self.can_refine(query):
                 self._refinement(query).refine_from_coarser(answer)
 
@@ -110,8 +110,8 @@ class Sift(Method):
             agrees: whether a fix agrees with another method's. The fix is then for comparison: not refined by the
                 grey levels that the other uses, and by all features if one by few does not agree.
         """
-        looks = Looks(self, query, agrees)
-        return looks.settled(climb(query, METHOD, looks.rungs))
+        efforts = Efforts(self, query, agrees)
+        return efforts.settled(climb(query, METHOD, efforts.rungs))
 
     def few_options(self, query: Query) -> SiftOptions | None:
         """Of few features, at their scale; None if they are not wanted or the map has no such level."""
@@ -176,8 +176,8 @@ class Sift(Method):
         return replace(result, stage="coarse") if share < 1.0 and isinstance(result, Fix) else result
 
 
-class Looks:
-    """All looks at one frame: the rungs of SIFT's ladder and what they leave to each other.
+class Efforts:
+    """The efforts on one frame: the rungs of SIFT's ladder and what they leave to each other.
 
     Args:
         sift: the method.

@@ -243,15 +243,15 @@ def test_sift_is_as_good_with_a_height_that_is_wrong_or_unknown(matchers, ground
             assert fix.attitude.heading_deg == pytest.approx(turn, abs=1.0)
 
 
-def test_without_a_second_look_a_height_off_by_two_is_refused(ground, camera, frame, prior):
+def test_without_a_wide_search_a_height_off_by_two_is_refused(ground, camera, frame, prior):
     wrong = replace(frame, height_agl_m=300.0)
-    assert isinstance(with_sift(ground, camera, second_look=False).locate(wrong, prior), NoFix)
+    assert isinstance(with_sift(ground, camera, search_widely=False).locate(wrong, prior), NoFix)
     trusting = with_sift(ground, camera, height_factor=1.0)
     assert isinstance(trusting.locate(wrong, prior), NoFix)
 
 
 @pytest.mark.parametrize(("budget_ms", "looks"), [(50.0, 1), (60_000.0, 3)])
-def test_a_second_look_is_not_begun_where_the_budget_does_not_hold_it(
+def test_a_wide_search_is_not_begun_where_the_budget_does_not_hold_it(
     ground, camera, frame, prior, monkeypatch, budget_ms, looks
 ):
     hypotheses, clock = [], SimpleNamespace(now_ns=0)
@@ -293,7 +293,7 @@ def test_features_agree_about_the_turn_also_where_the_maps_up_is_not_north(camer
     ground = Ground(lat_deg=60.0, lon_deg=17.9)  # 2.5 degrees of convergence
     shown = ground.frame(camera, NADIR, heading_deg=heading_deg, pitch_deg=8.0)
     mounted = replace(camera, mount=np.diag([turned, turned, 1.0]) @ camera.mount)
-    matcher = with_sift(ground, mounted, second_look=False)
+    matcher = with_sift(ground, mounted, search_widely=False)
     given = replace(shown, image=shown.image[::turned, ::turned].copy())
     assert px_off(matcher.locate(given, ground.prior(NADIR)), NADIR) < 0.5
 

@@ -11,7 +11,7 @@ import pytest
 
 from engine import Budget, Fix, MatcherOptions, NccOptions, NoFix, Reason, SceneMatcher
 from engine.budget import Deadline
-from engine.matching.ncc import Looks, Ncc
+from engine.matching.ncc import Efforts, Ncc
 from engine.matching.refinement import Refinement
 from engine.runtime import scheduler, threads
 from engine.runtime.device import Device
@@ -102,7 +102,7 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(ground, make, f
     """Where there is no time for the finest level; and where there is, the coarse one is enough."""
     hurried = make("ncc", ncc=cost_of_the_finest(make, frame, prior, "ncc", "ncc")).locate(frame, prior, HURRY)
     by_coarse = make("ncc").locate(frame, prior)
-    monkeypatch.setattr(Looks, "_if_coarse_suffices", lambda self, answer: {})
+    monkeypatch.setattr(Efforts, "_if_coarse_suffices", lambda self, answer: {})
     by_fine = make("ncc").locate(frame, prior)
     for fix in (hurried, by_coarse, by_fine):
         assert off_m(ground, fix) < 0.3
@@ -116,7 +116,7 @@ def test_steps_that_are_abandoned_leave_the_coarse_fix(ground, make, frame, prio
         raise OutOfTime
 
     monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
-    monkeypatch.setattr(Looks, "_correlate", out_of_time)
+    monkeypatch.setattr(Efforts, "_correlate", out_of_time)
     fix = make("ncc").locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 3.0
     assert fix.stage == "coarse"
@@ -143,7 +143,7 @@ def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(
         match = None if off_m is None else replace(answer, east_m=answer.east_m + off_m)
         self._refusal = replace(self.query.refuse(reason, "of the finer peak", "ncc"), match=match)
 
-    monkeypatch.setattr(Looks, "_correlate", refused)
+    monkeypatch.setattr(Efforts, "_correlate", refused)
     result = make("ncc").locate(frame, prior, HURRY)
     assert isinstance(result, Fix) == is_fixed
     if is_fixed:  # refinement did not confirm the tilt, and a refused peak makes nothing more certain
@@ -178,14 +178,14 @@ def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_coarser_level(
 def test_refinement_at_once_is_begun_only_where_there_is_time_for_it(ground, make, frame, prior, monkeypatch):
     """What comes before it may have taken longer than thought."""
     matcher = make("ncc")
-    look_coarsely = Looks._look_coarsely
+    search_coarsely = Efforts._search_coarsely
 
     def slow(self, *args):
-        found = look_coarsely(self, *args)
+        found = search_coarsely(self, *args)
         matcher._costs.per_unit = {"refinement": 1e9, "ncc": 1e9}
         return found
 
-    monkeypatch.setattr(Looks, "_look_coarsely", slow)
+    monkeypatch.setattr(Efforts, "_search_coarsely", slow)
     fix = matcher.locate(frame, prior, HURRY)
     assert off_m(ground, fix) < 3.0
     assert fix.stage == "coarse"

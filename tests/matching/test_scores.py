@@ -156,7 +156,7 @@ def test_a_frame_whose_tones_are_turned_round_is_found_by_its_gradient_or_struct
     for score in ("gradient", "local"):
         found = matcher_of(ground, camera, score).locate(inverted, ground.prior(NADIR))
         assert px_off(found, NADIR) < PIXELS
-        assert ("second look" in found.timings.stages_ms) == (score == "local")
+        assert ("structure" in found.timings.stages_ms) == (score == "local")
 
 
 # Options and the page

@@ -1,4 +1,4 @@
-"""The second look: structure keeps its orientation where tones change, and finds what grey levels do not."""
+"""Structure: it keeps its orientation where tones change, and finds what grey levels do not."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_what_is_not_valid_has_no_orientation_and_is_not_seen(ground):
     assert not first[:, ~valid].any()
 
 
-def test_a_frame_of_which_half_the_tones_are_turned_round_is_found_at_the_second_look(ground, camera):
+def test_a_frame_of_which_half_the_tones_are_turned_round_is_found_by_structure(ground, camera):
     """Fields that were darker than their neighbours are brighter: squares of the picture are inverted."""
     image = ground.picture(camera, NADIR, 150.0).copy()
     rows, columns = (np.arange(n) // 40 for n in image.shape[:2])
@@ -50,7 +50,7 @@ def test_a_frame_of_which_half_the_tones_are_turned_round_is_found_at_the_second
     matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
     result = matcher.locate(Frame(image, 0, 150.0, 0.0, 0.0, 0.0), ground.prior(NADIR))
     assert px_off(result, NADIR) < 2.0
-    assert "second look" in result.timings.stages_ms
+    assert "structure" in result.timings.stages_ms
 
 
 # Another heading

@@ -1,4 +1,4 @@
-"""NCC's second look at a window whose highest peak was refused: correlate structure as well as grey levels.
+"""NCC by structure as well as grey levels, in a window whose highest peak by grey levels was refused.
 
 Another season, year or sun changes grey levels and swaps the brighter side of an edge, but not the position and
 direction of edges. The surface is the mean over grey levels and both orientation channels
@@ -26,15 +26,15 @@ from engine.window import level_crop
 FloatImage = NDArray[np.float32]
 
 
-def second_look(correlator: Correlator, found: PeakCandidate, window: Window) -> PeakCandidate | None:
+def match_structure(correlator: Correlator, found: PeakCandidate, window: Window) -> PeakCandidate | None:
     """The candidate of the highest peak by grey levels and structure, out of every place of a window.
 
     Its rival is the better of the best elsewhere and of what chance reaches.
 
     Args:
         correlator: of the frame.
-        found: the candidate of the first look, whose hypothesis is examined.
-        window: in full-resolution map pixels; the fix names that of the first look.
+        found: the candidate by grey levels, whose hypothesis is examined.
+        window: in full-resolution map pixels; the fix names that of the candidate.
 
     Returns:
         PeakCandidate | None: None if the template is nowhere on the map.
