@@ -317,7 +317,7 @@ class Fix:
     @property
     def rests_on_attitude(self) -> bool:
         """Whether the position is only as good as the telemetry's attitude, which no picture confirmed."""
-        return self.up_m is None and self.stage in ("coarse", "unconfirmed")
+        return self.stage == "unconfirmed" or (self.stage == "coarse" and self.up_m is None)
 
     @property
     def attitude_sigma_deg(self) -> tuple[float, ...] | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from engine.matching.acceptance import agree_in_height, agree_in_place, offset_between_m
 from engine.matching.explanation import Explanation
-from engine.matching.ladder import is_coarse, is_late
+from engine.matching.ladder import is_late
 from engine.matching.method import Method
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
@@ -72,8 +72,8 @@ class Auto(Method):
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
         first = self.ncc.locate(query, widely=False)  # SIFT finds the heading by itself
-        # A coarse pose is not refined yet: SIFT's will be.
-        agrees = partial(_agree, first) if isinstance(first, Fix) and not is_coarse(first) else None
+        # Few features follow the telemetry's attitude, and so does a fix that no picture refined: SIFT's will be.
+        agrees = partial(_agree, first) if isinstance(first, Fix) and not first.rests_on_attitude else None
         with query.scheduler.with_fix(isinstance(first, Fix)):
             second = self.sift.locate(query, agrees)
         if isinstance(first, NoFix):

@@ -82,22 +82,21 @@ class Refinement:
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
         refined = self._through_all(fix)
-        is_doubtful = refined is None or refined.score < CONFIRMING_CORRELATION
-        if is_doubtful and has_tilt and query.site.has_surface:
+        if _is_doubtful(refined) and has_tilt and query.site.has_surface:
             try:
                 refined = self._doubting()._through_all(fix) or refined
             except OutOfTime:
                 if refined is None:
                     raise
-        if refined is not None:
+        if not (refined is None or _is_doubtful(refined)):
             return refined
         if not (has_tilt or query.site.has_surface):
             return fix
-        off = query.prior_chi_square(fix)
+        best = refined or (with_unconfirmed_tilt(query, fix) if query.site.has_surface else fix)
+        off = query.prior_chi_square(best)
         agrees = off <= chi_square_of(CHANCE, 2) if off is not None else not query.site.has_surface
         if has_tilt and agrees:
-            wider = with_unconfirmed_tilt(query, fix) if query.site.has_surface else fix
-            return replace(wider, stage="unconfirmed")
+            return replace(best, stage="unconfirmed")
         against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
         detail = "roll and pitch are unknown, and the picture does not determine them"
         if has_tilt:
@@ -259,6 +258,11 @@ class Refinement:
             map_sigma_m=self.options.errors.map_m,
         )
         return replace(refined, stage="refined", confidence=fix.confidence)
+
+
+def _is_doubtful(refined: Fix | None) -> bool:
+    """Whether a picture hardly confirms the telemetry's attitude."""
+    return refined is None or refined.score < CONFIRMING_CORRELATION
 
 
 def with_unconfirmed_tilt(query: Query, fix: Fix) -> Fix:
