@@ -211,6 +211,16 @@ class Window:
     height_px: int
 
     @property
+    def x1(self) -> int:
+        """The column after the last."""
+        return self.x0 + self.width_px
+
+    @property
+    def y1(self) -> int:
+        """The row after the last."""
+        return self.y0 + self.height_px
+
+    @property
     def area_px(self) -> int:
         """Number of pixels inside."""
         return self.width_px * self.height_px

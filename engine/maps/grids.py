@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError
 from engine.geo import LocalFrame
+from engine.values import Window
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
@@ -254,20 +255,26 @@ def warp_between(grid: Grid, other: Grid) -> Warp:
     return Warp(lambda xy: apply_affine(to_pixel, to_crs(xy)), grid.box(WARP_MARGIN), tolerance=0.01)
 
 
-def overlap(grid: Grid, other: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The part of another grid that a grid covers, widened by two pixels.
+def window_about(points: Array, grid: Grid, margin_px: int) -> Window | None:
+    """The whole pixels of a grid around points, with a margin.
 
     Args:
-        grid: the grid that covers.
-        other: the grid of which a part is returned.
+        points: (N, 2) in pixels of the grid, finite.
+        grid: to which the result is clipped.
+        margin_px: added on each side.
 
     Returns:
-        (2,) first pixel (x, y) of ``other``, and (2,) the one past the last; equal if they do not overlap.
+        Window | None: None if the grid has no pixel there.
     """
-    points = warp_between(grid, other)(grid.lattice())
-    points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
-        return np.zeros(2, np.intp), np.zeros(2, np.intp)
-    limit = np.array([other.width_px, other.height_px])
-    low = np.clip(np.floor(points.min(axis=0)) - 2, 0, limit).astype(np.intp)
-    return low, np.clip(np.ceil(points.max(axis=0)) + 3, 0, limit).astype(np.intp)
+        return None
+    limit = [grid.width_px, grid.height_px]
+    low = np.clip(np.floor(points.min(axis=0)) - margin_px, 0, limit).astype(int)
+    high = np.clip(np.ceil(points.max(axis=0)) + margin_px + 1, 0, limit).astype(int)
+    return Window(*low.tolist(), *(high - low).tolist()) if (high > low).all() else None
+
+
+def overlap(grid: Grid, other: Grid) -> Window | None:
+    """The part of another grid that a grid covers, widened by two pixels; None if they do not overlap."""
+    points = warp_between(grid, other)(grid.lattice())
+    return window_about(points[np.isfinite(points).all(axis=1)], other, margin_px=2)

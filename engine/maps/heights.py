@@ -52,10 +52,10 @@ def surface_part(source: Source, grid: Grid) -> Window:
         raise MapError(
             f"surface: expected one band of heights, got a picture of {len(dtypes)} bands, {source.path}"
         )
-    low, high = overlap(grid, source.grid)
-    if not (high > low).all():
+    part = overlap(grid, source.grid)
+    if part is None:
         raise MapError(f"surface: expected one that overlaps the map, got {source.path}")
-    return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+    return part
 
 
 def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> NDArray[np.float32]:

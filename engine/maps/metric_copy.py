@@ -22,7 +22,7 @@ import numpy as np
 
 from engine.errors import MapError
 from engine.maps import xyz_tiles
-from engine.maps.grids import Grid, Warp, apply_affine, wgs84
+from engine.maps.grids import Grid, Warp, apply_affine, wgs84, window_about
 from engine.maps.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_errors, open_source, stored_levels
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
@@ -52,9 +52,7 @@ def _metric_grid(source: Grid) -> Grid:
     near = to_utm(source.centre_px + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]))
     outline = to_utm(source.lattice())
     low, high = outline.min(axis=0), outline.max(axis=0)
-    with np.errstate(
-        invalid="ignore"
-    ):  # outside UTM's range coordinates are infinite; the check below refuses them
+    with np.errstate(invalid="ignore"):  # outside UTM's range coordinates are infinite, and refused below
         step = float(min(np.linalg.norm(near[1] - near[0]), np.linalg.norm(near[3] - near[2])))
         size = (high - low) / step
     if not (np.isfinite(size).all() and size.max() <= xyz_tiles.MAX_SIDE_PX):
@@ -81,10 +79,9 @@ def needs_copy(source: Source) -> bool:
 
 def _blocks(part: Window, block_px: int = 1024) -> Iterator[Window]:
     """Windows that cover a window, row by row; the last ones are smaller."""
-    right, bottom = part.x0 + part.width_px, part.y0 + part.height_px
-    for y0 in range(part.y0, bottom, block_px):
-        for x0 in range(part.x0, right, block_px):
-            yield Window(x0, y0, min(block_px, right - x0), min(block_px, bottom - y0))
+    for y0 in range(part.y0, part.y1, block_px):
+        for x0 in range(part.x0, part.x1, block_px):
+            yield Window(x0, y0, min(block_px, part.x1 - x0), min(block_px, part.y1 - y0))
 
 
 def _copied(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[tuple[Window, Gray]]:
@@ -103,22 +100,20 @@ def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> It
 
     to_source = source.pixels_of(grid.crs)[1]
     warp = Warp(lambda xy: to_source(apply_affine(grid.pixel_to_crs, xy)), grid.box(), tolerance=0.005)
-    limit = np.array([source.width_px, source.height_px])
     for window in _blocks(part):
-        columns = np.arange(window.x0, window.x0 + window.width_px, dtype=np.float64)
-        rows = np.arange(window.y0, window.y0 + window.height_px, dtype=np.float64)
+        columns = np.arange(window.x0, window.x1, dtype=np.float64)
+        rows = np.arange(window.y0, window.y1, dtype=np.float64)
         at = np.nan_to_num(warp.on_grid(columns, rows), nan=-9.0, posinf=-9.0, neginf=-9.0)
-        low = np.clip(np.floor(at.min(axis=(0, 1))) - 3, 0, limit).astype(int)
-        high = np.clip(np.ceil(at.max(axis=(0, 1))) + 4, 0, limit).astype(int)
+        seen = window_about(at.reshape(-1, 2), source, margin_px=3)
         block = np.zeros((2, window.height_px, window.width_px), np.uint8)
-        if (high > low).all():
-            gray, valid = reader.read(Window(*low.tolist(), *(high - low).tolist()))
-            x, y = np.moveaxis((at - low).astype(np.float32), -1, 0)
+        if seen is not None:
+            gray, valid = reader.read(seen)
+            x, y = np.moveaxis((at - [seen.x0, seen.y0]).astype(np.float32), -1, 0)
             # One pixel eroded plus the reach of bilinear make up the reach of cubic.
             solid = cv2.erode(valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
             block[0] = cv2.remap(gray, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             solid = cv2.remap(solid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            inside = ((at >= -0.5) & (at <= limit - 0.5)).all(axis=-1)
+            inside = ((at >= -0.5) & (at <= [source.width_px - 0.5, source.height_px - 0.5])).all(axis=-1)
             block[1] = np.where((np.asarray(solid) == 255) & inside, 255, 0)
         yield window, block
 

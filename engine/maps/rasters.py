@@ -308,8 +308,8 @@ class GrayReader:
         for value, area in self._collars.items():
             height, width = area.shape
             grid, scale = self._source.grid, 2.0**level
-            y = (np.arange(window.y0, window.y0 + window.height_px) + 0.5) * scale * height / grid.height_px
-            x = (np.arange(window.x0, window.x0 + window.width_px) + 0.5) * scale * width / grid.width_px
+            y = (np.arange(window.y0, window.y1) + 0.5) * scale * height / grid.height_px
+            x = (np.arange(window.x0, window.x1) + 0.5) * scale * width / grid.width_px
             valid &= ~((data == value).all(axis=0) & area[np.ix_(y.astype(int), x.astype(int))])
         luma = _luma(data)
         if self._limits is None:
