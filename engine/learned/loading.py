@@ -93,8 +93,7 @@ def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Modul
     Raises:
         OptionError: it is for descriptors of another length, or for keypoints with a scale and an angle.
     """
-    light_glue = _kornia().LightGlue
-    tensors, unnamed = weights.tensors, None  # for named features kornia would fetch weights
+    tensors = weights.tensors
     projection = tensors.get("input_proj.weight")
     taken = 256 if projection is None else int(projection.shape[-1])
     if tensors["posenc.Wr.weight"].shape[-1] != 2:
@@ -104,5 +103,6 @@ def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Modul
         what = f"expected LightGlue for descriptors of {numbers} numbers, got one for {taken}"
         raise OptionError(f"weights: {weights.path}: {what}")
     layers = 1 + max(int(n.split(".")[1]) for n in tensors if n.startswith("log_assignment."))
-    settings: dict[str, Any] = {"features": unnamed, "input_dim": numbers, "n_layers": layers}
-    return fill(light_glue(**settings), weights, device)
+    # For named features kornia would fetch weights.
+    network = _kornia().LightGlue(features=None, input_dim=numbers, n_layers=layers)
+    return fill(network, weights, device)
