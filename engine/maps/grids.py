@@ -45,7 +45,8 @@ class Warp:
     def __init__(self, exact: Function, box: Array, tolerance: float) -> None:
         self._exact = exact
         self._centre, self._half = (box[0] + box[1]) / 2.0, (box[1] - box[0]) / 2.0
-        nodes = _lattice(np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0))  # Chebyshev nodes spread the error evenly
+        chebyshev = np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0)  # nodes that spread the error evenly
+        nodes = square_lattice(chebyshev)
         terms = (_powers(nodes[:, 0])[:, :, None] * _powers(nodes[:, 1])[:, None, :]).reshape(len(nodes), 36)
         values = exact(self._centre + self._half * nodes)
         self._coefficients: Array = np.zeros((6, 6, 2))
@@ -98,7 +99,15 @@ def _powers(x: Array) -> Array:
     return powers
 
 
-def _lattice(x: Array) -> Array:
+def square_lattice(x: Array) -> Array:
+    """All points whose coordinates are two of these numbers, row by row.
+
+    Args:
+        x: (N,).
+
+    Returns:
+        (N ** 2, 2).
+    """
     return np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
 
 
@@ -229,7 +238,7 @@ class Grid:
             (count ** 2, 2) pixels.
         """
         low, high = self.box()
-        unit = _lattice(np.linspace(-1.0, 1.0, count))
+        unit = square_lattice(np.linspace(-1.0, 1.0, count))
         return np.asarray((low + high) / 2.0 + (high - low) / 2.0 * unit)
 
     @property

@@ -37,6 +37,7 @@ LIST = "tiles.txt"
 """In the folder of a copy: a line per tile, its name and its SHA-256, or "-" if it has no valid pixel."""
 ProgressCallback = Callable[[int, int], None]
 """Called while a copy is created, with the number of pixels done and in all."""
+_Block = tuple[Window, Gray]
 _CACHED_HASH_BYTES = 1 << 22  # the hashes of larger files are cached by size and time
 _FACTORS = [2, 4, 8, 16, 32]
 
@@ -84,7 +85,7 @@ def _blocks(part: Window, block_px: int = 1024) -> Iterator[Window]:
             yield Window(x0, y0, min(block_px, part.x1 - x0), min(block_px, part.y1 - y0))
 
 
-def _copied(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[tuple[Window, Gray]]:
+def _copied(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[_Block]:
     """Blocks of a part of the copy's grid as (2, h, w) grey and alpha."""
     if grid is not source:
         yield from _resampled(reader, source, grid, part)
@@ -94,7 +95,7 @@ def _copied(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Itera
         yield window, np.stack([gray, valid.astype(np.uint8) * 255])
 
 
-def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[tuple[Window, Gray]]:
+def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[_Block]:
     """The same, resampled: grey is cubic, alpha 255 where all of it is valid."""
     import cv2
 
@@ -210,7 +211,8 @@ def _built(
         progress.add(0)  # reports progress before the first block is done
         reader = reader or GrayReader(source)
         corner = tile in (tiles[0], tiles[-1])  # they define the extent of the grid
-        is_kept = _write(target, reader, source.grid, grid, tile, progress, is_corner=corner)
+        blocks = _copied(reader, source.grid, grid, tile)
+        is_kept = _write(target, grid, tile, blocks, progress, is_corner=corner)
         recorded = _file_hash(target, folder.parent) if is_kept else "-"
         with (folder / LIST).open("a", encoding="ascii") as stream:
             stream.write(f"{target.name} {recorded}\n")
@@ -237,14 +239,7 @@ def _profile(grid: Grid, part: Window) -> dict[str, Any]:
 
 
 def _write(
-    target: Path,
-    reader: GrayReader,
-    source: Grid,
-    grid: Grid,
-    part: Window,
-    progress: _Progress,
-    *,
-    is_corner: bool,
+    target: Path, grid: Grid, part: Window, blocks: Iterator[_Block], progress: _Progress, *, is_corner: bool
 ) -> bool:
     """Write a part of the copy under a temporary name and rename it, if it has a valid pixel or is a corner.
 
@@ -264,7 +259,7 @@ def _write(
     try:
         with rasterio.open(name, "w", **_profile(grid, part)) as dataset:
             dataset.colorinterp = (ColorInterp.gray, ColorInterp.alpha)
-            for window, block in _copied(reader, source, grid, part):
+            for window, block in blocks:
                 corner = (window.x0 - part.x0, window.y0 - part.y0)
                 dataset.write(block, window=RasterWindow(*corner, window.width_px, window.height_px))
                 is_kept = is_kept or bool(block[1].any())

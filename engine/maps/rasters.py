@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
 from engine.maps.grids import Array, Grid, earth_crs, wgs84
-from engine.maps.raster_formats import local_path, openable
+from engine.maps.raster_formats import DTYPES, local_path, openable
 from engine.values import MAX_SIGMA_M, Window
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ Mask = NDArray[np.bool_]
 Bounds = tuple[float, float, float, float]
 """West, south, east, north."""
 
-DTYPES = ("uint8", "uint16", "int16", "float32", "float64")
 COLLAR_SHARE = 0.005
 STRETCH_PERCENT = (2.0, 98.0)
 OVERVIEW_PX = 4096
