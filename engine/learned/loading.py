@@ -11,7 +11,7 @@ from engine.errors import OptionError
 from engine.learned.keypoints import Aliked, Disk, Extractor, SuperPointKeypoints
 from engine.learned.matchers import KeypointMatcher, Loftr
 from engine.learned.superpoint import SuperPoint
-from engine.learned.weights import KINDS, Weights, fill, read_weights
+from engine.learned.weights import Weights, fill, read_weights
 from engine.runtime import device as devices
 from engine.runtime.tensors import nn, torch
 
@@ -47,11 +47,7 @@ def load_matcher(
     if not paths:
         raise OptionError(f"weights: expected the files of {_EXPECTED}, got none")
     target, files = torch.device(devices.resolve(device)), [read_weights(path) for path in paths]
-    for weights in files:
-        if weights.kind is None:
-            some = ", ".join(sorted(weights.tensors)[:2])
-            raise OptionError(f"weights: {weights.path}: expected {', '.join(KINDS)}, got tensors named {some}")
-    kinds = sorted(str(weights.kind) for weights in files)
+    kinds = sorted(weights.kind for weights in files)
     if kinds == ["LoFTR"]:
         return Loftr(fill(_kornia().LoFTR(pretrained=None), files[0], target), min_confidence)
     extractors = [weights for weights in files if weights.kind in _EXTRACTORS]
