@@ -218,6 +218,11 @@ class Window:
         return self.y0 + self.height_px
 
     @property
+    def slices(self) -> tuple[slice, slice]:
+        """Its rows and columns, as NumPy and rasterio take them."""
+        return np.s_[self.y0 : self.y1, self.x0 : self.x1]
+
+    @property
     def area_px(self) -> int:
         """Number of pixels inside."""
         return self.width_px * self.height_px

@@ -73,13 +73,12 @@ def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> NDArra
         MapError: it cannot be read.
     """
     from rasterio.enums import Resampling
-    from rasterio.windows import Window as RasterWindow
 
     whole = shape == (part.height_px, part.width_px)
     with map_errors("surface", source.path):
         data = source.dataset.read(
             1,
-            window=RasterWindow(part.x0, part.y0, part.width_px, part.height_px),
+            window=part.slices,
             out_shape=shape,
             masked=True,
             resampling=Resampling.nearest if whole else Resampling.average,

@@ -24,6 +24,7 @@ from engine.errors import MapError
 from engine.maps import xyz_tiles
 from engine.maps.grids import Grid, Warp, apply_affine, wgs84, window_about
 from engine.maps.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_errors, open_source, stored_levels
+from engine.maps.tiles import within
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
 
@@ -204,19 +205,22 @@ def _built(
     tiles = list(_blocks(Window(0, 0, grid.width_px, grid.height_px), TILE_PX))
     for tile in tiles:
         target = folder / f"{tile.y0 // TILE_PX:04d}-{tile.x0 // TILE_PX:04d}.tif"
-        recorded = listed.get(target.name)
-        if recorded == ("-" if not target.exists() else _file_hash(target, folder.parent)):
+        if listed.get(target.name) == _state(target):
             progress.add(tile.area_px, quietly=True)
             continue
         progress.add(0)  # reports progress before the first block is done
         reader = reader or GrayReader(source)
         corner = tile in (tiles[0], tiles[-1])  # they define the extent of the grid
         blocks = _copied(reader, source.grid, grid, tile)
-        is_kept = _write(target, grid, tile, blocks, progress, is_corner=corner)
-        recorded = _file_hash(target, folder.parent) if is_kept else "-"
+        _write(target, grid, tile, blocks, progress, is_corner=corner)
         with (folder / LIST).open("a", encoding="ascii") as stream:
-            stream.write(f"{target.name} {recorded}\n")
+            stream.write(f"{target.name} {_state(target)}\n")
     return open_source(folder)
+
+
+def _state(tile: Path) -> str:
+    """What the list records of a tile: its hash, or "-" if it has no file, since no pixel of it is valid."""
+    return _file_hash(tile, tile.parent.parent) if tile.exists() else "-"
 
 
 def _read_list(path: Path) -> dict[str, str]:
@@ -240,18 +244,14 @@ def _profile(grid: Grid, part: Window) -> dict[str, Any]:
 
 def _write(
     target: Path, grid: Grid, part: Window, blocks: Iterator[_Block], progress: _Progress, *, is_corner: bool
-) -> bool:
+) -> None:
     """Write a part of the copy under a temporary name and rename it, if it has a valid pixel or is a corner.
-
-    Returns:
-        Whether it was written.
 
     Raises:
         OSError: it cannot be written.
     """
     import rasterio
     from rasterio.enums import ColorInterp, Resampling
-    from rasterio.windows import Window as RasterWindow
 
     handle, name = tempfile.mkstemp(suffix=".part", dir=target.parent)
     os.close(handle)
@@ -260,8 +260,7 @@ def _write(
         with rasterio.open(name, "w", **_profile(grid, part)) as dataset:
             dataset.colorinterp = (ColorInterp.gray, ColorInterp.alpha)
             for window, block in blocks:
-                corner = (window.x0 - part.x0, window.y0 - part.y0)
-                dataset.write(block, window=RasterWindow(*corner, window.width_px, window.height_px))
+                dataset.write(block, window=within(window, part))
                 is_kept = is_kept or bool(block[1].any())
                 progress.add(window.area_px)
             if is_large(grid):
@@ -272,4 +271,3 @@ def _write(
             target.unlink(missing_ok=True)
     finally:
         Path(name).unlink(missing_ok=True)
-    return is_kept

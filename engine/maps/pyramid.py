@@ -40,8 +40,7 @@ class ArrayReader:
         Returns:
             (h, w) uint8 grey and (h, w) bool validity, without a copy.
         """
-        part = np.s_[window.y0 : window.y1, window.x0 : window.x1]
-        return self.gray[part], self.valid[part]
+        return self.gray[window.slices], self.valid[window.slices]
 
 
 Reader = ArrayReader | GrayReader

@@ -6,6 +6,7 @@ refers only to local raster files.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -115,11 +116,10 @@ def openable(path: Path, argument: str) -> tuple[str | Path, str]:
 def _check_geopackage(file: Path, argument: str) -> None:
     """Refuse a GeoPackage without a raster or with several: GDAL would open none of them."""
     import sqlite3
-    from contextlib import closing
 
     kinds = "'tiles', '2d-gridded-coverage'"
     try:
-        with closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
+        with contextlib.closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
             found = base.execute(f"SELECT table_name FROM gpkg_contents WHERE data_type IN ({kinds})").fetchall()
     except sqlite3.Error as error:
         raise MapError(f"{argument}: cannot read {file}: {error}") from None
@@ -166,10 +166,8 @@ def _rasters_in(folder: Path) -> list[tuple[Path, str]]:
     found = []
     for file in sorted(folder.iterdir()):
         if file.is_file() and file.suffix.lower() not in NO_TILES and not file.name.startswith("."):
-            try:
+            with contextlib.suppress(MapError):  # a licence, a world file, an index: not every file is a tile
                 found.append((file, driver_of(file, "")))
-            except MapError:
-                continue  # a licence, a world file, an index: not every file is a tile
     return [(file, driver) for file, driver in found if driver not in ("VRT", "MBTiles", "GPKG")]
 
 

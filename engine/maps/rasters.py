@@ -275,15 +275,13 @@ class GrayReader:
     def _read(self, window: Window, size: tuple[int, int], *, smooth: bool = False) -> tuple[NDArray[Any], Mask]:
         """Bands and validity of a window in pixels of the file, resampled to ``size`` (rows, columns)."""
         from rasterio.enums import Resampling
-        from rasterio.windows import Window as RasterWindow
 
-        crop = RasterWindow(window.x0, window.y0, window.width_px, window.height_px)
         # GDAL reads the best overview; its pixels are offset from the level's if the size is not a multiple.
         how = Resampling.average if smooth and self._palette is None else Resampling.nearest
         shape = (len(self._bands), *size)
         with self._lock, map_errors("map", self._source.path):  # a GDAL dataset serves one thread at a time
-            data = self._source.dataset.read(self._bands, window=crop, out_shape=shape, resampling=how)
-            mask = self._source.dataset.dataset_mask(window=crop, out_shape=size)
+            data = self._source.dataset.read(self._bands, window=window.slices, out_shape=shape, resampling=how)
+            mask = self._source.dataset.dataset_mask(window=window.slices, out_shape=size)
         if self._palette is not None:
             data = self._palette[:, data[0]]
         valid = np.asarray(mask >= 128)
