@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
 """Names of ROS camera_info, and the valid numbers of coefficients of each."""
+_FISHEYES = ("equidistant", "fisheye")
 _BORDER_RAYS = 16  # along each side of the frame
 
 
@@ -71,10 +72,6 @@ def mount_rotation(name: str = "nadir", pitch_deg: float | None = None) -> Array
     return np.asarray(np.round(turned @ pitched, 15) + 0.0, np.float64)  # quarter turns are whole numbers
 
 
-def _nadir_mount() -> Array:
-    return mount_rotation()
-
-
 @dataclass(frozen=True, eq=False)  # == of arrays is elementwise
 class Camera:
     """Intrinsics and mount of one camera.
@@ -96,7 +93,7 @@ class Camera:
     matrix: Array
     distortion_model: str = "plumb_bob"
     distortion: Array = field(default_factory=lambda: np.zeros(5))
-    mount: Array = field(default_factory=_nadir_mount)
+    mount: Array = field(default_factory=mount_rotation)
 
     def __post_init__(self) -> None:
         for name in ("matrix", "distortion", "mount"):
@@ -174,9 +171,13 @@ class Camera:
                 raise CalibrationError(f"{name}: expected a whole number of pixels, got {value!r}")
             return value
 
-        matrix, model = numbers("camera_matrix"), str(info.get("distortion_model", "plumb_bob"))
-        if matrix.size != 9:
-            raise CalibrationError(f"camera_matrix: expected 9 numbers, got {matrix.size}")
+        def matrix(name: str) -> Array:
+            values = numbers(name)
+            if values.size != 9:
+                raise CalibrationError(f"{name}: expected 9 numbers, got {values.size}")
+            return values.reshape(3, 3)
+
+        pinhole, model = matrix("camera_matrix"), str(info.get("distortion_model", "plumb_bob"))
         distortion = numbers("distortion_coefficients") if "distortion_coefficients" in info else np.zeros(0)
         if not distortion.any():  # ROS writes an ideal camera as none, four or five zeros
             distortion = np.zeros(DISTORTION_MODELS.get(model, (5,))[-1])
@@ -184,19 +185,10 @@ class Camera:
         if not isinstance(named, str) and pitch_deg is not None:
             raise CalibrationError("camera_pitch_deg: expected a mount by name, got one of numbers")
         if isinstance(named, str):
-            mount = mount_rotation(named, None if pitch_deg is None else float(pitch_deg)).ravel()
+            mount = mount_rotation(named, None if pitch_deg is None else float(pitch_deg))
         else:
-            mount = numbers("mount")
-        if mount.size != 9:
-            raise CalibrationError(f"mount: expected 9 numbers, got {mount.size}")
-        return cls(
-            pixels("image_width"),
-            pixels("image_height"),
-            matrix.reshape(3, 3),
-            model,
-            distortion,
-            mount.reshape(3, 3),
-        )
+            mount = matrix("mount")
+        return cls(pixels("image_width"), pixels("image_height"), pinhole, model, distortion, mount)
 
     def scaled_to(self, width_px: int, height_px: int) -> Camera:
         """The same camera with its pictures resized as a whole, without cropping.
@@ -259,19 +251,21 @@ class Camera:
     @property
     def distorts(self) -> bool:
         """Whether pictures must be undistorted before the pinhole model holds."""
-        return bool(self.distortion.any()) or self.distortion_model in ("equidistant", "fisheye")
+        return bool(self.distortion.any()) or self.distortion_model in _FISHEYES
+
+    @property
+    def _lens(self) -> Any:
+        """OpenCV's functions for the distortion model."""
+        import cv2
+
+        return cv2.fisheye if self.distortion_model in _FISHEYES else cv2
 
     @cached_property
     def _undistort_maps(self) -> tuple[Any, Any]:
         import cv2
 
-        size = (self.width_px, self.height_px)
-        if self.distortion_model in ("equidistant", "fisheye"):
-            maps: tuple[Any, Any] = cv2.fisheye.initUndistortRectifyMap(
-                self.matrix, self.distortion, np.eye(3), self.matrix, size, cv2.CV_16SC2
-            )
-        else:
-            maps = cv2.initUndistortRectifyMap(self.matrix, self.distortion, None, self.matrix, size, cv2.CV_16SC2)
+        given, size = (self.matrix, self.distortion, np.eye(3), self.matrix), (self.width_px, self.height_px)
+        maps: tuple[Any, Any] = self._lens.initUndistortRectifyMap(*given, size, cv2.CV_16SC2)
         return maps
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -305,15 +299,10 @@ class Camera:
         Returns:
             (N, 2) x / z and y / z of the pixels' rays.
         """
-        import cv2
-
         if not len(xy_px):
             return np.zeros((0, 2))
         pixels = np.asarray(xy_px, np.float64)[:, None]
-        if self.distortion_model in ("equidistant", "fisheye"):
-            flat = cv2.fisheye.undistortPoints(pixels, self.matrix, self.distortion)
-        else:
-            flat = cv2.undistortPoints(pixels, self.matrix, self.distortion)
+        flat = self._lens.undistortPoints(pixels, self.matrix, self.distortion)
         return np.asarray(flat, np.float64)[:, 0]
 
     def check_size(self, shape: tuple[int, ...]) -> None:

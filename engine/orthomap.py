@@ -46,7 +46,6 @@ GROUND_REACH_M = 30.0
 SEARCH_LIMIT_PX = 1 << 29
 """Largest map, in pixels, that is searched as a whole if the position is unknown."""
 _MIN_KNOWN = 100  # known heights needed to determine the ground level
-_ROUGH_M = 1.0  # height range around a pixel that halves its weight
 
 
 class OrthoMap(Georeference):
@@ -223,7 +222,7 @@ class OrthoMap(Georeference):
     @property
     def inner_px(self) -> Array:
         """(2,) the middle pixel if it is valid, else the valid pixel farthest from any nodata."""
-        middle = np.array([self.width_px - 1, self.height_px - 1]) / 2.0
+        middle = self._grid.centre_px
         return middle if bool(self._pyramid.valid_at(middle)) else self._pyramid.innermost_px()
 
     @property
@@ -363,7 +362,7 @@ class OrthoMap(Georeference):
             return np.ones(xy.shape[:-1])
         about = reach_px * np.array([(0.0, 0.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
         heights = self.surface_at(xy[..., None, :] + about)
-        return np.asarray(1.0 / (1.0 + (np.ptp(heights, axis=-1) / _ROUGH_M) ** 2))
+        return np.asarray(1.0 / (1.0 + np.ptp(heights, axis=-1) ** 2))
 
     @property
     def from_file(self) -> bool:

@@ -24,11 +24,6 @@ MAX_SIGMA_M = 1e6
 """Upper bound on the standard deviation of a position or of a map's georeference."""
 
 
-def _check_finite(name: str, value: float | None) -> None:
-    if value is not None and not math.isfinite(value):
-        raise TelemetryError(f"{name}: expected a finite number or None, got {value}")
-
-
 @dataclass(frozen=True, slots=True)
 class Attitude:
     """Attitude of the body (forward-right-down), in aerospace order: yaw, then pitch, then roll.
@@ -94,7 +89,9 @@ class Frame:
         if str(self.image.dtype).removeprefix("torch.") != "uint8":
             raise DtypeError(f"image: expected uint8, got {self.image.dtype}")
         for name in _FINITE:
-            _check_finite(name, getattr(self, name))
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise TelemetryError(f"{name}: expected a finite number or None, got {value}")
         if self.height_agl_m is not None and self.height_agl_m <= 0:
             raise TelemetryError(f"height_agl_m: expected a height above 0 m, got {self.height_agl_m}")
         for name in _SIGMAS:
@@ -209,6 +206,21 @@ class Window:
     y0: int
     width_px: int
     height_px: int
+
+    @property
+    def x1(self) -> int:
+        """The column after the last."""
+        return self.x0 + self.width_px
+
+    @property
+    def y1(self) -> int:
+        """The row after the last."""
+        return self.y0 + self.height_px
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Its rows and columns, as NumPy and rasterio take them."""
+        return np.s_[self.y0 : self.y1, self.x0 : self.x1]
 
     @property
     def area_px(self) -> int:

@@ -87,12 +87,15 @@ class SuperPointKeypoints:
     def __call__(self, picture: Tensor, count: int) -> Keypoints:
         """The strongest keypoints; see :class:`Extractor`."""
         height, width = picture.shape[2:]
-        cell = superpoint.CELL_PX
-        scores, descriptors = self.network(
-            functional.pad(picture, (0, -width % cell, 0, -height % cell), mode="replicate")
-        )
+        scores, descriptors = self.network(padded(picture, superpoint.CELL_PX))
         xy, strength = superpoint.strongest(scores[0, :height, :width], count)
         return Keypoints(xy, strength, superpoint.sample(descriptors[0], xy))
+
+
+def padded(picture: Tensor, cell_px: int) -> Tensor:
+    """The picture, padded at the right and bottom to whole cells by replicating its edge."""
+    height, width = picture.shape[2:]
+    return functional.pad(picture, (0, -width % cell_px, 0, -height % cell_px), mode="replicate")
 
 
 def _ranked(xy_px: Tensor, strength: Tensor, descriptors: Tensor, count: int) -> Keypoints:

@@ -11,7 +11,7 @@ from engine.errors import OptionError
 from engine.learned.keypoints import Aliked, Disk, Extractor, SuperPointKeypoints
 from engine.learned.matchers import KeypointMatcher, Loftr
 from engine.learned.superpoint import SuperPoint
-from engine.learned.weights import KINDS, Weights, fill, read_weights
+from engine.learned.weights import Weights, fill, read_weights
 from engine.runtime import device as devices
 from engine.runtime.tensors import nn, torch
 
@@ -47,11 +47,7 @@ def load_matcher(
     if not paths:
         raise OptionError(f"weights: expected the files of {_EXPECTED}, got none")
     target, files = torch.device(devices.resolve(device)), [read_weights(path) for path in paths]
-    for weights in files:
-        if weights.kind is None:
-            some = ", ".join(sorted(weights.tensors)[:2])
-            raise OptionError(f"weights: {weights.path}: expected {', '.join(KINDS)}, got tensors named {some}")
-    kinds = sorted(str(weights.kind) for weights in files)
+    kinds = sorted(weights.kind for weights in files)
     if kinds == ["LoFTR"]:
         return Loftr(fill(_kornia().LoFTR(pretrained=None), files[0], target), min_confidence)
     extractors = [weights for weights in files if weights.kind in _EXTRACTORS]
@@ -93,8 +89,7 @@ def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Modul
     Raises:
         OptionError: it is for descriptors of another length, or for keypoints with a scale and an angle.
     """
-    light_glue = _kornia().LightGlue
-    tensors, unnamed = weights.tensors, None  # for named features kornia would fetch weights
+    tensors = weights.tensors
     projection = tensors.get("input_proj.weight")
     taken = 256 if projection is None else int(projection.shape[-1])
     if tensors["posenc.Wr.weight"].shape[-1] != 2:
@@ -104,5 +99,6 @@ def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Modul
         what = f"expected LightGlue for descriptors of {numbers} numbers, got one for {taken}"
         raise OptionError(f"weights: {weights.path}: {what}")
     layers = 1 + max(int(n.split(".")[1]) for n in tensors if n.startswith("log_assignment."))
-    settings: dict[str, Any] = {"features": unnamed, "input_dim": numbers, "n_layers": layers}
-    return fill(light_glue(**settings), weights, device)
+    # For named features kornia would fetch weights.
+    network = _kornia().LightGlue(features=None, input_dim=numbers, n_layers=layers)
+    return fill(network, weights, device)

@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from engine.errors import DtypeError, ShapeError
-from engine.learned.keypoints import Extractor, Keypoints
-from engine.runtime.tensors import Tensor, functional, nn, torch
+from engine.learned.keypoints import Extractor, Keypoints, padded
+from engine.runtime.tensors import Tensor, nn, torch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +37,7 @@ class Loftr:
         _check(frame, crop)
         device = _device_of(self.network)
         with torch.inference_mode():
-            images = {"image0": _padded(frame.to(device), 8), "image1": _padded(crop.to(device), 8)}
+            images = {"image0": padded(frame.to(device), 8), "image1": padded(crop.to(device), 8)}
             found = self.network(images)
             first, second = found["keypoints0"], found["keypoints1"]
             kept = found["confidence"] >= self.min_confidence
@@ -118,12 +118,6 @@ def _check(frame: Tensor, crop: Tensor) -> None:
 def _device_of(network: nn.Module) -> torch.device:
     first = next(network.parameters(), None)
     return torch.device("cpu") if first is None else first.device
-
-
-def _padded(image: Tensor, multiple: int) -> Tensor:
-    """The picture, padded at the right and bottom to whole cells by replicating its edge."""
-    height, width = image.shape[2:]
-    return functional.pad(image, (0, -width % multiple, 0, -height % multiple), mode="replicate")
 
 
 def _inside(points: Tensor, image: Tensor) -> Tensor:

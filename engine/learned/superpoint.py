@@ -11,8 +11,8 @@ from engine.runtime.tensors import Tensor, functional, nn, torch
 
 CELL_PX = 8
 """Side of the cell of pixels that shares one descriptor, and in which the detector chooses at most one place."""
-_BORDER_PX = 4  # a keypoint nearer to the edge is only partly visible
-_SEPARATION_PX = 4  # the strongest keypoint within this distance stays
+_CLEAR_PX = 4
+"""A keypoint nearer to the edge is only partly visible; of several nearer to each other the strongest stays."""
 _MIN_SCORE = 0.0005
 
 
@@ -49,9 +49,8 @@ class SuperPoint(nn.Module):
             x = functional.relu(getattr(self, f"conv{block}a")(x))
             x = functional.relu(getattr(self, f"conv{block}b")(x))
         logits = self.convPb(functional.relu(self.convPa(x)))
-        scores = functional.pixel_shuffle(torch.softmax(logits, dim=1)[:, :-1], CELL_PX)[
-            :, 0
-        ]  # the last is "no keypoint"
+        places = torch.softmax(logits, dim=1)[:, :-1]  # the last is "no keypoint"
+        scores = functional.pixel_shuffle(places, CELL_PX)[:, 0]
         return scores, functional.normalize(self.convDb(functional.relu(self.convDa(x))), dim=1)
 
 
@@ -65,10 +64,10 @@ def strongest(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:
     Returns:
         (N, 2) whole pixels (x, y) and (N,) their scores, falling.
     """
-    side = 2 * _SEPARATION_PX + 1
-    highest = functional.max_pool2d(scores[None, None], side, stride=1, padding=_SEPARATION_PX)[0, 0]
+    side = 2 * _CLEAR_PX + 1
+    highest = functional.max_pool2d(scores[None, None], side, stride=1, padding=_CLEAR_PX)[0, 0]
     kept = (scores == highest) & (scores > _MIN_SCORE)
-    kept[:_BORDER_PX], kept[-_BORDER_PX:], kept[:, :_BORDER_PX], kept[:, -_BORDER_PX:] = (False,) * 4
+    kept[:_CLEAR_PX], kept[-_CLEAR_PX:], kept[:, :_CLEAR_PX], kept[:, -_CLEAR_PX:] = (False,) * 4
     y, x = torch.nonzero(kept, as_tuple=True)
     found = scores[y, x]
     order = found.argsort(descending=True)[:count]

@@ -34,12 +34,12 @@ class Weights:
 
     Attributes:
         path: of the file.
-        kind: of :data:`KINDS`, or None if the names are of no known network.
+        kind: of :data:`KINDS`.
         tensors: by the names that the networks have now.
     """
 
     path: Path
-    kind: str | None
+    kind: str
     tensors: Mapping[str, Tensor]
 
 
@@ -50,10 +50,13 @@ def read_weights(path: str | Path) -> Weights:
         path: a state dict, or a checkpoint that holds one.
 
     Raises:
-        OptionError: the file is missing or contains more than tensors.
+        OptionError: the file is missing, contains more than tensors, or holds no known network.
     """
     tensors = {_present_name(name): value for name, value in _read(path).items()}
     kind = next((kind for kind, names in KINDS.items() if all(name in tensors for name in names)), None)
+    if kind is None:
+        some = ", ".join(sorted(tensors)[:2])
+        raise OptionError(f"weights: {Path(path)}: expected {', '.join(KINDS)}, got tensors named {some}")
     return Weights(Path(path), kind, tensors)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from engine.errors import MapError
 from engine.geo import LocalFrame
-from engine.maps.grids import WARP_MARGIN, Array, Grid, Warp, earth_crs
+from engine.maps.grids import WARP_MARGIN, Array, Grid, Warp, wgs84
 
 GSD_RANGE_M = (1e-3, 1e3)
 
@@ -37,7 +37,7 @@ class Georeference:
 
     def __init__(self, grid: Grid) -> None:
         self.width_px, self.height_px, self.crs, self._grid = grid.width_px, grid.height_px, grid.crs, grid
-        self._to_geodetic, self._from_geodetic = grid.pixels_of(earth_crs("EPSG:4326", "crs"))
+        self._to_geodetic, self._from_geodetic = grid.pixels_of(wgs84())
         lon_deg, lat_deg = self._to_geodetic(grid.centre_px)
         self.frame = LocalFrame(float(lat_deg), float(lon_deg))
         box = grid.box(WARP_MARGIN)

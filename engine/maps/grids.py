@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError
 from engine.geo import LocalFrame
+from engine.values import Window
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
@@ -44,7 +45,8 @@ class Warp:
     def __init__(self, exact: Function, box: Array, tolerance: float) -> None:
         self._exact = exact
         self._centre, self._half = (box[0] + box[1]) / 2.0, (box[1] - box[0]) / 2.0
-        nodes = _lattice(np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0))  # Chebyshev nodes spread the error evenly
+        chebyshev = np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0)  # nodes that spread the error evenly
+        nodes = square_lattice(chebyshev)
         terms = (_powers(nodes[:, 0])[:, :, None] * _powers(nodes[:, 1])[:, None, :]).reshape(len(nodes), 36)
         values = exact(self._centre + self._half * nodes)
         self._coefficients: Array = np.zeros((6, 6, 2))
@@ -97,7 +99,15 @@ def _powers(x: Array) -> Array:
     return powers
 
 
-def _lattice(x: Array) -> Array:
+def square_lattice(x: Array) -> Array:
+    """All points whose coordinates are two of these numbers, row by row.
+
+    Args:
+        x: (N,).
+
+    Returns:
+        (N ** 2, 2).
+    """
     return np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
 
 
@@ -228,7 +238,7 @@ class Grid:
             (count ** 2, 2) pixels.
         """
         low, high = self.box()
-        unit = _lattice(np.linspace(-1.0, 1.0, count))
+        unit = square_lattice(np.linspace(-1.0, 1.0, count))
         return np.asarray((low + high) / 2.0 + (high - low) / 2.0 * unit)
 
     @property
@@ -254,20 +264,26 @@ def warp_between(grid: Grid, other: Grid) -> Warp:
     return Warp(lambda xy: apply_affine(to_pixel, to_crs(xy)), grid.box(WARP_MARGIN), tolerance=0.01)
 
 
-def overlap(grid: Grid, other: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The part of another grid that a grid covers, widened by two pixels.
+def window_about(points: Array, grid: Grid, margin_px: int) -> Window | None:
+    """The whole pixels of a grid around points, with a margin.
 
     Args:
-        grid: the grid that covers.
-        other: the grid of which a part is returned.
+        points: (N, 2) in pixels of the grid, finite.
+        grid: to which the result is clipped.
+        margin_px: added on each side.
 
     Returns:
-        (2,) first pixel (x, y) of ``other``, and (2,) the one past the last; equal if they do not overlap.
+        Window | None: None if the grid has no pixel there.
     """
-    points = warp_between(grid, other)(grid.lattice())
-    points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
-        return np.zeros(2, np.intp), np.zeros(2, np.intp)
-    limit = np.array([other.width_px, other.height_px])
-    low = np.clip(np.floor(points.min(axis=0)) - 2, 0, limit).astype(np.intp)
-    return low, np.clip(np.ceil(points.max(axis=0)) + 3, 0, limit).astype(np.intp)
+        return None
+    limit = [grid.width_px, grid.height_px]
+    low = np.clip(np.floor(points.min(axis=0)) - margin_px, 0, limit).astype(int)
+    high = np.clip(np.ceil(points.max(axis=0)) + margin_px + 1, 0, limit).astype(int)
+    return Window(*low.tolist(), *(high - low).tolist()) if (high > low).all() else None
+
+
+def overlap(grid: Grid, other: Grid) -> Window | None:
+    """The part of another grid that a grid covers, widened by two pixels; None if they do not overlap."""
+    points = warp_between(grid, other)(grid.lattice())
+    return window_about(points[np.isfinite(points).all(axis=1)], other, margin_px=2)

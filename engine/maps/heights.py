@@ -52,10 +52,10 @@ def surface_part(source: Source, grid: Grid) -> Window:
         raise MapError(
             f"surface: expected one band of heights, got a picture of {len(dtypes)} bands, {source.path}"
         )
-    low, high = overlap(grid, source.grid)
-    if not (high > low).all():
+    part = overlap(grid, source.grid)
+    if part is None:
         raise MapError(f"surface: expected one that overlaps the map, got {source.path}")
-    return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+    return part
 
 
 def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> NDArray[np.float32]:
@@ -73,13 +73,12 @@ def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> NDArra
         MapError: it cannot be read.
     """
     from rasterio.enums import Resampling
-    from rasterio.windows import Window as RasterWindow
 
     whole = shape == (part.height_px, part.width_px)
     with map_errors("surface", source.path):
         data = source.dataset.read(
             1,
-            window=RasterWindow(part.x0, part.y0, part.width_px, part.height_px),
+            window=part.slices,
             out_shape=shape,
             masked=True,
             resampling=Resampling.nearest if whole else Resampling.average,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from engine.features import Features, chosen_backend, sift
 from engine.maps.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
+from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import HALO_PX, TILE_PX, tile_at, tiles_under, widened, within
 from engine.runtime.device import Device, Picture, all_on_host, all_placed, as_float, placed
@@ -34,7 +35,7 @@ MIN_CONTRAST = 0.005
 CELL_PX = 64
 """Landmarks are ranked by strength within square cells of the level."""
 MAX_PER_CELL = 96
-PREPARED_PX = 16 << 20
+PREPARED_PX = COARSE_LIMIT_PX
 """Most pixels of levels prepared at once, and of a level that is searched as a whole."""
 MAX_LANDMARKS = 1 << 19
 """Landmarks cached in memory, besides those of the last window; one takes 300 bytes.
@@ -175,9 +176,8 @@ class LandmarkMap:
         xy = positions + np.array([wide.x0, wide.y0], np.float32)
         rank = _rank_in_cells(xy)
         kept = np.flatnonzero(rank < MAX_PER_CELL)
-        scale, angle, descriptors = scale[kept], angle[kept], descriptors[kept]
-        arrays = (xy[kept], scale, angle, rank[kept], descriptors)
-        return {name: a.astype(kind[0]) for (name, kind), a in zip(_STORED.items(), arrays, strict=True)}
+        arrays = (xy, scale, angle, rank, descriptors)
+        return {name: a[kept].astype(kind[0]) for (name, kind), a in zip(_STORED.items(), arrays, strict=True)}
 
     def _with_points(self, tile: NamedArrays, level: int) -> NamedArrays:
         map_px = self._site.full_from_level(tile["xy_px"], level)

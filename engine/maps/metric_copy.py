@@ -22,8 +22,9 @@ import numpy as np
 
 from engine.errors import MapError
 from engine.maps import xyz_tiles
-from engine.maps.grids import Grid, Warp, apply_affine, wgs84
+from engine.maps.grids import Grid, Warp, apply_affine, wgs84, window_about
 from engine.maps.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_errors, open_source, stored_levels
+from engine.maps.tiles import within
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
 
@@ -37,6 +38,7 @@ LIST = "tiles.txt"
 """In the folder of a copy: a line per tile, its name and its SHA-256, or "-" if it has no valid pixel."""
 ProgressCallback = Callable[[int, int], None]
 """Called while a copy is created, with the number of pixels done and in all."""
+_Block = tuple[Window, Gray]
 _CACHED_HASH_BYTES = 1 << 22  # the hashes of larger files are cached by size and time
 _FACTORS = [2, 4, 8, 16, 32]
 
@@ -52,9 +54,7 @@ def _metric_grid(source: Grid) -> Grid:
     near = to_utm(source.centre_px + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]))
     outline = to_utm(source.lattice())
     low, high = outline.min(axis=0), outline.max(axis=0)
-    with np.errstate(
-        invalid="ignore"
-    ):  # outside UTM's range coordinates are infinite; the check below refuses them
+    with np.errstate(invalid="ignore"):  # outside UTM's range coordinates are infinite, and refused below
         step = float(min(np.linalg.norm(near[1] - near[0]), np.linalg.norm(near[3] - near[2])))
         size = (high - low) / step
     if not (np.isfinite(size).all() and size.max() <= xyz_tiles.MAX_SIDE_PX):
@@ -81,13 +81,12 @@ def needs_copy(source: Source) -> bool:
 
 def _blocks(part: Window, block_px: int = 1024) -> Iterator[Window]:
     """Windows that cover a window, row by row; the last ones are smaller."""
-    right, bottom = part.x0 + part.width_px, part.y0 + part.height_px
-    for y0 in range(part.y0, bottom, block_px):
-        for x0 in range(part.x0, right, block_px):
-            yield Window(x0, y0, min(block_px, right - x0), min(block_px, bottom - y0))
+    for y0 in range(part.y0, part.y1, block_px):
+        for x0 in range(part.x0, part.x1, block_px):
+            yield Window(x0, y0, min(block_px, part.x1 - x0), min(block_px, part.y1 - y0))
 
 
-def _copied(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[tuple[Window, Gray]]:
+def _copied(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[_Block]:
     """Blocks of a part of the copy's grid as (2, h, w) grey and alpha."""
     if grid is not source:
         yield from _resampled(reader, source, grid, part)
@@ -97,28 +96,26 @@ def _copied(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Itera
         yield window, np.stack([gray, valid.astype(np.uint8) * 255])
 
 
-def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[tuple[Window, Gray]]:
+def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[_Block]:
     """The same, resampled: grey is cubic, alpha 255 where all of it is valid."""
     import cv2
 
     to_source = source.pixels_of(grid.crs)[1]
     warp = Warp(lambda xy: to_source(apply_affine(grid.pixel_to_crs, xy)), grid.box(), tolerance=0.005)
-    limit = np.array([source.width_px, source.height_px])
     for window in _blocks(part):
-        columns = np.arange(window.x0, window.x0 + window.width_px, dtype=np.float64)
-        rows = np.arange(window.y0, window.y0 + window.height_px, dtype=np.float64)
+        columns = np.arange(window.x0, window.x1, dtype=np.float64)
+        rows = np.arange(window.y0, window.y1, dtype=np.float64)
         at = np.nan_to_num(warp.on_grid(columns, rows), nan=-9.0, posinf=-9.0, neginf=-9.0)
-        low = np.clip(np.floor(at.min(axis=(0, 1))) - 3, 0, limit).astype(int)
-        high = np.clip(np.ceil(at.max(axis=(0, 1))) + 4, 0, limit).astype(int)
+        seen = window_about(at.reshape(-1, 2), source, margin_px=3)
         block = np.zeros((2, window.height_px, window.width_px), np.uint8)
-        if (high > low).all():
-            gray, valid = reader.read(Window(*low.tolist(), *(high - low).tolist()))
-            x, y = np.moveaxis((at - low).astype(np.float32), -1, 0)
+        if seen is not None:
+            gray, valid = reader.read(seen)
+            x, y = np.moveaxis((at - [seen.x0, seen.y0]).astype(np.float32), -1, 0)
             # One pixel eroded plus the reach of bilinear make up the reach of cubic.
             solid = cv2.erode(valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
             block[0] = cv2.remap(gray, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             solid = cv2.remap(solid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            inside = ((at >= -0.5) & (at <= limit - 0.5)).all(axis=-1)
+            inside = ((at >= -0.5) & (at <= [source.width_px - 0.5, source.height_px - 0.5])).all(axis=-1)
             block[1] = np.where((np.asarray(solid) == 255) & inside, 255, 0)
         yield window, block
 
@@ -208,18 +205,22 @@ def _built(
     tiles = list(_blocks(Window(0, 0, grid.width_px, grid.height_px), TILE_PX))
     for tile in tiles:
         target = folder / f"{tile.y0 // TILE_PX:04d}-{tile.x0 // TILE_PX:04d}.tif"
-        recorded = listed.get(target.name)
-        if recorded == ("-" if not target.exists() else _file_hash(target, folder.parent)):
+        if listed.get(target.name) == _state(target):
             progress.add(tile.area_px, quietly=True)
             continue
         progress.add(0)  # reports progress before the first block is done
         reader = reader or GrayReader(source)
         corner = tile in (tiles[0], tiles[-1])  # they define the extent of the grid
-        is_kept = _write(target, reader, source.grid, grid, tile, progress, is_corner=corner)
-        recorded = _file_hash(target, folder.parent) if is_kept else "-"
+        blocks = _copied(reader, source.grid, grid, tile)
+        _write(target, grid, tile, blocks, progress, is_corner=corner)
         with (folder / LIST).open("a", encoding="ascii") as stream:
-            stream.write(f"{target.name} {recorded}\n")
+            stream.write(f"{target.name} {_state(target)}\n")
     return open_source(folder)
+
+
+def _state(tile: Path) -> str:
+    """What the list records of a tile: its hash, or "-" if it has no file, since no pixel of it is valid."""
+    return _file_hash(tile, tile.parent.parent) if tile.exists() else "-"
 
 
 def _read_list(path: Path) -> dict[str, str]:
@@ -242,26 +243,15 @@ def _profile(grid: Grid, part: Window) -> dict[str, Any]:
 
 
 def _write(
-    target: Path,
-    reader: GrayReader,
-    source: Grid,
-    grid: Grid,
-    part: Window,
-    progress: _Progress,
-    *,
-    is_corner: bool,
-) -> bool:
+    target: Path, grid: Grid, part: Window, blocks: Iterator[_Block], progress: _Progress, *, is_corner: bool
+) -> None:
     """Write a part of the copy under a temporary name and rename it, if it has a valid pixel or is a corner.
-
-    Returns:
-        Whether it was written.
 
     Raises:
         OSError: it cannot be written.
     """
     import rasterio
     from rasterio.enums import ColorInterp, Resampling
-    from rasterio.windows import Window as RasterWindow
 
     handle, name = tempfile.mkstemp(suffix=".part", dir=target.parent)
     os.close(handle)
@@ -269,9 +259,8 @@ def _write(
     try:
         with rasterio.open(name, "w", **_profile(grid, part)) as dataset:
             dataset.colorinterp = (ColorInterp.gray, ColorInterp.alpha)
-            for window, block in _copied(reader, source, grid, part):
-                corner = (window.x0 - part.x0, window.y0 - part.y0)
-                dataset.write(block, window=RasterWindow(*corner, window.width_px, window.height_px))
+            for window, block in blocks:
+                dataset.write(block, window=within(window, part))
                 is_kept = is_kept or bool(block[1].any())
                 progress.add(window.area_px)
             if is_large(grid):
@@ -282,4 +271,3 @@ def _write(
             target.unlink(missing_ok=True)
     finally:
         Path(name).unlink(missing_ok=True)
-    return is_kept

@@ -81,7 +81,7 @@ class PreparedMap:
         """
         step_px = 1 << MAX_HALVINGS  # so that the half-resolution levels fit
         x0, y0 = window.x0 & -step_px, window.y0 & -step_px
-        aligned = Window(x0, y0, window.x0 + window.width_px - x0, window.y0 + window.height_px - y0)
+        aligned = Window(x0, y0, window.x1 - x0, window.y1 - y0)
         region = self._region(aligned, level)
         i, j = aligned.x0 - region.window.x0, aligned.y0 - region.window.y0
         search = region.search.crop(i, j, aligned.width_px, aligned.height_px)
@@ -158,15 +158,14 @@ def enhanced_part(
 
 
 def _contains(region: Window, window: Window) -> bool:
-    right, bottom = window.x0 + window.width_px, window.y0 + window.height_px
-    across = region.x0 <= window.x0 and right <= region.x0 + region.width_px
-    return across and region.y0 <= window.y0 and bottom <= region.y0 + region.height_px
+    across = region.x0 <= window.x0 and window.x1 <= region.x1
+    return across and region.y0 <= window.y0 and window.y1 <= region.y1
 
 
 def _on_grid(window: Window, columns: int, rows: int) -> Window:
     """The window extended by half a tile to each side, then to whole tiles, and clipped at the level's edge."""
     ahead = TILE_PX // 2  # the next windows of a flight fall in the same region
     x0, y0 = (max(0, low - ahead) // TILE_PX * TILE_PX for low in (window.x0, window.y0))
-    x1 = min(columns, -(-(window.x0 + window.width_px + ahead) // TILE_PX) * TILE_PX)
-    y1 = min(rows, -(-(window.y0 + window.height_px + ahead) // TILE_PX) * TILE_PX)
+    x1 = min(columns, -(-(window.x1 + ahead) // TILE_PX) * TILE_PX)
+    y1 = min(rows, -(-(window.y1 + ahead) // TILE_PX) * TILE_PX)
     return Window(x0, y0, x1 - x0, y1 - y0)

@@ -5,42 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
 from engine.errors import OptionError
 from engine.maps.grids import Array
-from engine.maps.rasters import COARSE_LIMIT_PX, MEMORY_LIMIT_PX, Gray, Mask, scaled_window
+from engine.maps.rasters import COARSE_LIMIT_PX, MEMORY_LIMIT_PX, Gray, GrayReader, Mask, scaled_window
 from engine.values import Window
 
 MIN_LEVEL_PX = 16
-
-
-class Reader(Protocol):
-    """Source of pixels: a file, or arrays.
-
-    Attributes:
-        levels: the levels that can be read, ascending, including 0.
-        all_valid: whether no pixel can be nodata.
-    """
-
-    @property
-    def levels(self) -> tuple[int, ...]: ...  # noqa: D102
-
-    @property
-    def all_valid(self) -> bool: ...  # noqa: D102
-
-    def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
-        """Read a window.
-
-        Args:
-            window: in pixels of the level, inside it.
-            level: one of :attr:`levels`.
-
-        Returns:
-            (h, w) uint8 grey and (h, w) bool validity.
-        """
 
 
 @dataclass(frozen=True)
@@ -67,8 +40,11 @@ class ArrayReader:
         Returns:
             (h, w) uint8 grey and (h, w) bool validity, without a copy.
         """
-        part = np.s_[window.y0 : window.y0 + window.height_px, window.x0 : window.x0 + window.width_px]
-        return self.gray[part], self.valid[part]
+        return self.gray[window.slices], self.valid[window.slices]
+
+
+Reader = ArrayReader | GrayReader
+"""Source of pixels: arrays, or a file."""
 
 
 class Pyramid:
@@ -141,12 +117,10 @@ class Pyramid:
             OptionError: the window is empty or not inside, or there is no such level.
         """
         height, width = self.shape(level)
-        x1, y1 = window.x0 + window.width_px, window.y0 + window.height_px
-        if not (0 <= window.x0 < x1 <= width and 0 <= window.y0 < y1 <= height):
+        if not (0 <= window.x0 < window.x1 <= width and 0 <= window.y0 < window.y1 <= height):
             raise OptionError(f"window: expected one inside {width} x {height} px of level {level}, got {window}")
         if level >= self._base:
-            gray, valid = self._level(level)
-            return gray[window.y0 : y1, window.x0 : x1], valid[window.y0 : y1, window.x0 : x1]
+            return ArrayReader(*self._level(level)).read(window)
         last = self._last
         if last is None or last[0] != (window, level):  # grey and validity are often read in turn
             last = self._last = ((window, level), self._from_file(window, level))

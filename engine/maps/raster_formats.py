@@ -6,6 +6,7 @@ refers only to local raster files.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,7 +46,8 @@ _VRT_TAGS = frozenset(
         *("SrcRect", "DstRect", "NODATA", "UseMaskBand"),
     )
 )
-_TYPES = {"uint8": "Byte", "uint16": "UInt16", "int16": "Int16", "float32": "Float32", "float64": "Float64"}
+DTYPES = {"uint8": "Byte", "uint16": "UInt16", "int16": "Int16", "float32": "Float32", "float64": "Float64"}
+"""Element types of a map, with GDAL's names."""
 
 
 @dataclass(frozen=True)
@@ -114,11 +116,10 @@ def openable(path: Path, argument: str) -> tuple[str | Path, str]:
 def _check_geopackage(file: Path, argument: str) -> None:
     """Refuse a GeoPackage without a raster or with several: GDAL would open none of them."""
     import sqlite3
-    from contextlib import closing
 
     kinds = "'tiles', '2d-gridded-coverage'"
     try:
-        with closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
+        with contextlib.closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
             found = base.execute(f"SELECT table_name FROM gpkg_contents WHERE data_type IN ({kinds})").fetchall()
     except sqlite3.Error as error:
         raise MapError(f"{argument}: cannot read {file}: {error}") from None
@@ -165,10 +166,8 @@ def _rasters_in(folder: Path) -> list[tuple[Path, str]]:
     found = []
     for file in sorted(folder.iterdir()):
         if file.is_file() and file.suffix.lower() not in NO_TILES and not file.name.startswith("."):
-            try:
+            with contextlib.suppress(MapError):  # a licence, a world file, an index: not every file is a tile
                 found.append((file, driver_of(file, "")))
-            except MapError:
-                continue  # a licence, a world file, an index: not every file is a tile
     return [(file, driver) for file, driver in found if driver not in ("VRT", "MBTiles", "GPKG")]
 
 
@@ -179,8 +178,8 @@ def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
         if dataset.transform.is_identity:
             raise MapError(f"{argument}: expected a georeference in every tile of a folder, got none in {file}")
         bands, dtype = 3 if dataset.count >= 3 else 1, dataset.dtypes[0]
-        if dtype not in _TYPES:
-            raise MapError(f"{argument}: expected tiles of {', '.join(_TYPES)}, got {dtype} in {file}")
+        if dtype not in DTYPES:
+            raise MapError(f"{argument}: expected tiles of {', '.join(DTYPES)}, got {dtype} in {file}")
         if dataset.colorinterp[0].name == "palette":
             raise MapError(f"{argument}: expected tiles without a colour table, got one in {file}")
         return _Tile(
@@ -240,7 +239,7 @@ def _vrt_text(
         Xml.SubElement(metadata, "MDI", key=key).text = value
     _add_overviews(root, max(tiles, key=lambda tile: tile.size[0] * tile.size[1]).overviews)
     for band in range(1, bands + 1):
-        element = Xml.SubElement(root, "VRTRasterBand", dataType=_TYPES[dtype], band=str(band))
+        element = Xml.SubElement(root, "VRTRasterBand", dataType=DTYPES[dtype], band=str(band))
         Xml.SubElement(element, "ColorInterp").text = ("Red", "Green", "Blue")[band - 1] if bands == 3 else "Gray"
         Xml.SubElement(element, "Scale").text, Xml.SubElement(element, "Offset").text = repr(scale), repr(offset)
         if nodata != "None":
@@ -270,7 +269,7 @@ def _add_sources(
         if "mask" not in band:  # so that a tile is opened only when it is read
             rows, columns = (str(n) for n in tile.block)
             of = {"RasterXSize": width, "RasterYSize": height, "BlockXSize": columns, "BlockYSize": rows}
-            Xml.SubElement(source, "SourceProperties", of | {"DataType": _TYPES[tile.kind[1]]})
+            Xml.SubElement(source, "SourceProperties", of | {"DataType": DTYPES[tile.kind[1]]})
         Xml.SubElement(source, "SrcRect", xOff="0", yOff="0", xSize=width, ySize=height)
         Xml.SubElement(source, "DstRect", xOff=str(x), yOff=str(y), xSize=width, ySize=height)
         if nodata is not None:  # so that one tile's nodata does not hide another's pixels

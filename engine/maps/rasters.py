@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
 from engine.maps.grids import Array, Grid, earth_crs, wgs84
-from engine.maps.raster_formats import local_path, openable
+from engine.maps.raster_formats import DTYPES, local_path, openable
 from engine.values import MAX_SIGMA_M, Window
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ Mask = NDArray[np.bool_]
 Bounds = tuple[float, float, float, float]
 """West, south, east, north."""
 
-DTYPES = ("uint8", "uint16", "int16", "float32", "float64")
 COLLAR_SHARE = 0.005
 STRETCH_PERCENT = (2.0, 98.0)
 OVERVIEW_PX = 4096
@@ -276,15 +275,13 @@ class GrayReader:
     def _read(self, window: Window, size: tuple[int, int], *, smooth: bool = False) -> tuple[NDArray[Any], Mask]:
         """Bands and validity of a window in pixels of the file, resampled to ``size`` (rows, columns)."""
         from rasterio.enums import Resampling
-        from rasterio.windows import Window as RasterWindow
 
-        crop = RasterWindow(window.x0, window.y0, window.width_px, window.height_px)
         # GDAL reads the best overview; its pixels are offset from the level's if the size is not a multiple.
         how = Resampling.average if smooth and self._palette is None else Resampling.nearest
         shape = (len(self._bands), *size)
         with self._lock, map_errors("map", self._source.path):  # a GDAL dataset serves one thread at a time
-            data = self._source.dataset.read(self._bands, window=crop, out_shape=shape, resampling=how)
-            mask = self._source.dataset.dataset_mask(window=crop, out_shape=size)
+            data = self._source.dataset.read(self._bands, window=window.slices, out_shape=shape, resampling=how)
+            mask = self._source.dataset.dataset_mask(window=window.slices, out_shape=size)
         if self._palette is not None:
             data = self._palette[:, data[0]]
         valid = np.asarray(mask >= 128)
@@ -308,8 +305,8 @@ class GrayReader:
         for value, area in self._collars.items():
             height, width = area.shape
             grid, scale = self._source.grid, 2.0**level
-            y = (np.arange(window.y0, window.y0 + window.height_px) + 0.5) * scale * height / grid.height_px
-            x = (np.arange(window.x0, window.x0 + window.width_px) + 0.5) * scale * width / grid.width_px
+            y = (np.arange(window.y0, window.y1) + 0.5) * scale * height / grid.height_px
+            x = (np.arange(window.x0, window.x1) + 0.5) * scale * width / grid.width_px
             valid &= ~((data == value).all(axis=0) & area[np.ix_(y.astype(int), x.astype(int))])
         luma = _luma(data)
         if self._limits is None:

@@ -96,12 +96,10 @@ class SampleMap:
         shape = (picture.shape[0] // BLOCK_PX, picture.shape[1] // BLOCK_PX)
         rows, columns = _steepest(cv2.magnitude(across, down), shape)
         xy_px = self._site.full_from_level(np.stack([columns + cell.x0, rows + cell.y0], axis=-1), level)
-        weights = np.ones(len(rows))
+        weights = self._site.roughness_weight_at(xy_px, ROUGH_REACH_PX * 2.0**level)
         if mask is not None:
-            weights = mask[rows, columns].astype(np.float64)
-        height_m = self._site.surface_at(xy_px)
-        weights *= self._site.roughness_weight_at(xy_px, ROUGH_REACH_PX * 2.0**level)
-        points = np.column_stack([self._site.enu_from_pixel(xy_px), height_m])
+            weights = weights * mask[rows, columns]
+        points = np.column_stack([self._site.enu_from_pixel(xy_px), self._site.surface_at(xy_px)])
         per_px = np.stack([across[rows, columns], down[rows, columns]], axis=-1).astype(np.float64)
         metres_per_px = self._site.enu_jacobian(xy_px[len(xy_px) // 2]) * 2.0**level  # nearly constant over a cell
         gradients = per_px @ np.linalg.inv(metres_per_px)

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.maps.grids import Array, Grid, Warp, warp_between
+from engine.maps.grids import Array, Grid, Warp, square_lattice, warp_between
 from engine.maps.heights import SURFACE_LIMIT_PX, part_grid, read_heights, read_surface, surface_part
 from engine.maps.rasters import COARSE_LIMIT_PX, Source
 from engine.maps.tiles import TILE_PX
@@ -22,7 +22,7 @@ MAX_SPAN = 6
 """Lookups that span fewer tiles than this per side are read as one patch."""
 MAX_PATCHES = 16
 """Number of patches that are cached, of at most 9 MiB each."""
-_LATTICE = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 15)] * 2), axis=-1).reshape(-1, 2)
+_LATTICE = square_lattice(np.linspace(-1.0, 1.0, 15))
 """Sample positions of a plane fit, relative to half the side of the square."""
 _ROUNDS = 8
 _ON_PLANE_M = 0.3  # residual below which a height counts as on the plane

@@ -14,9 +14,8 @@ HALO_PX = 64
 
 def tiles_under(window: Window, side_px: int) -> list[tuple[int, int]]:
     """Row and column of the tiles that a window touches, row by row; they begin on multiples of their side."""
-    bottom, right = window.y0 + window.height_px - 1, window.x0 + window.width_px - 1
-    rows = range(window.y0 // side_px, bottom // side_px + 1)
-    columns = range(window.x0 // side_px, right // side_px + 1)
+    rows = range(window.y0 // side_px, (window.y1 - 1) // side_px + 1)
+    columns = range(window.x0 // side_px, (window.x1 - 1) // side_px + 1)
     return [(row, column) for row in rows for column in columns]
 
 
@@ -29,8 +28,7 @@ def tile_at(row: int, column: int, side_px: int, shape: tuple[int, int]) -> Wind
 def widened(window: Window, margin_px: int, shape: tuple[int, int]) -> Window:
     """A window with a margin around it, inside a level with this shape."""
     x0, y0 = max(0, window.x0 - margin_px), max(0, window.y0 - margin_px)
-    x1 = min(shape[1], window.x0 + window.width_px + margin_px)
-    y1 = min(shape[0], window.y0 + window.height_px + margin_px)
+    x1, y1 = min(shape[1], window.x1 + margin_px), min(shape[0], window.y1 + margin_px)
     return Window(x0, y0, x1 - x0, y1 - y0)
 
 

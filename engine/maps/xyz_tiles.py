@@ -36,14 +36,7 @@ MAX_ZOOM = 30
 MAX_SIDE_PX = 1_000_000
 """Largest side of a map."""
 RESOURCE = "tilemapresource.xml"
-_MERCATOR_CODES = (
-    "3857",
-    "3785",
-    "900913",
-    "41001",
-    "102100",
-    "102113",
-)  # current and former codes of Web Mercator
+_MERCATOR_CODES = ("3857", "3785", "900913", "41001", "102100", "102113")  # of Web Mercator, now and formerly
 _HALF_WORLD_M = math.pi * WGS84_A_M
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # Pillow's, of eight bits or fewer
 _NO_TILE_CODES = "200,204,404"  # of HTTP; of a file, 200 says that it is empty

@@ -75,7 +75,8 @@ def set_realtime(realtime: Realtime | None = None) -> None:
         BackendError: the system does not permit it; the message says which right is missing.
     """
     realtime = realtime or Realtime()
-    _check_system()
+    if sys.platform != "linux":
+        raise OptionError(f"realtime: expected Linux, got {sys.platform}")
     if realtime.cores:
         _pin(realtime.cores)
     if realtime.nice is None:
@@ -182,11 +183,6 @@ def limited_share() -> float:
 
 
 # ------------------------------------------------------------------------------------------------- system calls
-
-
-def _check_system() -> None:
-    if sys.platform != "linux":
-        raise OptionError(f"realtime: expected Linux, got {sys.platform}")
 
 
 def _pin(cores: tuple[int, ...]) -> None:
