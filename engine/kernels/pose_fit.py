@@ -85,7 +85,7 @@ def fit_pose(
     square = tolerance_px * tolerance_px
     reach = slack * slack * square
     variance, freedom, found = reach / 9.0, np.inf, True
-    rotation, center, before = rotation.copy(), center.copy(), rotation.copy()
+    rotation, center = rotation.copy(), center.copy()
     delta, angles, covariance = np.empty(_SIX), np.empty(3), np.empty((_SIX, _SIX))
     inliers, information = np.empty(weights.size, np.bool_), np.zeros((_SIX, _SIX))
     tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
@@ -115,8 +115,7 @@ def fit_pose(
         for i in range(3):
             for j in range(3):
                 center[i] += rotation[j, i] * delta[j]
-                before[i, j] = rotation[i, j]
-        turn(before, delta[3:], rotation)
+        turn(rotation.copy(), delta[3:], rotation)
         tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
         # The trace is the number of parameters that the matches determine; the prior determines the rest.
         freedom, mean = 2.0 * count - determined, 0.0
