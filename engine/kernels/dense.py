@@ -185,7 +185,9 @@ def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: Gaussia
         offset_m, samples.values, samples.gradients, samples.weights,
         _EDGE_PX, _CELLS, MIN_SAMPLES, MAX_STEPS, _EXCESS, _LAST_STEP**2,
     )  # fmt: skip
-    return DenseFit(Pose(rotation, center_m, slope), first_correlation, converged, offset_m, *seen) if found else None
+    if not found:
+        return None
+    return DenseFit(Pose(rotation, center_m, slope), first_correlation, converged, offset_m, *seen)
 
 
 def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
