@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from engine.errors import OptionError
 from engine.kernels import surface_loops
 from engine.kernels.accuracy import FLOAT32_NORM_RATIO
+from engine.kernels.sums import check_finite
 from engine.runtime.threads import in_parallel
 
 FloatImage = NDArray[np.float32]
@@ -48,18 +48,13 @@ def ncc_surface(search: FloatImage, templates: FloatImage, *, zero_mean: bool) -
     def one_window(b: int) -> None:
         mean, energy = surface_loops.moments(windows[b], zero_mean)
         models = [surface_loops.unit(picture, zero_mean) for picture in pictures[b]]
-        _check_finite("search", energy)
-        _check_finite("templates", sum(energy for _, energy in models))
+        check_finite("search", math.isfinite(energy))
+        check_finite("templates", math.isfinite(sum(energy for _, energy in models)))
         inverse_norms = surface_loops.inverse_norms(windows[b], mean, energy, h, w, zero_mean)
         correlate(out[b], windows[b], (mean, energy), inverse_norms, [model for model, _ in models])
 
     in_parallel(one_window, range(B))
     return out
-
-
-def _check_finite(name: str, energy: float) -> None:
-    if not math.isfinite(energy):
-        raise OptionError(f"{name}: expected finite values, got NaN or infinity")
 
 
 def inverse_norm(image: FloatImage, h: int, w: int) -> FloatImage:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from engine.kernels import blocks, surface_loops
 from engine.kernels.accuracy import FLAT_SHARE
 from engine.kernels.blocks import fast_side, spectrum_of, transform
-from engine.kernels.sums import check_finite, counts, counts_inside, integrals
+from engine.kernels.sums import box_sum, check_finite, counts, integrals
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -51,7 +51,8 @@ def ncc_surface(
     Raises:
         OptionError: NaN or infinity.
     """
-    check_finite(search=search, templates=templates)
+    check_finite("search", bool(np.isfinite(search).all()))
+    check_finite("templates", bool(np.isfinite(templates).all()))
     windows = zip(search, search_valid, templates, strict=True)
     return np.stack([_surfaces(*window, min_overlap) for window in windows])
 
@@ -69,7 +70,7 @@ def _surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_ov
         (T, H-h+1, W-w+1) in [-1, 1]: float32 if both pictures are, else float64.
     """
     h, w = templates.shape[1:]
-    common = counts_inside(counts(valid), h, w)
+    common = box_sum(counts(valid), h, w)
     is_single = window.dtype == templates.dtype == np.float32
     out = np.zeros((len(templates), *common.shape), np.float32 if is_single else np.float64)
     enough = common >= max(min_overlap * (h * w), 1.0)

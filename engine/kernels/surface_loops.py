@@ -263,7 +263,7 @@ def masked_scores(out, asked, sums, boxes, model, floors):
         for x in range(out.shape[1]):
             if not asked[y, x]:
                 continue
-            count = counts[y + h, x + w] - counts[y, x + w] - counts[y + h, x] + counts[y, x]
+            count = _box(counts, y, x, h, w)
             total, square = _box(integrals[0], y, x, h, w), _box(integrals[1], y, x, h, w)
             of_model = of_mask[y, x] * scale
             spread = square - total * total / count
