@@ -52,14 +52,13 @@ def match(
         from engine.sift.matching_tensors import match_tensors  # torch takes a while to import
 
         return match_tensors(query, train, limits, ratio)
-    index, distance, quotient, valid = _by_loops(_as_arrays(query), _as_arrays(train), limits, ratio)
-    return Matches(*(like(given, values) for values in (index, distance, quotient, valid)))
+    found = _by_loops(_as_arrays(query), _as_arrays(train), limits, ratio)
+    return Matches(*(like(given, values) for values in found))
 
 
 def _as_arrays(features: Features) -> Features:
     *numbers, valid = fields_of(features)
-    xy_px, scale_px, angle_deg, descriptors = (on_host(as_float(each, "float32")) for each in numbers)
-    return Features(xy_px, scale_px, angle_deg, descriptors, on_host(valid))
+    return Features(*(on_host(as_float(each, "float32")) for each in numbers), on_host(valid))
 
 
 def _by_loops(query: Features, train: Features, limits: Limits, ratio: float) -> tuple[AnyArray, ...]:
