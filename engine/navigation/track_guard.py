@@ -132,18 +132,13 @@ class TrackGuard:
         self._before = self._track  # as last vague, propagated without the fixes since
         self._rival: _Rival | None = None
         self._agreements = 0
-        self._distance_m = 0.0
+        self.distance_m = 0.0  # from the track to the last match
         self.has_fix = False  # whether one was sent to the autopilot
 
     @property
     def is_disputed(self) -> bool:
         """Whether matches contradict the track, so that it is unknown which of the two is right."""
         return self._rival is not None and self._rival.track.matches >= _IN_A_ROW
-
-    @property
-    def distance_m(self) -> float:
-        """How far the last match was from the track."""
-        return self._distance_m
 
     def confirm(self) -> None:
         """Continue the track at the next fix, wherever it is: an operator has confirmed it."""
@@ -184,7 +179,7 @@ class TrackGuard:
         if fix is None:
             return False
         track = self._track or _begun(_position(fix))
-        self._distance_m = float(np.hypot(*(en_m(fix) - track.en_m)))
+        self.distance_m = float(np.hypot(*(en_m(fix) - track.en_m)))
         contradicts = self._contradicts(track.estimate, fix)
         was_disputed = self.is_disputed
         continues = self._rival is not None and not self._contradicts(self._rival.track.estimate, fix)
