@@ -58,7 +58,8 @@ def match(
 
 def _as_arrays(features: Features) -> Features:
     *numbers, valid = fields_of(features)
-    return Features(*(on_host(as_float(each, "float32")) for each in numbers), on_host(valid))
+    xy_px, scale_px, angle_deg, descriptors = (on_host(as_float(each, "float32")) for each in numbers)
+    return Features(xy_px, scale_px, angle_deg, descriptors, on_host(valid))
 
 
 def _by_loops(query: Features, train: Features, limits: Limits, ratio: float) -> tuple[AnyArray, ...]:
