@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from engine.navigation.motion import Array, PositionEstimate, en_m
+from engine.navigation.odds import MIN_FRAMES
 from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason
 
 TOLERANCE_M = 5.0
 """Smaller contradictions are left to the estimator's own gate."""
-_IN_A_ROW = 3  # matches that contradict the track to start a dispute, or agree with it to end one
 _KNOWN_M = 50.0  # sigma up to which a track is known
 _MAX_GAP_S = 1.0  # longest gap between frames to integrate a stated velocity over
 
@@ -138,7 +138,7 @@ class TrackGuard:
     @property
     def is_disputed(self) -> bool:
         """Whether matches contradict the track, so that it is unknown which of the two is right."""
-        return self._rival is not None and self._rival.track.matches >= _IN_A_ROW
+        return self._rival is not None and self._rival.track.matches >= MIN_FRAMES
 
     def confirm(self) -> None:
         """Continue the track at the next fix, wherever it is: an operator has confirmed it."""
@@ -194,7 +194,7 @@ class TrackGuard:
             track = self._rival.track
         elif was_disputed:
             self._agreements += track.estimate.sigma_m <= _KNOWN_M
-            if self._agreements < _IN_A_ROW:
+            if self._agreements < MIN_FRAMES:
                 return False
         self._rival, self._agreements = None, 0
         if isinstance(result, NoFix):
@@ -211,7 +211,7 @@ class TrackGuard:
 
     def _is_right(self, rival: _Rival, track: _Track, fix: Fix) -> bool:
         """Whether the evidence favours a rival: the track has a fix or two, or the stated velocity misled it."""
-        if track.matches < _IN_A_ROW:
+        if track.matches < MIN_FRAMES:
             return self._before is None or not self._contradicts(self._before.estimate, fix)
         off_mps = rival.track.off_mps
         variance = max(rival.track.covariance[1, 1], self._sigma_mps**2)
