@@ -23,7 +23,7 @@ from engine.errors import OptionError
 from engine.geo import larger_variance
 from engine.matching.align import to_gray
 from engine.matching.covariance import with_frame_accuracy
-from engine.navigation.motion import GroundMotion
+from engine.navigation.motion import GroundMotion, velocity_of
 from engine.options import AssumedErrors
 from engine.values import Attitude, Frame
 
@@ -92,7 +92,7 @@ class VisualOdometry:
         self._camera.check_size(frame.image.shape)
         gray = to_gray(frame).copy()  # the buffer may be reused
         last, self._last = self._last, _Picture(frame, gray)
-        if frame.east_velocity_mps is not None and frame.north_velocity_mps is not None:
+        if velocity_of(frame) is not None:
             motion: GroundMotion | NoMotion = NoMotion("the velocity is known")
         elif last is None:
             motion = NoMotion("there is no picture before")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engine.navigation.motion import Array, PositionEstimate, en_m
+from engine.navigation.motion import Array, PositionEstimate, en_m, velocity_of
 from engine.navigation.odds import MIN_FRAMES
 from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason
@@ -157,12 +157,9 @@ class TrackGuard:
             return
         self._newest_ns = time_ns
         self._sigma_mps = self._unknown_mps
-        if (
-            frame.east_velocity_mps is not None
-            and frame.north_velocity_mps is not None
-            and elapsed_s <= _MAX_GAP_S
-        ):
-            self._stated_mps = np.array([frame.east_velocity_mps, frame.north_velocity_mps])
+        told_mps = velocity_of(frame)
+        if told_mps is not None and elapsed_s <= _MAX_GAP_S:
+            self._stated_mps = told_mps
             self._sigma_mps = frame.velocity_sigma_mps or self._options.measured_velocity_sigma_mps
         if self._track is not None:
             sigma_mps = math.hypot(self._sigma_mps, self._track.found_mps)
