@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import larger_variance
-from engine.matching.align import to_gray
+from engine.matching.acceptance import CHANCE
+from engine.matching.align import MAX_FIELD_DEG, to_gray
 from engine.matching.covariance import with_frame_accuracy
 from engine.navigation.motion import GroundMotion, velocity_of
 from engine.options import AssumedErrors
@@ -34,8 +35,7 @@ _SMALL_PX = 160  # width at which a shift is estimated
 _MAX_SIDE_PX = 640  # larger pictures are reduced first
 _WINDOW_PX = 15  # of Lucas-Kanade
 _APART_PX, _QUALITY = 8, 0.01  # distance between corners; weakest over strongest
-_RANSAC_PX, _RANSAC_CONFIDENCE = 1.5, 0.999
-_MAX_OFF_DEG = 70.0  # largest angle off the vertical of a point on the ground
+_RANSAC_PX = 1.5
 _STEPS, _CONVERGED = 6, 1e-6  # most Gauss-Newton steps; length of the last, as a share of the height
 _MIN_PX = 0.05  # of a point's error
 _HUBER_SIGMAS = 2.0
@@ -151,7 +151,7 @@ class VisualOdometry:
             return NoMotion(f"{len(begin_px)} points could be followed, {_MIN_POINTS} are needed")
         begin, end = camera.undistort_points(begin_px), camera.undistort_points(end_px)
         reach = _RANSAC_PX / camera.focal_px
-        _, found = cv2.findHomography(begin, end, cv2.RANSAC, reach, confidence=_RANSAC_CONFIDENCE)
+        _, found = cv2.findHomography(begin, end, cv2.RANSAC, reach, confidence=1.0 - CHANCE)
         kept = np.zeros(len(begin), bool) if found is None else found[:, 0] > 0
         if kept.sum() < max(_MIN_POINTS, _MIN_SHARE * len(kept)):
             return NoMotion(f"{kept.sum()} of {len(kept)} points agree on one motion")
@@ -263,7 +263,7 @@ class _View:
         """
         rays = np.column_stack([begin, np.ones(len(begin))]) @ self._begin.T
         steep = -rays[:, 2] / np.linalg.norm(rays, axis=1)
-        if steep.min() < math.cos(math.radians(_MAX_OFF_DEG)):
+        if steep.min() < math.cos(math.radians(MAX_FIELD_DEG)):
             return None
         ground_m = rays * (self._height_m / -rays[:, 2])[:, None]
         tilt_deg = _TILT_CHANGE_SIGMA_DEG if has_tilt else _LEVEL_DEG
