@@ -25,7 +25,8 @@ def _nearest(query: Features, train: Features, limits: Limits) -> tuple[Tensor, 
     """:func:`_two_nearest` over all train slots, by chunks that bound the memory."""
     found = []
     for start in range(0, max(1, train.valid.shape[1]), TRAIN_CHUNK):
-        first, index, second, is_mutual = _two_nearest(query, _slots(train, start, start + TRAIN_CHUNK), limits)
+        part = Features(*(values[:, start : start + TRAIN_CHUNK] for values in fields_of(train)))
+        first, index, second, is_mutual = _two_nearest(query, part, limits)
         found.append((first, index + start, second, is_mutual))
     return found[0] if len(found) == 1 else _merged(found)
 
@@ -33,11 +34,6 @@ def _nearest(query: Features, train: Features, limits: Limits) -> tuple[Tensor, 
 def _distance(cosine: Tensor) -> Tensor:
     """Distance of unit vectors; infinite for a forbidden pair."""
     return (2 - 2 * cosine).clamp_min_(0).sqrt_().masked_fill_(cosine < FORBIDDEN, torch.inf)
-
-
-def _slots(features: Features, start: int, end: int) -> Features:
-    """A range of the slots."""
-    return Features(*(values[:, start:end] for values in fields_of(features)))
 
 
 def _forbid(cosine: Tensor, query: Features, train: Features, limits: Limits) -> None:
