@@ -15,12 +15,13 @@ import cv2
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from engine.errors import OptionError
 from engine.kernels import surface_loops
 from engine.kernels.accuracy import FLOAT32_NORM_RATIO
+from engine.kernels.sums import check_finite
 from engine.runtime.threads import in_parallel
 
 FloatImage = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 # Transforms of longer sides leave the cache, and cost twice as much per pixel.
 _CACHED_SIDE = 1152
@@ -44,22 +45,33 @@ def ncc_surface(search: FloatImage, templates: FloatImage, *, zero_mean: bool) -
     (B, H, W), (T, h, w) = search.shape, templates.shape[1:]
     windows, pictures = np.ascontiguousarray(search), np.ascontiguousarray(templates)
     out = np.empty((B, T, H - h + 1, W - w + 1), np.float32)
-
-    def one_window(b: int) -> None:
-        mean, energy = surface_loops.moments(windows[b], zero_mean)
-        models = [surface_loops.unit(picture, zero_mean) for picture in pictures[b]]
-        _check_finite("search", energy)
-        _check_finite("templates", sum(energy for _, energy in models))
-        inverse_norms = surface_loops.inverse_norms(windows[b], mean, energy, h, w, zero_mean)
-        correlate(out[b], windows[b], (mean, energy), inverse_norms, [model for model, _ in models])
-
-    in_parallel(one_window, range(B))
+    in_parallel(lambda b: write_surfaces(out[b], windows[b], pictures[b], zero_mean=zero_mean), range(B))
     return out
 
 
-def _check_finite(name: str, energy: float) -> None:
-    if not math.isfinite(energy):
-        raise OptionError(f"{name}: expected finite values, got NaN or infinity")
+def write_surfaces(
+    out: FloatImage, window: FloatImage, templates: FloatImage, *, zero_mean: bool, asked: Mask | None = None
+) -> None:
+    """Write the scores of all templates in one window.
+
+    Args:
+        out: (T, H-h+1, W-w+1) takes the scores.
+        window: (H, W), contiguous.
+        templates: (T, h, w), contiguous.
+        zero_mean: subtract the means first.
+        asked: (H-h+1, W-w+1) bool; the scores are 0 elsewhere. None is everywhere.
+
+    Raises:
+        OptionError: NaN or infinity.
+    """
+    mean, energy = surface_loops.moments(window, zero_mean)
+    models = [surface_loops.unit(template, zero_mean) for template in templates]
+    check_finite("search", math.isfinite(energy))
+    check_finite("templates", math.isfinite(sum(energy for _, energy in models)))
+    inverse_norms = surface_loops.inverse_norms(window, mean, energy, *templates.shape[1:], zero_mean)
+    if asked is not None:
+        inverse_norms[~asked] = 0.0
+    correlate(out, window, (mean, energy), inverse_norms, [model for model, _ in models])
 
 
 def inverse_norm(image: FloatImage, h: int, w: int) -> FloatImage:

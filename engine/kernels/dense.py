@@ -109,12 +109,16 @@ class EnhancedFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class _Projection:
-    """All samples projected by a pose.
+class DenseFit:
+    """A refined pose, and the samples as they were projected before the last step.
 
     Attributes:
-        rotation: (3, 3) of the pose.
-        correlation: of picture and map at the visible samples.
+        pose: at which picture and map agree best.
+        first_correlation: of picture and map at the samples, at the pose to begin with.
+        converged: whether the last step was small.
+        offsets_m: (3, N) of the samples from the slope's pivot.
+        rotation: (3, 3) of the pose before the last step.
+        correlation: of picture and map at the samples that are visible from it.
         differences: (N,) of picture and map.
         points: (3, N) samples in the camera's axes.
         shown: (3, N) derivatives of the differences by the points, from the picture's gradients.
@@ -123,6 +127,10 @@ class _Projection:
         cells: (N,) cell of the picture.
     """
 
+    pose: Pose
+    first_correlation: float
+    converged: bool
+    offsets_m: Array
     rotation: Array
     correlation: float
     differences: Array
@@ -131,27 +139,6 @@ class _Projection:
     expected: Array
     weights: Array
     cells: NDArray[np.intp]
-
-
-@dataclass(frozen=True, slots=True)
-class DenseFit:
-    """A refined pose.
-
-    Attributes:
-        pose: at which picture and map agree best.
-        first_correlation: of picture and map at the samples, at the pose to begin with.
-        correlation: the same before the last step.
-        converged: whether the last step was small.
-        projection: of the samples before the last step.
-        offsets_m: (3, N) of the samples from the slope's pivot.
-    """
-
-    pose: Pose
-    first_correlation: float
-    correlation: float
-    converged: bool
-    projection: _Projection
-    offsets_m: Array
 
 
 def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> float:
@@ -200,9 +187,7 @@ def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: Gaussia
     )  # fmt: skip
     if not found:
         return None
-    projection = _Projection(*seen)
-    pose = Pose(rotation, center_m, slope)
-    return DenseFit(pose, first_correlation, projection.correlation, converged, projection, offset_m)
+    return DenseFit(Pose(rotation, center_m, slope), first_correlation, converged, offset_m, *seen)
 
 
 def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
@@ -221,12 +206,11 @@ def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
     """
     from engine.kernels import gauss_newton
 
-    seen = fit.projection
     own, common, of_map, by_cell = gauss_newton.information(
-        seen.shown, seen.expected, seen.points, fit.offsets_m, seen.rotation, seen.weights, seen.differences,
-        seen.cells, _CELLS**2,
+        fit.shown, fit.expected, fit.points, fit.offsets_m, fit.rotation, fit.weights, fit.differences, fit.cells,
+        _CELLS**2,
     )  # fmt: skip
-    variance = max(float(seen.weights @ seen.differences**2 / seen.weights.sum()), 1e-12)
+    variance = max(float(fit.weights @ fit.differences**2 / fit.weights.sum()), 1e-12)
     reference = _inverse(own / variance + prior.precision)
     if reference is None:
         return None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from engine.kernels.small_matrices import pixel_of, rotated
 from engine.runtime.jit import compiled, inlined
 
 # Median absolute differences at which the weight reaches 0: 4.685 standard deviations for Tukey's biweight, and
@@ -45,11 +46,11 @@ def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradi
     right, bottom, count = width - 1.0 - edge_px, height - 1.0 - edge_px, 0
     for n in range(samples):
         e, north, up = _from_camera(offset_m, n, shift, slope)
-        points[0, n], points[1, n], points[2, n] = x, y, z = _rotated(rotation, e, north, up)
+        points[0, n], points[1, n], points[2, n] = x, y, z = rotated(rotation, e, north, up)
         if known[n] <= 0.0 or z <= 1e-6:
             continue
         across, down = x / z, y / z
-        u, v = _pixel(matrix, across, down)
+        u, v = pixel_of(matrix, across, down)
         if not (edge_px < u < right and edge_px < v < bottom):
             continue
         levels[n], by_u, by_v = _bilinear(picture, u, v)
@@ -74,19 +75,6 @@ def _from_map(expected, rotation, gradients, n, e, north, up):
     by_up = -(by_e * e + by_n * north) / min(up, -1e-6)
     for k in range(3):
         expected[k, n] = rotation[k, 0] * by_e + rotation[k, 1] * by_n + rotation[k, 2] * by_up
-
-
-@inlined
-def _rotated(rotation, a, b, c):
-    x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c
-    y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c
-    return x, y, rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c
-
-
-@inlined
-def _pixel(matrix, across, down):
-    u = matrix[0, 0] * across + matrix[0, 1] * down + matrix[0, 2]
-    return u, matrix[1, 0] * across + matrix[1, 1] * down + matrix[1, 2]
 
 
 @inlined

@@ -52,12 +52,10 @@ def gauss_newton(
         (3, N), derivatives (3, N) by the picture and by the map, weights (N,) and cells (N,).
     """
     rotation, center_m, slope = rotation.copy(), center_m.copy(), slope.copy()
-    seen, step, off = rotation.copy(), np.zeros(_PARAMETERS), np.zeros(_PARAMETERS)
+    step, off = np.zeros(_PARAMETERS), np.zeros(_PARAMETERS)
     found, converged, at_first = True, False, np.nan
     while True:
-        for i in range(3):
-            for j in range(3):
-                seen[i, j] = rotation[i, j]
+        seen = rotation.copy()
         levels, points, shown, expected, weights, cell, count = project(
             picture, matrix, seen, center_m, slope, offset_m, prior_center_m, gradients, known, edge_px, cells
         )

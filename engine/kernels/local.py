@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.accuracy import FLAT_SHARE
-from engine.kernels.sums import counts_inside
+from engine.kernels.sums import box_sum
 
 FloatImage = NDArray[np.float32]
 Sums = NDArray[np.float64]
@@ -60,13 +60,13 @@ class LocalScores:
         self._count: NDArray[np.float64] | None = None
         if counts is not None:
             counts = counts[y0 : y1 + h + 1, x0 : x1 + w + 1]
-            count = counts_inside(counts, h, w)
+            count = box_sum(counts, h, w)
             if (count < h * w).any():
                 self._mask(counts, count.astype(np.float64), square, max(min_overlap * (h * w), 1.0))
 
     def _mask(self, counts: Counts, count: Sums, square: Sums, least: float) -> None:
         """Prepare the sums of positions that reach over the mask's edge."""
-        valid = counts_inside(counts, 1, 1).astype(np.float32)
+        valid = box_sum(counts, 1, 1).astype(np.float32)
         self._valid, self._squares = valid.ravel(), self._template * self._template
         self._count, self._least = count, least
         self._spread = square - self._total * self._total / np.maximum(count, 1.0)

@@ -12,13 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels import blocks, surface_loops
+from engine.kernels import surface_loops
 from engine.kernels.accuracy import FLAT_SHARE
-from engine.kernels.blocks import fast_side, spectrum_of, transform
-from engine.kernels.sums import check_finite, counts, counts_inside, integrals
+from engine.kernels.blocks import Mask, fast_side, spectrum_of, transform, write_surfaces
+from engine.kernels.sums import box_sum, check_finite, counts, integrals
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _SMALL_PX = 1 << 17  # windows up to this size are neither split nor scored in two ways
 _DIVISIONS = (1, 2, 3, 4, 6, 8, 12, 16)  # of a surface along each axis
@@ -51,7 +50,8 @@ def ncc_surface(
     Raises:
         OptionError: NaN or infinity.
     """
-    check_finite(search=search, templates=templates)
+    check_finite("search", bool(np.isfinite(search).all()))
+    check_finite("templates", bool(np.isfinite(templates).all()))
     windows = zip(search, search_valid, templates, strict=True)
     return np.stack([_surfaces(*window, min_overlap) for window in windows])
 
@@ -69,7 +69,7 @@ def _surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_ov
         (T, H-h+1, W-w+1) in [-1, 1]: float32 if both pictures are, else float64.
     """
     h, w = templates.shape[1:]
-    common = counts_inside(counts(valid), h, w)
+    common = box_sum(counts(valid), h, w)
     is_single = window.dtype == templates.dtype == np.float32
     out = np.zeros((len(templates), *common.shape), np.float32 if is_single else np.float64)
     enough = common >= max(min_overlap * (h * w), 1.0)
@@ -80,22 +80,11 @@ def _surfaces(window: NDArray[Any], valid: Mask, templates: NDArray[Any], min_ov
         asked = enough & ~whole
         if whole.any():
             centred = np.where(valid, window - np.float64(mean), 0.0).astype(np.float32)
-            _score_whole(out, centred, np.ascontiguousarray(templates), whole)
+            write_surfaces(out, centred, np.ascontiguousarray(templates), zero_mean=True, asked=whole)
     if asked.any():
         _score_partial(out, (window, valid, mean), templates, asked)
     out[:, ~enough] = -1.0
     return out
-
-
-def _score_whole(
-    out: NDArray[np.float32], centred: NDArray[np.float32], templates: NDArray[np.float32], whole: Mask
-) -> None:
-    """Write the scores of places without invalid pixels, and 0 elsewhere."""
-    moments = surface_loops.moments(centred, True)
-    models = [surface_loops.unit(template, True)[0] for template in templates]
-    inverse_norms = surface_loops.inverse_norms(centred, *moments, *templates.shape[1:], True)
-    inverse_norms[~whole] = 0.0
-    blocks.correlate(out, centred, moments, inverse_norms, models)
 
 
 def _score_partial(

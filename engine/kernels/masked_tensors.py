@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 
 from engine.kernels.accuracy import FLAT_SHARE
-from engine.kernels.tensors import check_finite
+from engine.kernels.tensors import check_all_finite
 from engine.runtime.tensors import Tensor, torch
 
 
@@ -48,7 +48,7 @@ def ncc_surface(search: Tensor, search_valid: Tensor, templates: Tensor, *, min_
     scores = numerator / (spread_i.clamp_min(0.0) * spread_t.clamp_min(0.0)).sqrt().clamp_min(1e-300)
     scores = torch.where(textured, scores, 0.0).clamp_(-1.0, 1.0)
     scores = torch.where(common >= max(min_overlap * (h * w), 1.0), scores, -1.0)
-    check_finite(search=search, templates=templates)  # last: the host waits for it
+    check_all_finite(search=search, templates=templates)  # last: the host waits for it
     return scores
 
 

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from engine.kernels.small_matrices import mirror, solve, turn, turn_between
+from engine.kernels.small_matrices import mirror, pixel_of, rotated, solve, turn, turn_between
 from engine.runtime.jit import compiled, inlined
 
 _SIX = 6
@@ -35,9 +35,7 @@ def reproject(points, pixels, matrix, rotation, center):
     tangents, projected, squared = np.empty((3, count)), np.empty((2, count)), np.empty(count)
     for n in range(count):
         x, y, z = points[0, n] - center[0], points[1, n] - center[1], points[2, n] - center[2]
-        across = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
-        down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
-        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        across, down, depth = rotated(rotation, x, y, z)
         is_behind = depth < 1e-9
         near = 1.0 if is_behind else 1.0 / depth
         u, v = across * near, down * near
@@ -45,8 +43,7 @@ def reproject(points, pixels, matrix, rotation, center):
         if is_behind:
             projected[0, n] = projected[1, n] = _FAR_PX
         else:
-            projected[0, n] = matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]
-            projected[1, n] = matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]
+            projected[0, n], projected[1, n] = pixel_of(matrix, u, v)
         squared[n] = (projected[0, n] - pixels[0, n]) ** 2 + (projected[1, n] - pixels[1, n]) ** 2
     return tangents, projected, squared
 
@@ -85,7 +82,7 @@ def fit_pose(
     square = tolerance_px * tolerance_px
     reach = slack * slack * square
     variance, freedom, found = reach / 9.0, np.inf, True
-    rotation, center, before = rotation.copy(), center.copy(), rotation.copy()
+    rotation, center = rotation.copy(), center.copy()
     delta, angles, covariance = np.empty(_SIX), np.empty(3), np.empty((_SIX, _SIX))
     inliers, information = np.empty(weights.size, np.bool_), np.zeros((_SIX, _SIX))
     tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
@@ -115,8 +112,7 @@ def fit_pose(
         for i in range(3):
             for j in range(3):
                 center[i] += rotation[j, i] * delta[j]
-                before[i, j] = rotation[i, j]
-        turn(before, delta[3:], rotation)
+        turn(rotation.copy(), delta[3:], rotation)
         tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
         # The trace is the number of parameters that the matches determine; the prior determines the rest.
         freedom, mean = 2.0 * count - determined, 0.0

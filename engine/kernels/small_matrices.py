@@ -10,6 +10,21 @@ import numpy as np
 from engine.runtime.jit import compiled, inlined
 
 
+@inlined
+def rotated(rotation, a, b, c):
+    """A vector by a rotation (3, 3)."""
+    x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c
+    y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c
+    return x, y, rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c
+
+
+@inlined
+def pixel_of(matrix, across, down):
+    """The pixel of the ray (across, down, 1) in a pinhole camera (3, 3)."""
+    u = matrix[0, 0] * across + matrix[0, 1] * down + matrix[0, 2]
+    return u, matrix[1, 0] * across + matrix[1, 1] * down + matrix[1, 2]
+
+
 @compiled()
 def mirror(matrix):
     """Complete a symmetric matrix (N, N) from its lower triangle, in place."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import cv2
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.runtime.device import Picture
 
 
 def integrals(image: NDArray[Any]) -> NDArray[np.float64]:
@@ -40,18 +40,10 @@ def halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def check_finite(**arrays: NDArray[Any]) -> None:
-    """Check that no value is NaN or infinity; a finite sum implies that.
-
-    Args:
-        arrays: by the name of the argument, of any shape.
-
-    Raises:
-        OptionError: one is.
-    """
-    for name, array in arrays.items():
-        if not (math.isfinite(array.sum(dtype=np.float64)) or np.isfinite(array).all()):
-            raise OptionError(f"{name}: expected finite values, got NaN or infinity")
+def check_finite(name: str, is_finite: bool) -> None:
+    """Raise OptionError if the values of the argument of this name are not all finite."""
+    if not is_finite:
+        raise OptionError(f"{name}: expected finite values, got NaN or infinity")
 
 
 def counts(valid: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -66,15 +58,18 @@ def counts(valid: NDArray[np.bool_]) -> NDArray[np.int32]:
     return np.asarray(cv2.integral(np.ascontiguousarray(valid).view(np.uint8)))
 
 
-def counts_inside(counts: NDArray[np.int32], h: int, w: int) -> NDArray[np.int32]:
-    """Number of valid pixels in every patch.
+def box_sum(running: Picture, h: int, w: int) -> Picture:
+    """Sums over every patch.
 
     Args:
-        counts: (H+1, W+1) from :func:`counts`, or a crop of a larger mask's.
+        running: (..., H+1, W+1) running sums, such as :func:`counts`, or a crop of a larger picture's.
         h: rows of a patch.
         w: columns of a patch.
 
     Returns:
-        (H-h+1, W-w+1) int32.
+        (..., H-h+1, W-w+1) of the same type.
     """
-    return np.asarray(counts[h:, w:] - counts[:-h, w:] - counts[h:, :-w] + counts[:-h, :-w])
+    sums = running[..., h:, w:] - running[..., :-h, w:]
+    sums -= running[..., h:, :-w]
+    sums += running[..., :-h, :-w]
+    return sums

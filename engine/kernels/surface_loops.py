@@ -71,7 +71,10 @@ def inverse_norms(window, mean, energy, h, w, zero_mean):
     floor, share = FLAT_SHARE * energy, 1.0 / (1.0 * h * w) if zero_mean else 0.0
     down, down_squares = np.zeros(columns), np.zeros(columns)
     along, along_squares = np.zeros(columns + 1), np.zeros(columns + 1)
-    spreads, (unit_energy, unit_norm) = np.empty(width, np.float32), _units(energy)
+    spreads = np.empty(width, np.float32)
+    # Patches are counted in the window's energy and norm, for float32 to hold them.
+    unit_energy = 1.0 / energy if energy > 0.0 else 0.0
+    unit_norm = np.float32(1.0 / math.sqrt(energy) if energy > 0.0 else 0.0)
     for y in range(height):
         _sum_rows(down, down_squares, window, y, h, mean)
         _sum_along(along, along_squares, down, down_squares)
@@ -128,14 +131,6 @@ def _sum_along(along, along_squares, down, down_squares):
         total += down[x]
         square += down_squares[x]
         along[x + 1], along_squares[x + 1] = total, square
-
-
-@inlined
-def _units(energy):
-    """Reciprocals of a window's energy and norm: patches are counted in these, for float32 to hold them."""
-    if energy <= 0.0:
-        return 0.0, np.float32(0.0)
-    return 1.0 / energy, np.float32(1.0 / math.sqrt(energy))
 
 
 @inlined
@@ -263,7 +258,7 @@ def masked_scores(out, asked, sums, boxes, model, floors):
         for x in range(out.shape[1]):
             if not asked[y, x]:
                 continue
-            count = counts[y + h, x + w] - counts[y, x + w] - counts[y + h, x] + counts[y, x]
+            count = _box(counts, y, x, h, w)
             total, square = _box(integrals[0], y, x, h, w), _box(integrals[1], y, x, h, w)
             of_model = of_mask[y, x] * scale
             spread = square - total * total / count

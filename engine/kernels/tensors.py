@@ -10,8 +10,8 @@ import math
 
 import cv2
 
-from engine.errors import OptionError
 from engine.kernels.accuracy import FLAT_SHARE
+from engine.kernels.sums import box_sum, check_finite
 from engine.runtime.tensors import Tensor, torch
 
 # Lower bound on a template's norm; a template of zeros scores 0.
@@ -20,7 +20,7 @@ _TINY = 1e-12
 _CHUNK_NUMBERS = 1 << 24
 
 
-def check_finite(**tensors: Tensor) -> None:
+def check_all_finite(**tensors: Tensor) -> None:
     """Check that no value is NaN or infinity; finite sums imply that, are faster, and are copied at once.
 
     Args:
@@ -31,8 +31,7 @@ def check_finite(**tensors: Tensor) -> None:
     """
     totals = torch.stack([tensor.detach().sum().double() for tensor in tensors.values()]).cpu().tolist()
     for (name, tensor), total in zip(tensors.items(), totals, strict=True):
-        if not (math.isfinite(total) or bool(torch.isfinite(tensor).all())):
-            raise OptionError(f"{name}: expected finite values, got NaN or infinity")
+        check_finite(name, math.isfinite(total) or bool(torch.isfinite(tensor).all()))
 
 
 def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor:
@@ -61,7 +60,7 @@ def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True, dtype=torch.float64)
     normal = templates.double() / norm.clamp_min(_TINY)  # a flat template is all zeros, and scores 0 everywhere
     scores = correlate(search.double(), normal).mul_(energy.rsqrt_()[:, None]).clamp_(-1.0, 1.0)
-    check_finite(**given)  # last: the host waits for it
+    check_all_finite(**given)  # last: the host waits for it
     return scores.to(search.dtype)
 
 
@@ -162,20 +161,6 @@ def integrals(image: Tensor) -> Tensor:
     """
     wide = torch.nn.functional.pad(image.double(), (1, 0, 1, 0))
     return torch.stack([wide, wide.square()]).cumsum_(-1).cumsum_(-2)
-
-
-def box_sum(total: Tensor, h: int, w: int) -> Tensor:
-    """Sums over every patch.
-
-    Args:
-        total: (..., H+1, W+1) running sums, or a crop of a larger picture's.
-        h: rows of a patch.
-        w: columns of a patch.
-
-    Returns:
-        (..., H-h+1, W-w+1).
-    """
-    return (total[..., h:, w:] - total[..., :-h, w:]).sub_(total[..., h:, :-w]).add_(total[..., :-h, :-w])
 
 
 def box_energy(sums: Tensor, h: int, w: int) -> Tensor:

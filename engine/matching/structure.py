@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance, orientation
-from engine.kernels.sums import counts, counts_inside
+from engine.kernels.sums import box_sum, counts
 from engine.matching.correlation import MIN_VALID_SHARE, Aligned, Correlator
 from engine.matching.peak_evidence import PeakCandidate, candidate_of
 from engine.ncc_fft import ncc
@@ -94,7 +94,7 @@ def _scores(
 
 def _share_on_map(valid: NDArray[np.bool_], height: int, width: int) -> NDArray[np.float64]:
     """Share of the template's pixels on valid map at every place (H', W')."""
-    return np.asarray(counts_inside(counts(valid), height, width) / (height * width), np.float64)
+    return np.asarray(box_sum(counts(valid), height, width) / (height * width), np.float64)
 
 
 def _channels(gray: NDArray[np.uint8], radius_px: int, valid: NDArray[np.bool_] | None) -> FloatImage:

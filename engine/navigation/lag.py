@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
 from engine.geo import enu_from_body
+from engine.navigation.odometry import small_shift
 
 Array = NDArray[np.float64]
 
@@ -18,7 +18,6 @@ _STEP_S = 0.002
 _MIN_PICTURES = 30
 _MIN_CORRELATION = 0.8
 _MIN_TURN_DEG = 0.2  # root mean square, between pictures
-_SMALL_PX = 160  # width to which pictures are reduced for comparison
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +39,8 @@ def turn_between(first: NDArray[np.uint8], second: NDArray[np.uint8], focal_px: 
     Returns:
         Radians.
     """
-    scale = _SMALL_PX / first.shape[1]
-    size = (_SMALL_PX, max(8, round(first.shape[0] * scale)))
-    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) for image in (first, second)]
-    (right, down), _ = cv2.phaseCorrelate(*small, cv2.createHanningWindow(size, cv2.CV_32F))
-    return math.atan2(math.hypot(right, down), focal_px * scale)
+    shift, (width, _) = small_shift(first, second)
+    return math.atan2(math.hypot(*shift), focal_px * (width / first.shape[1]))
 
 
 def camera_lag(times_s: Array, turns_rad: Array, attitude: Array, mount: Array, max_lag_s: float = 0.6) -> Lag:

@@ -12,6 +12,9 @@ MAX_PROBABILITY = 0.9999
 UNSTATED_PROBABILITY = 0.999
 """Of a match that states none, as the paper's: enough for a navigator by default if nothing contradicts it."""
 
+MIN_FRAMES = 3
+"""Frames that must show the same before it counts: one or two of them may be wrong."""
+
 
 def stated_nats(fix: Fix) -> float:
     """Log-odds of a match by itself, if every second frame shows a place in its window."""

@@ -21,21 +21,21 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import larger_variance
-from engine.matching.align import to_gray
+from engine.matching.acceptance import CHANCE
+from engine.matching.align import MAX_FIELD_DEG, to_gray
 from engine.matching.covariance import with_frame_accuracy
-from engine.navigation.motion import GroundMotion
+from engine.navigation.motion import GroundMotion, velocity_of
 from engine.options import AssumedErrors
 from engine.values import Attitude, Frame
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-_SMALL_PX = 160  # width at which a first shift is estimated
+_SMALL_PX = 160  # width at which a shift is estimated
 _MAX_SIDE_PX = 640  # larger pictures are reduced first
-_LEVELS, _WINDOW_PX = 3, 15  # of Lucas-Kanade
+_WINDOW_PX = 15  # of Lucas-Kanade
 _APART_PX, _QUALITY = 8, 0.01  # distance between corners; weakest over strongest
-_RANSAC_PX, _RANSAC_CONFIDENCE = 1.5, 0.999
-_MAX_OFF_DEG = 70.0  # largest angle off the vertical of a point on the ground
+_RANSAC_PX = 1.5
 _STEPS, _CONVERGED = 6, 1e-6  # most Gauss-Newton steps; length of the last, as a share of the height
 _MIN_PX = 0.05  # of a point's error
 _HUBER_SIGMAS = 2.0
@@ -92,7 +92,7 @@ class VisualOdometry:
         self._camera.check_size(frame.image.shape)
         gray = to_gray(frame).copy()  # the buffer may be reused
         last, self._last = self._last, _Picture(frame, gray)
-        if frame.east_velocity_mps is not None and frame.north_velocity_mps is not None:
+        if velocity_of(frame) is not None:
             motion: GroundMotion | NoMotion = NoMotion("the velocity is known")
         elif last is None:
             motion = NoMotion("there is no picture before")
@@ -151,7 +151,7 @@ class VisualOdometry:
             return NoMotion(f"{len(begin_px)} points could be followed, {_MIN_POINTS} are needed")
         begin, end = camera.undistort_points(begin_px), camera.undistort_points(end_px)
         reach = _RANSAC_PX / camera.focal_px
-        _, found = cv2.findHomography(begin, end, cv2.RANSAC, reach, confidence=_RANSAC_CONFIDENCE)
+        _, found = cv2.findHomography(begin, end, cv2.RANSAC, reach, confidence=1.0 - CHANCE)
         kept = np.zeros(len(begin), bool) if found is None else found[:, 0] > 0
         if kept.sum() < max(_MIN_POINTS, _MIN_SHARE * len(kept)):
             return NoMotion(f"{kept.sum()} of {len(kept)} points agree on one motion")
@@ -211,8 +211,7 @@ def track_corners(earlier: Gray, later: Gray, expected: Array) -> tuple[Array, A
     if not len(start):
         return none, none
     shown = cv2.warpPerspective(earlier, expected, size, borderMode=cv2.BORDER_REPLICATE)
-    window = (_WINDOW_PX, _WINDOW_PX)
-    end, found, _ = cv2.calcOpticalFlowPyrLK(shown, later, start, None, winSize=window, maxLevel=_LEVELS)
+    end, found, _ = cv2.calcOpticalFlowPyrLK(shown, later, start, None, winSize=(_WINDOW_PX, _WINDOW_PX))
     good = found[:, 0] > 0
     return begin[good, 0].astype(np.float64), end[good, 0].astype(np.float64)
 
@@ -220,12 +219,26 @@ def track_corners(earlier: Gray, later: Gray, expected: Array) -> tuple[Array, A
 def _shifted(earlier: Gray, later: Gray, expected: Array) -> Array:
     """The expected homography and the shift that small pictures show beyond it, by phase correlation."""
     shown = cv2.warpPerspective(earlier, expected, later.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
-    size = (_SMALL_PX, max(8, round(later.shape[0] * _SMALL_PX / later.shape[1])))
-    small = [cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32) for gray in (shown, later)]
-    (right, down), _ = cv2.phaseCorrelate(*small, cv2.createHanningWindow(size, cv2.CV_32F))
+    (right, down), (width, height) = small_shift(shown, later)
     shift = np.eye(3)
-    shift[:2, 2] = right * later.shape[1] / size[0], down * later.shape[0] / size[1]
+    shift[:2, 2] = right * later.shape[1] / width, down * later.shape[0] / height
     return np.asarray(shift @ expected)
+
+
+def small_shift(first: Gray, second: Gray) -> tuple[tuple[float, float], tuple[int, int]]:
+    """The shift from one picture to another by phase correlation of both at a small size.
+
+    Args:
+        first: (H, W) uint8.
+        second: the same.
+
+    Returns:
+        Pixels right and down at the small size; and its width and height.
+    """
+    size = (_SMALL_PX, max(8, round(second.shape[0] * _SMALL_PX / second.shape[1])))
+    small = [cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32) for gray in (first, second)]
+    (right, down), _ = cv2.phaseCorrelate(*small, cv2.createHanningWindow(size, cv2.CV_32F))
+    return (right, down), size
 
 
 class _View:
@@ -250,7 +263,7 @@ class _View:
         """
         rays = np.column_stack([begin, np.ones(len(begin))]) @ self._begin.T
         steep = -rays[:, 2] / np.linalg.norm(rays, axis=1)
-        if steep.min() < math.cos(math.radians(_MAX_OFF_DEG)):
+        if steep.min() < math.cos(math.radians(MAX_FIELD_DEG)):
             return None
         ground_m = rays * (self._height_m / -rays[:, 2])[:, None]
         tilt_deg = _TILT_CHANGE_SIGMA_DEG if has_tilt else _LEVEL_DEG

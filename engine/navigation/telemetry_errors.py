@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.geo import wrap_heading_deg
 from engine.matching.covariance import scale_doubt_m
+from engine.navigation.odds import MIN_FRAMES
 from engine.options import AssumedErrors, NavigatorOptions
 from engine.values import Attitude, Fix, Frame
 
@@ -33,9 +34,8 @@ _SCATTER_SHARE = 0.2  # weight of a new difference in the mean square
 _MAX_INTERVAL_S = 0.5  # between frames; over longer ones the turn rates are unknown
 _MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
 _MAX_LAG_DEG = 180.0  # timestamps in a wrong unit make rates of any size
-_MIN_FIXES = 3  # fewer are not used for correction: one of them may be wrong
 _MIN_SIGMAS, _MIN_SHARE = 2.0, 0.03  # of an error before it is corrected: every frame's matching allows for less
-_FIRST_SEARCH, _SEARCH_GROWTH = 3, 1.5  # refusals in a row before a search; growth until the next
+_SEARCH_GROWTH = 1.5  # of the refusals in a row before the next search
 _DOUBTED_HEADING_DEG, _DOUBTED_SHARE = 8.0, 0.07  # standard deviations of a heading and a height to search for
 
 
@@ -122,7 +122,7 @@ class TelemetryErrors:
         self._turn: _Turn | None = None  # from the frame before to the newest
         self._seen: _Seen | None = None  # what the newest frame's fix measured
         self._height_m: float | None = None
-        self._next_search = _FIRST_SEARCH  # refusals in a row at which heading and height are searched
+        self._next_search = MIN_FRAMES  # refusals in a row at which heading and height are searched
         self._settling = 0  # further fixes needed before a search's result is applied
         self._searched = False  # whether the newest frame is the first of a search
 
@@ -165,11 +165,11 @@ class TelemetryErrors:
             return shown
         self._searched = refusals >= self._next_search
         if self._searched:
-            self._next_search, self._settling = math.ceil(_SEARCH_GROWTH * refusals), _MIN_FIXES
+            self._next_search, self._settling = math.ceil(_SEARCH_GROWTH * refusals), MIN_FRAMES
         elif refusals:
             self._settling = 0
         else:
-            self._next_search = _FIRST_SEARCH
+            self._next_search = MIN_FRAMES
         return self._doubted(shown) if self._settling else shown
 
     def _doubted(self, frame: Frame) -> Frame:
@@ -201,7 +201,7 @@ class TelemetryErrors:
         heading_deg = frame.heading_sigma_deg or self._assumed.heading_deg
         off: Array = np.zeros(3)
         wider_deg2 = rates_dps**2 * (variance[_LAG] + self._jitter_s**2)
-        if self._attitudes >= _MIN_FIXES:
+        if self._attitudes >= MIN_FRAMES:
             is_off = np.abs(self._mean[_ANGLES]) > _MIN_SIGMAS * np.array([tilt_deg, tilt_deg, heading_deg])
             off = is_off.astype(np.float64)
             wider_deg2 = wider_deg2 + variance[_ANGLES] * off + self._scatter_deg2
@@ -221,7 +221,7 @@ class TelemetryErrors:
     def _at_its_height(self, frame: Frame) -> Frame:
         """The frame at the height that pictures measured, if it differs by more than a match tolerates."""
         share, sigma = float(self._mean[_HEIGHT]), math.sqrt(self._covariance[_HEIGHT, _HEIGHT])
-        is_known = self._heights >= _MIN_FIXES and abs(share) > max(_MIN_SHARE, _MAX_SIGMAS * sigma)
+        is_known = self._heights >= MIN_FRAMES and abs(share) > max(_MIN_SHARE, _MAX_SIGMAS * sigma)
         if frame.height_agl_m is None or not is_known or share <= -1.0:
             return frame
         return replace(frame, height_agl_m=(1.0 + share) * frame.height_agl_m)

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engine.navigation.motion import Array, PositionEstimate, en_m
+from engine.navigation.motion import Array, PositionEstimate, en_m, velocity_of
+from engine.navigation.odds import MIN_FRAMES
 from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason
 
 TOLERANCE_M = 5.0
 """Smaller contradictions are left to the estimator's own gate."""
-_IN_A_ROW = 3  # matches that contradict the track to start a dispute, or agree with it to end one
 _KNOWN_M = 50.0  # sigma up to which a track is known
 _MAX_GAP_S = 1.0  # longest gap between frames to integrate a stated velocity over
 
@@ -132,18 +132,13 @@ class TrackGuard:
         self._before = self._track  # as last vague, propagated without the fixes since
         self._rival: _Rival | None = None
         self._agreements = 0
-        self._distance_m = 0.0
+        self.distance_m = 0.0  # from the track to the last match
         self.has_fix = False  # whether one was sent to the autopilot
 
     @property
     def is_disputed(self) -> bool:
         """Whether matches contradict the track, so that it is unknown which of the two is right."""
-        return self._rival is not None and self._rival.track.matches >= _IN_A_ROW
-
-    @property
-    def distance_m(self) -> float:
-        """How far the last match was from the track."""
-        return self._distance_m
+        return self._rival is not None and self._rival.track.matches >= MIN_FRAMES
 
     def confirm(self) -> None:
         """Continue the track at the next fix, wherever it is: an operator has confirmed it."""
@@ -162,12 +157,9 @@ class TrackGuard:
             return
         self._newest_ns = time_ns
         self._sigma_mps = self._unknown_mps
-        if (
-            frame.east_velocity_mps is not None
-            and frame.north_velocity_mps is not None
-            and elapsed_s <= _MAX_GAP_S
-        ):
-            self._stated_mps = np.array([frame.east_velocity_mps, frame.north_velocity_mps])
+        told_mps = velocity_of(frame)
+        if told_mps is not None and elapsed_s <= _MAX_GAP_S:
+            self._stated_mps = told_mps
             self._sigma_mps = frame.velocity_sigma_mps or self._options.measured_velocity_sigma_mps
         if self._track is not None:
             sigma_mps = math.hypot(self._sigma_mps, self._track.found_mps)
@@ -184,7 +176,7 @@ class TrackGuard:
         if fix is None:
             return False
         track = self._track or _begun(_position(fix))
-        self._distance_m = float(np.hypot(*(en_m(fix) - track.en_m)))
+        self.distance_m = float(np.hypot(*(en_m(fix) - track.en_m)))
         contradicts = self._contradicts(track.estimate, fix)
         was_disputed = self.is_disputed
         continues = self._rival is not None and not self._contradicts(self._rival.track.estimate, fix)
@@ -199,7 +191,7 @@ class TrackGuard:
             track = self._rival.track
         elif was_disputed:
             self._agreements += track.estimate.sigma_m <= _KNOWN_M
-            if self._agreements < _IN_A_ROW:
+            if self._agreements < MIN_FRAMES:
                 return False
         self._rival, self._agreements = None, 0
         if isinstance(result, NoFix):
@@ -216,7 +208,7 @@ class TrackGuard:
 
     def _is_right(self, rival: _Rival, track: _Track, fix: Fix) -> bool:
         """Whether the evidence favours a rival: the track has a fix or two, or the stated velocity misled it."""
-        if track.matches < _IN_A_ROW:
+        if track.matches < MIN_FRAMES:
             return self._before is None or not self._contradicts(self._before.estimate, fix)
         off_mps = rival.track.off_mps
         variance = max(rival.track.covariance[1, 1], self._sigma_mps**2)

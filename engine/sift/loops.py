@@ -50,11 +50,6 @@ class LoopPlan:
     upsample: int
 
     @property
-    def size(self) -> int:
-        """Of the buffer."""
-        return self.octaves[-1][0].end
-
-    @property
     def first_sigma(self) -> np.float32:
         """Sigma of each octave's first level in pixels of the octave."""
         return np.float32(FIRST_SIGMA_PX * self.upsample)
@@ -170,7 +165,7 @@ def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Fl
     Returns:
         The Gaussian levels (N,), which the thread's next call overwrites; and keypoints (K, 6).
     """
-    buffer, found, source = _buffer(plan.size), [], image
+    buffer, found, source = _buffer(plan.octaves[-1][0].end), [], image
     threshold = contrast_threshold / SCALES
     limits = (SCALES, _MOVES, threshold, _MAX_SHIFT, EDGE_RATIO)
     for number, (octave, across, down) in enumerate(plan.octaves):

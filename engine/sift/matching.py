@@ -52,8 +52,8 @@ def match(
         from engine.sift.matching_tensors import match_tensors  # torch takes a while to import
 
         return match_tensors(query, train, limits, ratio)
-    index, distance, quotient, valid = _by_loops(_as_arrays(query), _as_arrays(train), limits, ratio)
-    return Matches(*(like(given, values) for values in (index, distance, quotient, valid)))
+    found = _by_loops(_as_arrays(query), _as_arrays(train), limits, ratio)
+    return Matches(*(like(given, values) for values in found))
 
 
 def _as_arrays(features: Features) -> Features:

@@ -25,7 +25,8 @@ def _nearest(query: Features, train: Features, limits: Limits) -> tuple[Tensor, 
     """:func:`_two_nearest` over all train slots, by chunks that bound the memory."""
     found = []
     for start in range(0, max(1, train.valid.shape[1]), TRAIN_CHUNK):
-        first, index, second, is_mutual = _two_nearest(query, _slots(train, start, start + TRAIN_CHUNK), limits)
+        part = Features(*(values[:, start : start + TRAIN_CHUNK] for values in fields_of(train)))
+        first, index, second, is_mutual = _two_nearest(query, part, limits)
         found.append((first, index + start, second, is_mutual))
     return found[0] if len(found) == 1 else _merged(found)
 
@@ -35,21 +36,9 @@ def _distance(cosine: Tensor) -> Tensor:
     return (2 - 2 * cosine).clamp_min_(0).sqrt_().masked_fill_(cosine < FORBIDDEN, torch.inf)
 
 
-def _slots(features: Features, start: int, end: int) -> Features:
-    """A range of the slots."""
-    return Features(*(values[:, start:end] for values in fields_of(features)))
-
-
-def _forbid(
-    cosine: Tensor,
-    query: Features,
-    train: Features,
-    rotation_deg: float,
-    max_angle_diff_deg: float | None,
-    scale: float,
-    max_scale_factor: float | None,
-) -> None:
+def _forbid(cosine: Tensor, query: Features, train: Features, limits: Limits) -> None:
     """Lower the cosine (B, N, M) of excluded pairs by a large number, in place; faster than masks."""
+    rotation_deg, max_angle_diff_deg, scale, max_scale_factor = limits
     for valid, dim in ((query.valid, 2), (train.valid, 1)):
         cosine.sub_((~valid).to(cosine.dtype).unsqueeze(dim), alpha=_FAR)
     if max_angle_diff_deg is not None and max_angle_diff_deg < 180:
@@ -68,7 +57,7 @@ def _forbid(
 def _two_nearest(query: Features, train: Features, limits: Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best."""
     cosine = query.descriptors @ train.descriptors.mT
-    _forbid(cosine, query, train, *limits)
+    _forbid(cosine, query, train, limits)
     if 0 in cosine.shape:
         none = cosine.new_full(cosine.shape[:2], -torch.inf)
         return none, torch.zeros_like(none, dtype=torch.int64), none, none > 0
