@@ -26,7 +26,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.runtime.device import Device, Picture, as_float, as_tensor, device_of, element_type, like, on_host
+from engine.runtime.device import (
+    Device,
+    Picture,
+    as_float,
+    as_tensor,
+    device_of,
+    element_type,
+    on_host,
+    same_kind_as,
+)
 from engine.sift import BACKENDS
 from engine.sift.matching import match
 from engine.sift.scale_space import octaves_of
@@ -91,7 +100,7 @@ def sift(
         pictures = np.nan_to_num(on_host(pictures), nan=0.0, posinf=1.0, neginf=0.0)
         pictures = np.ascontiguousarray(pictures.clip(-_MAX_MAGNITUDE, _MAX_MAGNITUDE))
         found = loops.find_features(pictures, None if mask is None else on_host(mask), choice)
-    return Features(*(like(images, values) for values in fields_of(found)))
+    return Features(*(same_kind_as(images, values) for values in fields_of(found)))
 
 
 def chosen_backend(backend: str, device: Device | torch.device) -> str:

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.kernels import coarse_to_fine
 from engine.kernels.peaks import find_peak
-from engine.kernels.search_levels import Search, prepare
-from engine.runtime.device import Picture, as_float, as_tensor, element_type, like, plain
+from engine.kernels.search_levels import MapRegion, prepare
+from engine.runtime.device import Picture, as_arrays, as_float, as_tensor, element_type, same_kind_as
 from engine.values import Peak
 
 if TYPE_CHECKING:
     from engine.runtime.tensors import Tensor
 
 __all__ = [
+    "MapRegion",
     "Peak",
-    "Search",
     "find_peak",
     "match_template",
     "ncc",
@@ -77,15 +77,15 @@ def ncc(
             raise OptionError("zero_mean: expected True with a mask, got False")
         if not 0.0 < min_overlap <= 1.0:
             raise OptionError(f"min_overlap: expected above 0 and at most 1, got {min_overlap}")
-        pictures = plain(search, search_valid, templates)
+        pictures = as_arrays(search, search_valid, templates)
         scores = _masked_kernels(pictures[0]).ncc_surface(*pictures, min_overlap=min_overlap)
     else:
         if types[0] in _DOUBLE or types[1] in _DOUBLE:
             pictures = [as_tensor(as_float(v, "float64")) for v in (search, templates)]
         else:
-            pictures = plain(*(as_float(v, "float32") for v in (search, templates)))
+            pictures = as_arrays(*(as_float(v, "float32") for v in (search, templates)))
         scores = _kernels(pictures[0]).ncc_surface(*pictures, zero_mean=zero_mean)
-    found: Given = like(search, as_float(scores, "float64" if "float64" in types else "float32"))
+    found: Given = same_kind_as(search, as_float(scores, "float64" if "float64" in types else "float32"))
     return found
 
 
@@ -135,7 +135,7 @@ def _masked_kernels(picture: Picture) -> Any:
     return masked_tensors
 
 
-def surface(search: Search, templates: Given) -> Given:
+def surface(search: MapRegion, templates: Given) -> Given:
     """Zero-mean NCC of templates with a prepared part of a map.
 
     Args:
@@ -152,7 +152,7 @@ def surface(search: Search, templates: Given) -> Given:
     return next(surfaces(search, templates, group=templates.shape[0]))
 
 
-def _check_fit(search: Search, templates: Picture) -> None:
+def _check_fit(search: MapRegion, templates: Picture) -> None:
     if templates.ndim != 3 or 0 in templates.shape:
         raise ShapeError(f"templates: expected (T, h, w) with no empty axis, got {tuple(templates.shape)}")
     (H, W), (h, w) = search.image.shape, templates.shape[-2:]
@@ -160,7 +160,7 @@ def _check_fit(search: Search, templates: Picture) -> None:
         raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
 
 
-def surfaces(search: Search, templates: Given, *, group: int) -> Iterator[Given]:
+def surfaces(search: MapRegion, templates: Given, *, group: int) -> Iterator[Given]:
     """Zero-mean NCC, a group of templates at a time, to bound memory for many templates on a large map.
 
     Args:
@@ -177,15 +177,15 @@ def surfaces(search: Search, templates: Given, *, group: int) -> Iterator[Given]
     for first in range(0, len(templates), group):
         part = _of_kind(search, templates[first : first + group])
         found = kernels.prepared_surface(search.image, inverse_norms, part - part.mean((-2, -1), keepdims=True))
-        yield like(templates, found)
+        yield same_kind_as(templates, found)
 
 
-def _of_kind(search: Search, template: Picture) -> Picture:
+def _of_kind(search: MapRegion, template: Picture) -> Picture:
     """The template as an array if the map is one; else unchanged."""
-    return plain(template)[0] if isinstance(search.image, np.ndarray) else template
+    return as_arrays(template)[0] if isinstance(search.image, np.ndarray) else template
 
 
-def match_template(search: Search, template: Picture, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
+def match_template(search: MapRegion, template: Picture, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
     """The peak of one template in a prepared part of a map; all its pixels count as valid.
 
     Coarse to fine, see :mod:`engine.kernels.coarse_to_fine`. If that is not certain, with ``exhaustive``, or off
@@ -206,7 +206,7 @@ def match_template(search: Search, template: Picture, *, exclusion_px: float, ex
     """
     _check_fit(search, template[None])
     if isinstance(search.image, np.ndarray) and not exhaustive:
-        found = coarse_to_fine.peak(search, plain(template)[0], exclusion_px)
+        found = coarse_to_fine.peak(search, as_arrays(template)[0], exclusion_px)
         if found is not None:
             return found
     return find_peak(surface(search, template[None])[0], exclusion_px=exclusion_px)

@@ -2,7 +2,7 @@
 
 The error bound of the coarse scores is twice the largest error at the refined positions, and at least the loss of
 a match between coarse pixels. If that bound does not exclude every other position, all must be scored at full
-resolution, unless the window is wide and a :class:`QuickLook` already decides about the frame.
+resolution, unless the window is wide and a :class:`EarlyStop` already decides about the frame.
 
 On a coarse level nodata is 0 in a picture with zero mean, and hardly lowers positions that are mostly on the map:
 their scores are divided by the share on the map, which more than compensates if the template's contrast is spread
@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.local import LocalScores
-from engine.kernels.peaks import FAR, NEAR, best_positions, fit_summit
-from engine.kernels.search_levels import COARSE_TEMPLATE_PX, MAX_HALVINGS, Search
+from engine.kernels.peaks import FAR, NEAR, best_positions, fit_peak
+from engine.kernels.search_levels import COARSE_TEMPLATE_PX, MAX_HALVINGS, MapRegion
 from engine.kernels.sums import halved
 from engine.values import Peak
 
@@ -31,11 +31,11 @@ WIDE_PX = 2_000_000
 _MIN_HALVED_PX = 128 * 128
 _CANDIDATES, _CANDIDATES_WIDE = 6, 64
 _SEPARATION_PX = 2  # of candidates, on the coarsest level
-_MAX_LOSS = 0.5  # of a perfect match between pixels, on the coarsest level usable for a quick look
+_MAX_LOSS = 0.5  # of a perfect match between pixels, on the coarsest level usable for an early stop
 
 
 @dataclass(frozen=True, slots=True)
-class QuickLook:
+class EarlyStop:
     """Which peaks of a wide window to keep although not every position was scored at full resolution.
 
     Attributes:
@@ -72,7 +72,7 @@ class _Levels:
         min_overlap: positions with a smaller share of the template on valid pixels do not count.
     """
 
-    parts: list[Search]
+    parts: list[MapRegion]
     models: list[FloatImage]
     min_overlap: float
 
@@ -87,18 +87,18 @@ class _Levels:
         return 1 << (len(self.parts) - 1)
 
 
-def is_wide(search: Search) -> bool:
+def is_wide(search: MapRegion) -> bool:
     """Whether a window has more than :data:`WIDE_PX` pixels."""
     return int(np.prod(search.image.shape)) > WIDE_PX
 
 
 def peak(
-    search: Search,
+    search: MapRegion,
     template: FloatImage,
     exclusion_px: float,
     *,
     min_overlap: float = 0.0,
-    quick: QuickLook | None = None,
+    stop: EarlyStop | None = None,
 ) -> Peak | None:
     """The peak by way of the half-resolution levels.
 
@@ -107,13 +107,13 @@ def peak(
         template: (h, w) float32.
         exclusion_px: radius about the peak within which no rival is counted.
         min_overlap: positions where a smaller share of the template lies on valid pixels do not count.
-        quick: which peaks of a wide window to keep beyond the certain ones.
+        stop: which peaks of a wide window to keep beyond the certain ones.
 
     Returns:
         Peak | None: as :func:`engine.kernels.peaks.find_peak`, but the second score is a coarse level's if that is
         higher than the refined rivals; None if positions elsewhere are not excluded.
     """
-    wide = quick is not None and is_wide(search)
+    wide = stop is not None and is_wide(search)
     levels = _levels(search, template, min_overlap, _MAX_LOSS if wide else 1.0)
     if levels is None:
         return None  # no gain
@@ -134,16 +134,16 @@ def peak(
     by_coarse_scores = replace(best, second_score=max(rest, second))
     if refinement.is_certain:
         return by_coarse_scores
-    if quick is None or not wide or refinement.unresolved >= origin[2]:
+    if stop is None or not wide or refinement.unresolved >= origin[2]:
         return None
     # A place between coarse pixels has more at full resolution than the coarse score shows.
     pessimistic = replace(best, second_score=max(min(rest / (1.0 - levels.loss), 1.0), second))
-    if quick.is_clear(pessimistic):
+    if stop.is_clear(pessimistic):
         return pessimistic
-    return by_coarse_scores if quick.is_hopeless(replace(best, second_score=second)) else None
+    return by_coarse_scores if stop.is_hopeless(replace(best, second_score=second)) else None
 
 
-def _levels(search: Search, template: FloatImage, min_overlap: float, max_loss: float) -> _Levels | None:
+def _levels(search: MapRegion, template: FloatImage, min_overlap: float, max_loss: float) -> _Levels | None:
     """The levels worth searching, or None if that is only the finest.
 
     Args:
@@ -169,7 +169,7 @@ def _levels(search: Search, template: FloatImage, min_overlap: float, max_loss: 
 
 
 def surfaces_over_nodata(
-    search: Search, templates: FloatImage, *, min_overlap: float, group: int
+    search: MapRegion, templates: FloatImage, *, min_overlap: float, group: int
 ) -> Iterator[FloatImage]:
     """Scores of many templates with nodata taken as 0, which are about those that leave it out.
 
@@ -210,7 +210,7 @@ def _coarse_scores(levels: _Levels) -> FloatImage:
 
 
 def _scores_by_share(
-    part: Search, models: FloatImage, inverse_norms: FloatImage, share: FloatImage, least: float
+    part: MapRegion, models: FloatImage, inverse_norms: FloatImage, share: FloatImage, least: float
 ) -> FloatImage:
     """Scores (T, H', W') divided by the share on the map; -1 where that is less than ``least``."""
     from engine.kernels import blocks
@@ -253,8 +253,8 @@ def _refined_candidates(
     for index, candidate in enumerate(candidates):
         if found and is_certain and candidate[2] + error < best:
             break  # candidates are in falling order: none of the rest can win
-        refined, is_summit = _refined(levels, scores, *candidate[:2]) if index < count else (None, False)
-        is_certain = is_certain and is_summit
+        refined, is_peak = _refined(levels, scores, *candidate[:2]) if index < count else (None, False)
+        is_certain = is_certain and is_peak
         if stops and not is_certain:
             return _Refined([], False, unresolved)
         if refined is None:
@@ -296,7 +296,7 @@ def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak 
     if not (0 < y < scores.shape[0] - 1 and 0 < x < scores.shape[1] - 1):
         return None, False
     part, model, scale = levels.parts[0], levels.models[0], levels.scale
-    dx, dy, _ = fit_summit(scores[y - 1 : y + 2, x - 1 : x + 2].astype(np.float64))
+    dx, dy, _ = fit_peak(scores[y - 1 : y + 2, x - 1 : x + 2].astype(np.float64))
     y, x = round(scale * (y + dy)), round(scale * (x + dx))
     scorer = LocalScores(part.image, model, (y, x), part.counts, levels.min_overlap)
     for steps_left in reversed(range(scorer.REACH)):  # each looks one pixel further
@@ -314,5 +314,5 @@ def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak 
     wide = np.zeros((5, 5))
     wide[1:4, 1:4] = around
     wide[FAR[0] + 2, FAR[1] + 2] = scorer.at(y + FAR[0], x + FAR[1])
-    dx, dy, curvature = fit_summit(wide)
+    dx, dy, curvature = fit_peak(wide)
     return Peak(x + dx, y + dy, float(around[1, 1]), -1.0, curvature), True

@@ -70,7 +70,7 @@ def find_peak(scores: Picture, *, exclusion_px: float) -> Peak:
         exclusion_px: radius about the peak within which no rival is counted.
 
     Returns:
-        Peak: (x, y) by :func:`fit_summit`, never further than half a pixel from the best whole pixel;
+        Peak: (x, y) by :func:`fit_peak`, never further than half a pixel from the best whole pixel;
         unrefined on the border of the surface.
 
     Raises:
@@ -93,7 +93,7 @@ def find_peak(scores: Picture, *, exclusion_px: float) -> Peak:
     r = min(2, x, y, width - 1 - x, height - 1 - y)
     if r > 0:
         patch = around[row - r : row + r + 1, column - r : column + r + 1]
-        dx, dy, curvature = fit_summit(patch.astype(np.float64))
+        dx, dy, curvature = fit_peak(patch.astype(np.float64))
     return Peak(x + dx, y + dy, score, second, curvature)
 
 
@@ -136,7 +136,7 @@ _NEWTON_STEPS = 5
 _NEWTON_END_PX = 1e-4
 
 
-def fit_summit(patch: NDArray[np.float64]) -> tuple[float, float, NDArray[np.float64]]:
+def fit_peak(patch: NDArray[np.float64]) -> tuple[float, float, NDArray[np.float64]]:
     """Sub-pixel maximum of a patch, by Newton's method from its centre on a polynomial fit.
 
     Args:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from engine.errors import DtypeError, ShapeError
 from engine.kernels.sums import counts, halved
-from engine.runtime.device import Picture, element_type, plain
+from engine.runtime.device import Picture, as_arrays, element_type
 
 # Coarse to fine: templates are halved while they stay at least this wide.
 COARSE_TEMPLATE_PX = 48
@@ -17,7 +17,7 @@ MAX_HALVINGS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class MapRegion:
     """Part of a map prepared for matching, independent of the frame. Arrays on the CPU, tensors on a GPU.
 
     Attributes:
@@ -31,11 +31,11 @@ class Search:
     """
 
     image: Picture
-    half: Search | None = None
+    half: MapRegion | None = None
     sums: Picture = None
     counts: NDArray[np.int32] | None = None
 
-    def crop(self, x0: int, y0: int, width: int, height: int) -> Search:
+    def crop(self, x0: int, y0: int, width: int, height: int) -> MapRegion:
         """Crop columns [x0, x0 + width) and rows [y0, y0 + height), without a copy.
 
         The half-resolution level is kept if the crop begins on an even pixel.
@@ -47,10 +47,10 @@ class Search:
         inner = np.s_[..., y0 : y0 + height + 1, x0 : x0 + width + 1]
         sums = None if self.sums is None else self.sums[inner]
         counts = None if self.counts is None else self.counts[inner]
-        return Search(self.image[rows, columns], half, sums, counts)
+        return MapRegion(self.image[rows, columns], half, sums, counts)
 
 
-def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.bool_] | None = None) -> Search:
+def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.bool_] | None = None) -> MapRegion:
     """Compute half-resolution levels, or on a GPU running sums.
 
     Args:
@@ -59,7 +59,7 @@ def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.b
         valid: (H, W); None if all pixels are. The picture is 0 where they are not.
 
     Returns:
-        Search: on the CPU with levels down to 48 x 48 pixels.
+        MapRegion: on the CPU with levels down to 48 x 48 pixels.
 
     Raises:
         ShapeError: the picture is not (H, W), or is empty.
@@ -69,12 +69,12 @@ def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.b
         raise ShapeError(f"image: expected (H, W) with no empty axis, got {tuple(image.shape)}")
     if element_type(image) != "float32":
         raise DtypeError(f"image: expected float32, got {image.dtype}")
-    (image,) = plain(image)
+    (image,) = as_arrays(image)
     if not isinstance(image, np.ndarray):
         from engine.kernels.tensors import integrals
 
-        return Search(image.contiguous(), sums=integrals(image))
+        return MapRegion(image.contiguous(), sums=integrals(image))
     image, half = np.ascontiguousarray(image), None
     if halvings > 0 and min(image.shape) >= 2 * COARSE_TEMPLATE_PX:
         half = prepare(halved(image), halvings=halvings - 1)
-    return Search(image, half, counts=None if valid is None else counts(valid))
+    return MapRegion(image, half, counts=None if valid is None else counts(valid))

@@ -20,7 +20,7 @@ from engine.maps.landmark_cache import Kinds, NamedArrays, cache_key, load_array
 from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import HALO_PX, TILE_PX, tile_at, tiles_under, widened, within
-from engine.runtime.device import Device, Picture, all_on_host, all_placed, as_float, placed
+from engine.runtime.device import Device, Picture, all_on_host, all_to_device, as_float, to_device
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -166,7 +166,7 @@ class LandmarkMap:
             max_keypoints=_SLOTS,
             backend=self._backend,
             upright=upright,
-            mask=placed(mask[None, None], self.device),
+            mask=to_device(mask[None, None], self.device),
             contrast_threshold=MIN_CONTRAST,
             spread=1,  # by strength alone; the level's cells spread landmarks
         )
@@ -187,7 +187,7 @@ class LandmarkMap:
 
     def _to_landmarks(self, found: NamedArrays) -> Landmarks:
         columns = [found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors")]
-        xy, scale, angle, descriptors = (column[None] for column in all_placed(columns, self.device))
+        xy, scale, angle, descriptors = (column[None] for column in all_to_device(columns, self.device))
         valid = scale > 0.0  # of every landmark
         features = Features(xy, scale, angle, as_float(descriptors, "float32"), valid)
         return Landmarks(features, found["xy_px"], found["points_m"])
@@ -207,7 +207,7 @@ def as_picture(gray: NDArray[np.uint8], device: Device) -> Picture:
     Returns:
         (1, 1, H, W) float32 in [0, 1].
     """
-    return as_float(placed(np.ascontiguousarray(gray), device), "float32")[None, None] / 255.0
+    return as_float(to_device(np.ascontiguousarray(gray), device), "float32")[None, None] / 255.0
 
 
 def _keys(window: Window, level: int, upright: bool) -> list[_Key]:

@@ -17,8 +17,8 @@ from engine.kernels.scores import enhance
 from engine.kernels.search_levels import MAX_HALVINGS
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import TILE_PX, widened, within
-from engine.ncc_fft import Search, prepare
-from engine.runtime.device import Device, Picture, on_host, placed
+from engine.ncc_fft import MapRegion, prepare
+from engine.runtime.device import Device, Picture, on_host, to_device
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -45,7 +45,7 @@ class Region:
     """
 
     window: Window
-    search: Search
+    search: MapRegion
     valid: Picture | None
     mask: NDArray[np.bool_] | None = None
 
@@ -124,10 +124,10 @@ class PreparedMap:
 
     def _prepare(self, window: Window, level: int) -> Region:
         picture, mask = enhanced_part(self._site, self._radius_px, self._score, window, level)
-        image = placed(picture, self._device)
+        image = to_device(picture, self._device)
         if mask is None:
             return Region(window, prepare(image), None)
-        return Region(window, prepare(image, valid=mask), placed(mask, self._device), mask)
+        return Region(window, prepare(image, valid=mask), to_device(mask, self._device), mask)
 
 
 def enhanced_part(

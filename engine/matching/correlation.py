@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels import coarse_to_fine
-from engine.kernels.coarse_to_fine import QuickLook
+from engine.kernels.coarse_to_fine import EarlyStop
 from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance
 from engine.maps.prepared import PreparedMap, Region
@@ -18,7 +18,7 @@ from engine.matching.oblique import is_oblique, oblique_patch
 from engine.matching.query import Query
 from engine.ncc_fft import match_template, ncc
 from engine.options import NccOptions
-from engine.runtime.device import Picture, placed
+from engine.runtime.device import Picture, to_device
 from engine.runtime.scheduler import OutOfTime
 from engine.values import GridPose, NoFix, Peak, Reason, Window
 from engine.window import MARGIN, SPREAD_SIGMAS, level_crop
@@ -171,13 +171,13 @@ class Correlator:
         """The prepared map under a window of full-resolution pixels."""
         return self.prepared.cut(level_crop(self.query.site, window, level), level)
 
-    def search(self, aligned: Aligned, window: Window, quick: QuickLook | None = None) -> Peak | None:
+    def search(self, aligned: Aligned, window: Window, stop: EarlyStop | None = None) -> Peak | None:
         """The peak in a window, in pixels of the aligned level; None if the template is nowhere on the map.
 
         Args:
             aligned: the hypothesis.
             window: in full-resolution map pixels.
-            quick: which peaks of a wide window to keep although not every place was scored.
+            stop: which peaks of a wide window to keep although not every place was scored.
         """
         height, width = aligned.template.shape
         with self.query.scheduler.stage("map"):
@@ -185,17 +185,17 @@ class Correlator:
         if region.window.width_px < width or region.window.height_px < height:
             return None
         exclusion_px = self.exclusion_px(aligned.level)
-        quick = None if quick is None else _about(quick, region.window)
-        peak = self._peak(region, aligned.template, exclusion_px, quick)
+        stop = None if stop is None else _about(stop, region.window)
+        peak = self._peak(region, aligned.template, exclusion_px, stop)
         return None if peak.score <= -1.0 and region.valid is not None else _moved(peak, region.window)
 
     def _peak(
-        self, region: Region, template: NDArray[np.float32], exclusion_px: float, quick: QuickLook | None
+        self, region: Region, template: NDArray[np.float32], exclusion_px: float, stop: EarlyStop | None
     ) -> Peak:
         """The peak coarse to fine if that suffices, else over every place if there is time."""
         scheduler, search = self.query.scheduler, region.search
         with scheduler.stage("match"):
-            found = self._coarse_to_fine(region, template, exclusion_px, quick)
+            found = self._coarse_to_fine(region, template, exclusion_px, stop)
             if found is not None:
                 return found
             if not (coarse_to_fine.is_wide(search) and self._has_coarse_levels(region)):
@@ -208,11 +208,11 @@ class Correlator:
             return self._of_every_place(region, template, exclusion_px)
 
     def _coarse_to_fine(
-        self, region: Region, template: NDArray[np.float32], exclusion_px: float, quick: QuickLook | None
+        self, region: Region, template: NDArray[np.float32], exclusion_px: float, stop: EarlyStop | None
     ) -> Peak | None:
         if not self._has_coarse_levels(region):
             return None
-        return coarse_to_fine.peak(region.search, template, exclusion_px, min_overlap=MIN_VALID_SHARE, quick=quick)
+        return coarse_to_fine.peak(region.search, template, exclusion_px, min_overlap=MIN_VALID_SHARE, stop=stop)
 
     def _has_coarse_levels(self, region: Region) -> bool:
         """Whether to score places at half resolution: on the CPU, if pixels are centred on 0 like nodata."""
@@ -222,7 +222,7 @@ class Correlator:
     def _of_every_place(self, region: Region, template: NDArray[np.float32], exclusion_px: float) -> Peak:
         if region.valid is not None:
             return find_peak(self.masked_scores(region, template[None])[0], exclusion_px=exclusion_px)
-        own = placed(template, self.query.device)
+        own = to_device(template, self.query.device)
         return match_template(region.search, own, exclusion_px=exclusion_px, exhaustive=True)
 
     def exclusion_px(self, level: int) -> float:
@@ -247,7 +247,7 @@ class Correlator:
             return None
         template = aligned.template[None]
         if region.valid is None:
-            scores = ncc(region.search.image[None], placed(template[None], self.query.device))[0, 0]
+            scores = ncc(region.search.image[None], to_device(template[None], self.query.device))[0, 0]
         else:
             scores = self.masked_scores(region, template)[0]
         return scores, np.array([region.window.x0, region.window.y0], np.float64)
@@ -257,7 +257,7 @@ class Correlator:
         assert region.valid is not None
         scores = ncc(
             region.search.image[None],
-            placed(templates[None], self.query.device),
+            to_device(templates[None], self.query.device),
             search_valid=region.valid[None],
             min_overlap=MIN_VALID_SHARE,
         )
@@ -274,11 +274,11 @@ def _moved(peak: Peak, window: Window) -> Peak:
     return replace(peak, x=peak.x + window.x0, y=peak.y + window.y0)
 
 
-def _about(quick: QuickLook, window: Window) -> QuickLook:
-    """A quick look at peaks of a window's surface, by one at peaks in pixels of the level."""
-    return QuickLook(
-        is_clear=lambda peak: quick.is_clear(_moved(peak, window)),
-        is_hopeless=lambda peak: quick.is_hopeless(_moved(peak, window)),
+def _about(stop: EarlyStop, window: Window) -> EarlyStop:
+    """An early stop by peaks of a window's surface, from one by peaks in pixels of the level."""
+    return EarlyStop(
+        is_clear=lambda peak: stop.is_clear(_moved(peak, window)),
+        is_hopeless=lambda peak: stop.is_hopeless(_moved(peak, window)),
     )
 
 

@@ -26,7 +26,7 @@ from engine.matching.views import MapView, TelemetryHypothesis, map_px_per_pixel
 from engine.matching.votes import Vote, similarity, vote
 from engine.options import PAPER_SCALE, SiftOptions
 from engine.orthomap import OrthoMap
-from engine.runtime.device import Device, Picture, all_on_host, all_placed, as_float, on_host, placed
+from engine.runtime.device import Device, Picture, all_on_host, all_to_device, as_float, on_host, to_device
 from engine.values import Attitude
 
 if TYPE_CHECKING:  # it loads torch
@@ -139,7 +139,7 @@ def _feature_pairs(
     with query.scheduler.stage("frame features"):
         shown_px = int(np.count_nonzero(photo.valid))
         keypoints = max(options.max_keypoints, min(round(shown_px * options.keypoints_per_px), MAX_KEYPOINTS))
-        gray, valid = all_placed([photo.gray, photo.valid], landmarks.device)
+        gray, valid = all_to_device([photo.gray, photo.valid], landmarks.device)
         features = sift(
             as_float(gray, "float32")[None, None] / 255.0,
             max_keypoints=keypoints,
@@ -288,7 +288,7 @@ def _map_features(
     )
     mask = None
     if not site.fully_valid:
-        mask = placed(site.valid(crop, view.level), landmarks.device)[None, None]
+        mask = to_device(site.valid(crop, view.level), landmarks.device)[None, None]
     picture = as_picture(site.gray(crop, view.level), landmarks.device)
     features = sift(picture, max_keypoints=int(count), backend=options.backend, upright=upright, mask=mask)
     xy_px = on_host(features.xy_px[0])

@@ -23,7 +23,7 @@ from engine.matching.covariance import score_sigma
 from engine.matching.evidence import Evidence, is_beyond_doubt, is_hopeless, surprise_of
 from engine.matching.peak_evidence import places_in
 from engine.ncc_fft import surfaces
-from engine.runtime.device import Picture, placed
+from engine.runtime.device import Picture, to_device
 from engine.values import GridPose, NoFix, Peak, Window
 from engine.window import SPREAD_SIGMAS
 
@@ -201,7 +201,7 @@ def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.floa
     area_px = region.window.width_px * region.window.height_px
     group = max(1, _MAX_COARSE_PX // area_px)
     if region.valid is None:
-        own = placed(templates, correlator.query.device)
+        own = to_device(templates, correlator.query.device)
         for several in surfaces(region.search, own, group=group):
             yield from several
     elif region.search.counts is not None and correlator.is_centred:

@@ -19,9 +19,9 @@ from engine.matching.method import Method
 from engine.matching.peak_evidence import (
     PeakCandidate,
     candidate_of,
+    early_stop,
     null_tested,
     places_in,
-    quick_look,
 )
 from engine.matching.query import Query
 from engine.matching.refinement import Refinement, with_unconfirmed_tilt
@@ -143,7 +143,7 @@ class Ncc(Method):
             return query.refuse(Reason.LOW_SCORE, detail, METHOD, window=window)
         is_window, hypotheses = not (widely or wide or query.prior is None), 1
         if is_window:
-            peak = correlator.search(aligned, window, quick_look(correlator, aligned, window))
+            peak = correlator.search(aligned, window, early_stop(correlator, aligned, window))
         else:
             peak, aligned, hypotheses = hypothesis_search.search(correlator, aligned, window, reach)
         if peak is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from engine.kernels.coarse_to_fine import QuickLook
+from engine.kernels.coarse_to_fine import EarlyStop
 from engine.kernels.scores import enhance
 from engine.matching.correlation import METHOD, Aligned, Correlator
 from engine.matching.covariance import (
@@ -46,11 +46,11 @@ class PeakCandidate:
     is_tested: bool
 
 
-def quick_look(correlator: Correlator, aligned: Aligned, window: Window) -> QuickLook:
+def early_stop(correlator: Correlator, aligned: Aligned, window: Window) -> EarlyStop:
     """Which peaks of a wide window to keep although not every place was scored.
 
     Returns:
-        QuickLook: a clear peak is accepted without the null hypothesis; for a hopeless one not even a closer look
+        EarlyStop: a clear peak is accepted without the null hypothesis; for a hopeless one not even a closer look
         is expected to give a fix.
     """
     risk = correlator.query.risk
@@ -58,7 +58,7 @@ def quick_look(correlator: Correlator, aligned: Aligned, window: Window) -> Quic
     def nats(peak: Peak) -> float:
         return candidate_of(correlator, aligned, peak, window).evidence.nats
 
-    return QuickLook(lambda peak: is_beyond_doubt(nats(peak), risk), lambda peak: is_hopeless(nats(peak), risk))
+    return EarlyStop(lambda peak: is_beyond_doubt(nats(peak), risk), lambda peak: is_hopeless(nats(peak), risk))
 
 
 def candidate_of(
@@ -126,10 +126,10 @@ def _null_score(
         aligned: the hypothesis.
         window: that was searched.
         rival_score: score of the peak's best rival; certainly lower scores are ignored.
-        matters: whether the peak is accepted without it; if not, a quick look's best score suffices.
+        matters: whether the peak is accepted without it; if not, the best score of an early stop suffices.
     """
     options, best = correlator.options, -1.0
-    quick = QuickLook(
+    quick = EarlyStop(
         is_clear=lambda peak: max(peak.score, peak.second_score) <= rival_score,
         is_hopeless=lambda _: not matters,
     )

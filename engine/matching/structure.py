@@ -19,7 +19,7 @@ from engine.kernels.sums import box_sum, counts
 from engine.matching.correlation import MIN_VALID_SHARE, Aligned, Correlator
 from engine.matching.peak_evidence import PeakCandidate, candidate_of
 from engine.ncc_fft import ncc
-from engine.runtime.device import on_host, placed
+from engine.runtime.device import on_host, to_device
 from engine.values import Window
 from engine.window import level_crop
 
@@ -85,7 +85,7 @@ def _scores(
         valid = query.site.valid(crop, aligned.level)
         valid = None if valid.all() else valid
     search = _channels(gray, options.enhance_radius_px, valid)
-    scores = on_host(ncc(placed(search, query.device), placed(templates, query.device)).mean(0))
+    scores = on_host(ncc(to_device(search, query.device), to_device(templates, query.device)).mean(0))
     if valid is not None:
         # Nodata is 0 in all channels, near their mean, and so hardly lowers places that are mostly on the map.
         scores[:, _share_on_map(valid, height, width) < MIN_VALID_SHARE] = -1.0

@@ -91,7 +91,7 @@ def synchronise(device: Device | torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def placed(array: AnyArray, device: Device | torch.device) -> Picture:
+def to_device(array: AnyArray, device: Device | torch.device) -> Picture:
     """An array on the device.
 
     Args:
@@ -108,8 +108,8 @@ def placed(array: AnyArray, device: Device | torch.device) -> Picture:
     return torch.from_numpy(array).to(device)
 
 
-def all_placed(arrays: Sequence[AnyArray], device: Device | torch.device) -> Sequence[Picture]:
-    """Several arrays on the device, sent in one copy; see :func:`placed`.
+def all_to_device(arrays: Sequence[AnyArray], device: Device | torch.device) -> Sequence[Picture]:
+    """Several arrays on the device, sent in one copy; see :func:`to_device`.
 
     Args:
         arrays: of any shapes.
@@ -165,7 +165,7 @@ def as_float(picture: Picture, name: str) -> Picture:
     return picture.double() if name == "float64" else picture.float()
 
 
-def plain(*pictures: Picture) -> list[Picture]:
+def as_arrays(*pictures: Picture) -> list[Picture]:
     """CPU tensors as arrays in the same memory; tensors on a GPU or with gradients unchanged."""
     if any(not isinstance(v, np.ndarray) and (v.device.type != "cpu" or v.requires_grad) for v in pictures):
         return list(pictures)
@@ -181,7 +181,7 @@ def as_tensor(picture: Picture) -> Picture:
     return torch.from_numpy(np.ascontiguousarray(picture))
 
 
-def like(given: Picture, found: Picture) -> Picture:
+def same_kind_as(given: Picture, found: Picture) -> Picture:
     """The result as an array or a tensor, whichever the input was."""
     if isinstance(given, np.ndarray):
         return found if isinstance(found, np.ndarray) else found.numpy()

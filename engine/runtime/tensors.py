@@ -23,7 +23,7 @@ __all__ = ["Tensor", "download", "functional", "nn", "torch", "upload"]
 AnyArray = NDArray[Any]
 _ALIGNMENT = 16  # bytes; no element is larger
 
-threads.tell(torch)
+threads.limit_torch(torch)
 
 
 def upload(arrays: Sequence[AnyArray], device: str | torch.device) -> list[Tensor]:

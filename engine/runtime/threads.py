@@ -39,10 +39,10 @@ def set_threads(count: int) -> None:
     cv2.setNumThreads(count)
     threadpool_limits(count, "blas")
     if "torch" in sys.modules:
-        tell(sys.modules["torch"])
+        limit_torch(sys.modules["torch"])
 
 
-def tell(torch: Any) -> None:
+def limit_torch(torch: Any) -> None:
     """Give torch the chosen number of threads, if any."""
     if _chosen:
         torch.set_num_threads(_chosen[0])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.runtime.device import as_float, device_of, like, on_host
+from engine.runtime.device import as_float, device_of, on_host, same_kind_as
 from engine.sift.values import FORBIDDEN, ROUNDING, TRAIN_CHUNK, Features, Limits, Matches, fields_of
 
 Floats = NDArray[np.float32]
@@ -53,7 +53,7 @@ def match(
 
         return match_tensors(query, train, limits, ratio)
     found = _by_loops(_as_arrays(query), _as_arrays(train), limits, ratio)
-    return Matches(*(like(given, values) for values in found))
+    return Matches(*(same_kind_as(given, values) for values in found))
 
 
 def _as_arrays(features: Features) -> Features:

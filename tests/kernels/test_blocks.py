@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine.kernels import blocks, tensors
-from engine.ncc_fft import Search, ncc, prepare, surface
+from engine.ncc_fft import MapRegion, ncc, prepare, surface
 from engine.runtime import threads as chosen
 from tests.support.correlation import reference_scores
 from tests.support.tensors import assert_close
@@ -88,7 +88,10 @@ def test_a_prepared_crop_scores_as_the_reference(seed, model):
     image, templates = (rng.normal(0.0, 1.0, shape).astype(np.float32) for shape in ((60, 70), (2, *model)))
     expected = reference_scores(image[None, 3:40, 7:48], templates[None])[0]
     picture = torch.from_numpy(image)
-    for whole, has_sums in ((prepare(picture), False), (Search(picture, sums=tensors.integrals(picture)), True)):
+    for whole, has_sums in (
+        (prepare(picture), False),
+        (MapRegion(picture, sums=tensors.integrals(picture)), True),
+    ):
         part = whole.crop(7, 3, 41, 37)
         assert (part.sums is not None) == has_sums
         for count in (1, 2):

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engine.kernels.peaks import best_positions, fit_summit
+from engine.kernels.peaks import best_positions, fit_peak
 
 
 def greedy(values, separation, count):
@@ -87,7 +87,7 @@ def test_the_summit_of_a_paraboloid_is_exact(at, bend, n):
     def paraboloid(x, y):
         return 0.7 + 0.5 * (a * (x - x0) ** 2 + 2 * c * (x - x0) * (y - y0) + b * (y - y0) ** 2)
 
-    dx, dy, curvature = fit_summit(patch_of(paraboloid, n))
+    dx, dy, curvature = fit_peak(patch_of(paraboloid, n))
     assert (dx, dy) == (pytest.approx(x0, abs=1e-6), pytest.approx(y0, abs=1e-6))
     np.testing.assert_allclose(curvature, [[a, c], [c, b]], atol=1e-9)
 
@@ -108,7 +108,7 @@ def test_the_summit_of_a_quartic_is_exact(at, sharp, skew):
     def quartic(x, y):
         return 0.8 + along(x, x0, p, s) + along(y, y0, q, t)
 
-    dx, dy, curvature = fit_summit(patch_of(quartic, 5))
+    dx, dy, curvature = fit_peak(patch_of(quartic, 5))
     assert (dx, dy) == (pytest.approx(x0, abs=1e-4), pytest.approx(y0, abs=1e-4))
     assert np.linalg.eigvalsh(curvature).max() < 0
 
@@ -117,15 +117,15 @@ def test_the_summit_of_a_quartic_is_exact(at, sharp, skew):
 @given(seed=st.integers(0, 2**32 - 1))
 def test_an_offset_is_finite_and_at_most_half_a_pixel(n, seed):
     patch = np.random.default_rng(seed).uniform(-1.0, 1.0, (n, n))
-    dx, dy, curvature = fit_summit(patch)
+    dx, dy, curvature = fit_peak(patch)
     assert abs(dx) <= 0.5
     assert abs(dy) <= 0.5
     assert np.isfinite(curvature).all()
-    turned = fit_summit(np.ascontiguousarray(patch.T))
+    turned = fit_peak(np.ascontiguousarray(patch.T))
     assert turned[:2] == (pytest.approx(dy, abs=1e-6), pytest.approx(dx, abs=1e-6))
 
 
 @pytest.mark.parametrize("n", [3, 5])
 def test_level_ground_ridges_and_bowls_have_no_summit(n):
     for shape in (lambda x, y: 0 * x, lambda x, y: x * x + y * y, lambda x, y: x * x - y * y):
-        assert fit_summit(patch_of(shape, n))[:2] == (0.0, 0.0)
+        assert fit_peak(patch_of(shape, n))[:2] == (0.0, 0.0)
