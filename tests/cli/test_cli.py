@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 
@@ -497,7 +498,10 @@ def test_the_decoders_own_words_stay_off_standard_error(flight, tmp_path):
 def test_the_console_script_under_ctrl_c(tmp_path):
     out = tmp_path / "demo"
     command, pipe = [SCRIPT, "demo", f"--out={out}"], subprocess.PIPE
-    with subprocess.Popen(command, stderr=pipe, stdout=pipe, text=True, env=NARROW) as process:
+    given = {"stderr": pipe, "stdout": pipe, "text": True, "env": NARROW}
+    # A shell that started the tests in the background has it ignored.
+    heeds = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(command, preexec_fn=heeds, **given) as process:
         assert process.stderr.readline().startswith("drawing")
         for _ in range(60):  # as a user does it: C code may swallow the first
             process.send_signal(signal.SIGINT)
