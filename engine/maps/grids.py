@@ -264,20 +264,20 @@ def warp_between(grid: Grid, other: Grid) -> Warp:
     return Warp(lambda xy: apply_affine(to_pixel, to_crs(xy)), grid.box(WARP_MARGIN), tolerance=0.01)
 
 
-def window_about(points: Array, grid: Grid, margin_px: int) -> Window | None:
-    """The whole pixels of a grid around points, with a margin.
+def window_about(points: Array, shape: tuple[int, ...], margin_px: int) -> Window | None:
+    """The whole pixels of a picture around points, with a margin.
 
     Args:
-        points: (N, 2) in pixels of the grid, finite.
-        grid: to which the result is clipped.
+        points: (N, 2) in pixels of the picture, finite.
+        shape: (rows, columns) of the picture, to which the result is clipped.
         margin_px: added on each side.
 
     Returns:
-        Window | None: None if the grid has no pixel there.
+        Window | None: None if the picture has no pixel there.
     """
     if len(points) == 0:
         return None
-    limit = [grid.width_px, grid.height_px]
+    limit = shape[::-1]
     low = np.clip(np.floor(points.min(axis=0)) - margin_px, 0, limit).astype(int)
     high = np.clip(np.ceil(points.max(axis=0)) + margin_px + 1, 0, limit).astype(int)
     return Window(*low.tolist(), *(high - low).tolist()) if (high > low).all() else None
@@ -286,4 +286,4 @@ def window_about(points: Array, grid: Grid, margin_px: int) -> Window | None:
 def overlap(grid: Grid, other: Grid) -> Window | None:
     """The part of another grid that a grid covers, widened by two pixels; None if they do not overlap."""
     points = warp_between(grid, other)(grid.lattice())
-    return window_about(points[np.isfinite(points).all(axis=1)], other, margin_px=2)
+    return window_about(points[np.isfinite(points).all(axis=1)], (other.height_px, other.width_px), margin_px=2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from engine.kernels.dense import (
     refine,
 )
 from engine.kernels.scores import enhance
+from engine.maps.grids import window_about
 from engine.maps.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
 from engine.matching.acceptance import CHANCE, agree_in_height, are_consistent
 from engine.matching.align import shrink
@@ -82,25 +84,32 @@ class Refinement:
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
         refined = self._through_all(fix)
-        if _is_doubtful(refined) and has_tilt and query.site.has_surface:
+        if not _is_confirmed(refined) and has_tilt and query.site.has_surface:
             try:
                 refined = self._doubting()._through_all(fix) or refined
             except OutOfTime:
                 if refined is None:
                     raise
-        if not (refined is None or _is_doubtful(refined)):
+        if _is_confirmed(refined):
             return refined
-        if not (has_tilt or query.site.has_surface):
-            return fix
-        best = refined or (with_unconfirmed_tilt(query, fix) if query.site.has_surface else fix)
-        off = query.prior_chi_square(best)
-        agrees = off <= chi_square_of(CHANCE, 2) if off is not None else not query.site.has_surface
-        if has_tilt and agrees:
-            return replace(best, stage="unconfirmed")
-        against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
-        detail = "roll and pitch are unknown, and the picture does not determine them"
         if has_tilt:
-            detail = f"the picture does not confirm the attitude, and {against}"
+            return self._unconfirmed(refined or fix)
+        if not query.site.has_surface:
+            return fix
+        detail = "roll and pitch are unknown, and the picture does not determine them"
+        return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
+
+    def _unconfirmed(self, fix: Fix) -> Fix | NoFix:
+        """The fix of a known attitude that the picture does not confirm, refined or not, if the prior agrees."""
+        query = self.query
+        if query.site.has_surface and fix.stage != "refined":
+            fix = with_unconfirmed_tilt(query, fix)
+        off = query.prior_chi_square(fix)
+        agrees = off <= chi_square_of(CHANCE, 2) if off is not None else not query.site.has_surface
+        if agrees:
+            return replace(fix, stage="unconfirmed")
+        against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
+        detail = f"the picture does not confirm the attitude, and {against}"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
     def refine_at_once(self, fix: Fix) -> Fix | None:
@@ -226,12 +235,10 @@ class Refinement:
         rays = query.camera.frame_rays[:4] @ pose.rotation
         ground_m = pose.center_m[:2] + rays[:, :2] * (height_m / -rays[:, 2:])
         corners = query.site.level_from_full(query.site.pixel_from_enu(ground_m), level)
-        height, width = query.site.level_shape(level)
-        low = np.clip(np.floor(corners.min(axis=0)), 0, [width, height]).astype(int)
-        high = np.clip(np.ceil(corners.max(axis=0)) + 1, 0, [width, height]).astype(int)
-        if (high - low).min() < 4 * BLOCK_PX:
+        window = window_about(corners, query.site.level_shape(level), margin_px=0)
+        if window is None or min(window.width_px, window.height_px) < 4 * BLOCK_PX:
             return None
-        return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+        return window
 
     def _enhanced_frame(self, height_m: float, level: int) -> EnhancedFrame:
         """The frame at the resolution of a level, enhanced like the map."""
@@ -260,9 +267,9 @@ class Refinement:
         return replace(refined, stage="refined", confidence=fix.confidence)
 
 
-def _is_doubtful(refined: Fix | None) -> bool:
-    """Whether a picture hardly confirms the telemetry's attitude."""
-    return refined is None or refined.score < CONFIRMING_CORRELATION
+def _is_confirmed(refined: Fix | None) -> TypeGuard[Fix]:
+    """Whether a picture confirms a refined pose."""
+    return refined is not None and refined.score >= CONFIRMING_CORRELATION
 
 
 def with_unconfirmed_tilt(query: Query, fix: Fix) -> Fix:
