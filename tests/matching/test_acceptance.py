@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from engine import Camera, MatcherOptions, OptionError, OrthoMap
+from engine import Camera, OptionError, OrthoMap
 from engine.matching.covariance import (
     misalignment_covariance_px2,
     ncc_covariance_m2,
@@ -56,12 +56,6 @@ def test_options_are_keyword_only_and_frozen():
         AssumedErrors(0.5)
     with pytest.raises(FrozenInstanceError):
         AssumedErrors().map_m = 0.5
-
-
-@pytest.mark.parametrize("risk", [0.0, 1.0, 98.0, math.nan])
-def test_a_risk_is_a_probability(risk):
-    with pytest.raises(OptionError, match=r"^risk: expected a probability above 0 and below 1, got "):
-        MatcherOptions(risk=risk)
 
 
 def test_what_is_assumed_of_telemetry_is_said_in_one_place():

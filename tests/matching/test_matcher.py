@@ -35,7 +35,7 @@ from engine.budget import Deadline
 from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
-from engine.options import AssumedErrors, NccOptions, SiftOptions
+from engine.options import AssumedErrors, LearnedOptions, NccOptions, PoseOptions, SiftOptions
 from engine.values import GridPose
 from tests.support.fixes import px_off, values_of
 from tests.support.ground import Ground
@@ -494,8 +494,6 @@ def test_a_device_that_is_missing_is_an_error_and_only_auto_falls_back(ground, c
 def test_options_are_refused_by_name(ground, camera):
     with pytest.raises(OptionError, match=r"^method: expected one of ncc, sift, auto, learned, got 'orb'"):
         SceneMatcher(ground.site, camera, "orb")
-    with pytest.raises(OptionError, match=r"^profile: expected one of engine, paper, got 'fast'"):
-        MatcherOptions(profile="fast")
     with pytest.raises(OptionError, match=r"^method: the paper's profile"):
         SceneMatcher(ground.site, camera, "auto", "cpu", MatcherOptions(profile="paper"))
 
@@ -512,6 +510,14 @@ def test_options_are_refused_by_name(ground, camera):
         (SiftOptions, "map_features", "sometimes", "one of prepared, per_frame"),
         *((SiftOptions, "upsample", value, "1 or 2") for value in (0, 3)),
         (SiftOptions, "max_tilt_deg", -1, "above 0"),
+        (NccOptions, "score", "census", "one of grey, local, gradient, mixed"),
+        *((PoseOptions, name, value, "a positive number") for name, value in (
+            ("reprojection_px", 0), ("distinct_px", -1))),
+        (PoseOptions, "min_inliers", 3, "at least 4"), (PoseOptions, "max_log10_nfa", math.nan, "a number"),
+        (LearnedOptions, "max_keypoints", 1, ".+"), (LearnedOptions, "max_picture_px", 10, ".+"),
+        (LearnedOptions, "max_window_px", 10, ".+"), (MatcherOptions, "profile", "fast", "one of engine, paper"),
+        *((MatcherOptions, "risk", value, "a probability above 0 and below 1") for value in (0.0, 98.0, math.nan)),
+        (MatcherOptions, "risk", 1.0, "a probability above 0 and below 1"),
     ],
 )  # fmt: skip
 def test_options_by_which_every_frame_would_fail_are_refused(options, name, value, text):
