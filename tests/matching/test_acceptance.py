@@ -144,12 +144,6 @@ def test_the_height_of_a_tilted_camera_moves_the_fix_along_the_tilt():
     assert turned[0, 0] < 1e-4
 
 
-def test_a_fix_by_correlation_needs_height_and_heading():
-    for frame in (GridPose(None, 0.0, None, None), GridPose(150.0, None, None, None)):
-        with pytest.raises(OptionError, match=r"^pose: expected a height and a heading"):
-            errors_for(frame)
-
-
 def test_a_turned_patch_pulls_its_peak_only_where_its_parts_come_apart():
     """By hand: what 240 x 320 px move by when turned by 1 degree, against a peak 0.8 / 0.02 = 40 px^2 wide."""
     stated = AssumedErrors(heading_deg=1.0, height_m=1e-9, height_share=1e-9)

@@ -10,17 +10,14 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from rasterio.transform import Affine
 
-from engine import Attitude, Camera, Frame, MatcherOptions, OrthoMap, SceneMatcher
-from engine.matching.align import FRACTION, MAX_RAY_DEG, rectify, to_gray, view_of
+from engine import Attitude, Camera, Frame, MatcherOptions, SceneMatcher
+from engine.matching.align import FRACTION, MAX_RAY_DEG, rectify, view_of
 from engine.options import NccOptions, SiftOptions
 from tests.support.fixes import px_off
 from tests.support.ground import rays_of
-from tests.support.rasters import write_raster
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
 UPRIGHT = np.array([[0.5, 0.0], [0.0, -0.5]])  # metres east and north per map pixel
@@ -41,23 +38,6 @@ def matcher_of(site, camera, method):
 
 def locate(ground, camera, frame, method="ncc"):
     return matcher_of(ground.site, camera, method).locate(frame, ground.prior(NADIR))
-
-
-# The map
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_half_pixel_of_the_map_a_geotiff_counts_from_the_corner_of_the_first_pixel(
-    ground, camera, method, tmp_path
-):
-    left, top = ground.pixel_to_crs[:, 2] + (-0.5 * ground.gsd_m, 0.5 * ground.gsd_m)
-    corner = Affine(ground.gsd_m, 0.0, left, 0.0, -ground.gsd_m, top)
-    path = write_raster(tmp_path / "map.tif", ground.gray, crs=f"EPSG:{ground.epsg}", transform=corner)
-    matcher = SceneMatcher(OrthoMap.open(path), camera, method, "cpu")
-    result = matcher.locate(ground.frame(camera, NADIR), ground.prior(NADIR))
-    assert px_off(result, NADIR) < 0.15
-    east, north = ground.enu_from_pixel(NADIR)
-    assert (result.east_m, result.north_m) == (pytest.approx(east, abs=0.08), pytest.approx(north, abs=0.08))
 
 
 # Equations 2 and 3: scale and heading
@@ -169,15 +149,3 @@ def test_a_patch_holds_frame_alone(roll, pitch, heading):
 def test_a_frame_that_covers_a_few_map_pixels_gives_no_patch():
     view = view_of(CAMERA, Attitude(0.0, 0.0, 0.0), 4.0, UPRIGHT)  # 9 map pixels wide
     assert rectify(np.zeros((300, 300), np.uint8), CAMERA, view) is None
-
-
-# Grey
-
-
-def test_grey_is_luma_of_rgb():
-    image = np.zeros((2, 2, 3), np.uint8)
-    image[0, 0], image[0, 1], image[1, 0] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
-    gray = to_gray(Frame(image))
-    assert gray.tolist() == [[76, 150], [29, 0]]  # 0.299, 0.587, 0.114
-    assert to_gray(Frame(torch.from_numpy(image))).tolist() == gray.tolist()
-    assert to_gray(Frame(image[..., 1])).tolist() == image[..., 1].tolist()

@@ -172,10 +172,6 @@ def test_nothing_is_forked_beside_other_threads():
         other.join()
 
 
-def test_results_come_in_order_while_workers_go_on():
-    assert list(processes.in_order(lambda task: task * task, 50, 3)) == [task * task for task in range(50)]
-
-
 def test_a_worker_that_ends_is_an_error_and_leaves_no_process():
     parent = os.getpid()
 
