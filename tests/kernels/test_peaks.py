@@ -1,6 +1,8 @@
-"""The highest places of a surface and the summits between them."""
+"""The highest places of a surface and the summits between them, on the host and on a device."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
@@ -8,7 +10,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engine.kernels.peaks import best_positions, fit_peak
+from engine.kernels.peaks import best_positions, find_peak, fit_peak
+from engine.kernels.tensors import peak_numbers
+from engine.ncc_fft import match_template, prepare
+from tests.support.fields import fields_of
+from tests.support.pretended import DEVICE, pretended_device
 
 
 def greedy(values, separation, count):
@@ -129,3 +135,52 @@ def test_an_offset_is_finite_and_at_most_half_a_pixel(n, seed):
 def test_level_ground_ridges_and_bowls_have_no_summit(n):
     for shape in (lambda x, y: 0 * x, lambda x, y: x * x + y * y, lambda x, y: x * x - y * y):
         assert fit_peak(patch_of(shape, n))[:2] == (0.0, 0.0)
+
+
+# On a device
+
+
+def draw(size):
+    """A view into a larger buffer of NaN, as a transform's is, with many equal scores."""
+    rough = torch.randn(1, 1, *size, generator=torch.Generator().manual_seed(sum(size)))
+    smooth = torch.nn.functional.avg_pool2d(rough, 3, stride=1, padding=1)[0, 0].clamp(-1.0, 1.0)
+    wide = torch.full((size[0] + 2, size[1] + 5), math.nan)
+    wide[: size[0], : size[1]] = torch.round(32.0 * smooth) / 64.0
+    return wide
+
+
+@pytest.mark.parametrize("exclusion_px", [0.0, math.sqrt(2.0), 5.0, 5.5, 1e5])
+@pytest.mark.parametrize(
+    "size",
+    [
+        (88, 82),  # a peak with 5 x 5 places about it
+        (8, 8),  # 3 x 3
+        (4, 2),  # none: on the border
+        (1, 500),  # one row
+        (500, 1),  # one column
+        (1, 1),  # one place
+    ],
+    ids=str,
+)
+def test_the_peak_on_a_device_is_that_on_the_host(size, exclusion_px):
+    wide, part = draw(size), np.s_[: size[0], : size[1]]
+    expected = find_peak(wide[part], exclusion_px=exclusion_px)
+    with pretended_device():
+        found = find_peak(wide.to(DEVICE)[part], exclusion_px=exclusion_px)
+    for one, other in zip(fields_of(found), fields_of(expected), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_nan_never_wins():
+    """And infinities are cut off."""
+    scores = draw((63, 65))[:63, :65]
+    scores[5, 6:9], scores[62, 64] = math.nan, math.inf
+    assert peak_numbers(scores, 5.0)[:2] == [62 * 65 + 64, 1.0]
+    assert peak_numbers(torch.full((63, 65), math.nan), 5.0)[:3] == [0.0, -1.0, -1.0]
+
+
+def test_the_peak_of_a_window_without_texture_is_finite():
+    with pretended_device():
+        search, template = prepare(torch.zeros(60, 70).to(DEVICE)), torch.rand(20, 30).to(DEVICE)
+        found = match_template(search, template, exclusion_px=3.0)
+    assert (found.x, found.y, found.score, found.second_score) == (0.0, 0.0, 0.0, 0.0)
