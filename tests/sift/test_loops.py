@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from engine.features import sift
-from engine.kernels import sift_descriptors
 from engine.runtime import jit
 from engine.runtime.threads import count, set_threads
 from engine.sift import loops
@@ -98,14 +97,6 @@ def test_angles_and_descriptors_are_those_of_the_reference(plan, both, turn_rad)
     ]
     got = loops.describe(buffer, rows, turns.astype(np.float32), plan)
     np.testing.assert_allclose(got, np.array(described).reshape(-1, 128), atol=3e-4)
-
-
-def test_directions_are_the_arc_tangents():
-    angle = np.linspace(0, 2 * np.pi, 4001)[:-1]
-    got = [sift_descriptors._turn(np.float32(np.cos(a)), np.float32(np.sin(a))) for a in angle]
-    error = np.abs((np.array(got) - angle / math.tau + 0.5) % 1 - 0.5)
-    assert error.max() < 3e-6
-    assert sift_descriptors._turn(np.float32(0), np.float32(0)) == 0
 
 
 def test_more_threads_give_the_same():
