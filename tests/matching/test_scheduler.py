@@ -191,16 +191,21 @@ def test_refinement_at_once_is_begun_only_where_there_is_time_for_it(ground, mak
     assert fix.stage == "coarse"
 
 
-def test_a_refinement_at_once_that_was_too_dear_once_is_tried_again(site, camera, frame, prior, monkeypatch):
+@pytest.mark.parametrize(
+    ("method", "step", "work"), [("ncc", "refinement at once", 9e4), ("sift", "sift by few features", 3e4)]
+)
+def test_a_short_way_that_was_too_dear_once_is_tried_again(
+    site, camera, frame, prior, monkeypatch, method, step, work
+):
     """Without it every frame takes the long way, which is dearer yet."""
     monkeypatch.setattr(Costs, "load", lambda _self: 1.0)  # whatever else this machine does
-    matcher = SceneMatcher(site, camera, "ncc", "cpu")
+    matcher = SceneMatcher(site, camera, method, "cpu")
     for _ in range(2):
-        matcher._costs.learn("refinement at once", 9e4, 1e7, 1e7)
-    before_ms = matcher._costs.needed_ms("refinement at once", 9e4)
+        matcher._costs.learn(step, work, 1e7, 1e7)
+    before_ms = matcher._costs.needed_ms(step, work)
     for _ in range(40):
         matcher.locate(frame, prior, Budget(total_ms=0.9 * before_ms))
-    assert matcher._costs.needed_ms("refinement at once", 9e4) < 0.5 * before_ms
+    assert matcher._costs.needed_ms(step, work) < 0.5 * before_ms
 
 
 def test_beside_a_fix_a_step_leaves_room_for_a_preemption(ground, make, frame, prior):

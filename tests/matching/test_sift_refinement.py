@@ -174,21 +174,6 @@ def test_certain_few_features_are_kept_where_all_come_too_late(ground, camera, m
     assert fix.stage == "coarse"
 
 
-@pytest.mark.usefixtures("clock_stands")
-def test_few_features_that_were_too_dear_once_are_tried_again(ground, camera, site):
-    matcher = SceneMatcher(site, camera, "sift", "cpu")
-    matcher.warmup()
-    for _ in range(20):
-        matcher._costs.learn("sift by few features", 1.0, 10.0, 10.0)
-    frame, prior = shot(ground, camera), ground.prior(NADIR)
-    work_px = drawn_px(matcher._query(frame, prior, Deadline(Budget())), frame.height_agl_m, 0.5)
-    before_ms = matcher._costs.needed_ms("sift by few features", work_px)
-    for _ in range(10):
-        matcher.locate(frame, prior, Budget(total_ms=before_ms / 2.0))
-    after_ms = matcher._costs.needed_ms("sift by few features", work_px)
-    assert after_ms < before_ms
-
-
 def test_a_pose_refined_to_another_height_is_not_taken(ground, camera, matcher, plain):
     """Refinement is held to the telemetry's height, the features measure their own."""
     frame = replace(shot(ground, camera), height_agl_m=162.0)
