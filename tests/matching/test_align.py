@@ -5,6 +5,7 @@ The frames of :class:`Ground` are drawn ray by ray, so that no homography of the
 
 from __future__ import annotations
 
+import itertools
 import math
 from functools import lru_cache
 
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from engine import Attitude, Camera, Frame, MatcherOptions, SceneMatcher
 from engine.matching.align import FRACTION, MAX_RAY_DEG, rectify, view_of
+from engine.matching.oblique import largest_rectangle
 from engine.options import NccOptions, SiftOptions
 from tests.support.fixes import px_off
 from tests.support.ground import rays_of
@@ -149,3 +151,29 @@ def test_a_patch_holds_frame_alone(roll, pitch, heading):
 def test_a_frame_that_covers_a_few_map_pixels_gives_no_patch():
     view = view_of(CAMERA, Attitude(0.0, 0.0, 0.0), 4.0, UPRIGHT)  # 9 map pixels wide
     assert rectify(np.zeros((300, 300), np.uint8), CAMERA, view) is None
+
+
+# The largest upright part of an oblique frame that shows the map
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_largest_rectangle_is_that_of_an_exhaustive_search(seed):
+    valid = np.random.default_rng(seed).random((9, 11)) > 0.25
+    best = 0
+    for top, bottom in itertools.combinations(range(10), 2):
+        for left, right in itertools.combinations(range(12), 2):
+            if valid[top:bottom, left:right].all():
+                best = max(best, (bottom - top) * (right - left))
+    box = largest_rectangle(valid)
+    assert box.area_px == best
+    assert valid[box.y0 : box.y0 + box.height_px, box.x0 : box.x0 + box.width_px].all()
+
+
+def test_a_large_one_is_found_within_a_cell():
+    valid = np.zeros((480, 640), bool)
+    valid[101:402, 53:517] = True
+    box = largest_rectangle(valid)
+    assert valid[box.y0 : box.y0 + box.height_px, box.x0 : box.x0 + box.width_px].all()
+    assert box.area_px > 0.95 * 301 * 464
+    assert largest_rectangle(np.zeros((50, 50), bool)).area_px == 0
+    assert largest_rectangle(np.ones((1, 200), bool)).area_px == 0  # lower than a cell

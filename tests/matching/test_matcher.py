@@ -273,6 +273,30 @@ def test_a_wide_search_is_not_begun_where_the_budget_does_not_hold_it(
     assert [(tried.x_axis_deg is None, tried.heights_m) for tried in hypotheses] == expected[:looks]
 
 
+# The null hypothesis of SIFT: what the mirrored frame reaches is chance, and counts against the pose
+
+
+class SymmetricalGround(Ground):
+    """Its west mirrors its east, so that a frame from above the axis is its own mirror image."""
+
+    def levels(self, east_m, north_m):
+        return super().levels(np.abs(east_m), north_m)
+
+
+def test_a_frame_of_the_map_beats_its_mirror_image(ground, camera, frame, prior):
+    """At a risk that leaves nothing beyond doubt."""
+    matcher = SceneMatcher(ground.site, camera, "sift", "cpu", MatcherOptions(risk=1e-20))
+    assert px_off(matcher.locate(frame, prior), NADIR) < 0.3
+
+
+def test_a_frame_that_is_its_own_mirror_image_is_refused(camera):
+    ground, on_axis = SymmetricalGround(), np.array([319.5, 305.0])
+    shown = ground.frame(camera, on_axis, timestamp_ns=77)
+    result = with_sift(ground, camera).locate(shown, ground.prior(on_axis))
+    assert_refused(result, Reason.AMBIGUOUS)
+    assert "the mirrored frame fits the map as well" in result.detail
+
+
 # Where SIFT's features come from
 
 

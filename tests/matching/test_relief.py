@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from engine import Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher
+from engine.kernels.dense import Pose
 from engine.matching.align import view_of
+from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.options import NccOptions
 from engine.values import Attitude
 from tests.support.ground import pixels_of, rays_of
@@ -60,6 +62,10 @@ def off_m(ground, fix):
     return float(np.hypot(*ground.off_m(fix, NADIR)))
 
 
+def matcher_of(site, camera, refine=True):
+    return SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=refine)))
+
+
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("somewhere", [True, False])
 def test_a_fix_over_hills_lies_where_the_truth_is(scene, ground, camera, stated, somewhere):
@@ -67,7 +73,7 @@ def test_a_fix_over_hills_lies_where_the_truth_is(scene, ground, camera, stated,
     site, frame, up_m = scene
     frame = frame if stated else replace(frame, roll_deg=None, pitch_deg=None)
     prior = None if somewhere else ground.prior(NADIR)
-    fix = SceneMatcher(site, camera, "ncc", "cpu").locate(frame, prior)
+    fix = matcher_of(site, camera).locate(frame, prior)
     assert fix.stage == "refined"
     assert off_m(ground, fix) < 0.35
     assert fix.up_m == pytest.approx(up_m, abs=0.2)
@@ -76,7 +82,7 @@ def test_a_fix_over_hills_lies_where_the_truth_is(scene, ground, camera, stated,
 def test_the_frame_is_laid_on_the_slope_below_it(scene, ground, camera, monkeypatch):
     """Correlation alone: aligned with its slope the frame fits the map better than on level ground."""
     site, frame, _ = scene
-    matcher = SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=False)))
+    matcher = matcher_of(site, camera, refine=False)
     fix = matcher.locate(frame, ground.prior(NADIR))
     monkeypatch.setattr("engine.matching.correlation.Correlator._slope", lambda *_: np.zeros(2))
     level = matcher.locate(frame, ground.prior(NADIR))
@@ -94,7 +100,7 @@ def test_sift_counts_height_from_the_ground_below(scene, ground, camera):
 
 def test_a_frame_without_height_takes_it_from_the_last_fix_above_the_ground_there(scene, ground, camera):
     site, frame, up_m = scene
-    navigator = Navigator(SceneMatcher(site, camera, "ncc", "cpu"), ground.prior(NADIR))
+    navigator = Navigator(matcher_of(site, camera), ground.prior(NADIR))
     assert isinstance(navigator.update(frame), Fix)
     fix = navigator.update(replace(frame, height_agl_m=None, timestamp_ns=10**9))
     assert fix.up_m == pytest.approx(up_m, abs=0.2)
@@ -133,3 +139,106 @@ def test_a_slope_that_a_corner_looks_along_has_no_view(camera):
     level, jacobian = Attitude(0.0, 0.0, 0.0), np.diag([0.5, -0.5])
     assert view_of(camera, level, HEIGHT_M, jacobian, np.array([0.8, 0.0])) is not None
     assert view_of(camera, level, HEIGHT_M, jacobian, np.array([0.9, 0.0])) is None
+
+
+# A map alone: the refined pose over ground whose slope nobody stated
+
+TRUE = {"roll_deg": 4.0, "pitch_deg": -3.0, "heading_deg": 20.0}
+OFF_DEG = [(0.5, -0.3), (-0.4, 0.4), (0.2, 0.5), (-0.5, -0.2)]
+
+
+def tangent(degrees):
+    return np.tan(np.radians(degrees))
+
+
+def picture():
+    """What a picture of a plane tells: by six numbers, of which each tilt looks like a slope and a way."""
+    rows = np.eye(8)[:6]
+    rows[0, 4], rows[1, 3] = HEIGHT_M, -HEIGHT_M
+    rows[3, 7], rows[4, 6] = 1.0, 1.0
+    return rows / np.array([0.05, 0.05, 0.05, 1e-3, 1e-3, 1e-3])[:, None]
+
+
+def inferred(measured, slope_sigma):
+    """Mean, covariance and evidence of the parameters by the textbook, the slope's prior being normal."""
+    tilt = tangent(0.37)
+    precision = np.diag(np.array([1e4, 1e4, 1.6, tilt, tilt, 3 * tilt, slope_sigma, slope_sigma]) ** -2.0)
+    rows = picture()
+    covariance = np.linalg.inv(rows.T @ rows + precision)
+    spread = rows @ np.linalg.inv(precision) @ rows.T + np.eye(6)
+    evidence = np.exp(-0.5 * measured @ np.linalg.solve(spread, measured)) / np.sqrt(np.linalg.det(spread))
+    return covariance @ rows.T @ measured, covariance, evidence
+
+
+def refined(measured):
+    """The pose by a wide prior of the slope, its covariance, and the place (2,) by the picture alone."""
+    mean, covariance, _ = inferred(measured, tangent(wide_slope_deg(2.0)))
+    free, _, _ = inferred(measured, 1e6)
+    return Pose(np.eye(3), mean[:3], mean[6:]), covariance, free[:2]
+
+
+@pytest.mark.parametrize("slope_deg", [(0.0, 0.3), (0.4, -0.2), (1.5, 1.0)])
+def test_exchanging_the_prior_equals_inference_with_each_and_their_mean_by_evidence(slope_deg):
+    measured = picture() @ np.concatenate([[0.3, -0.2, 0.5, 0.004, -0.003, 0.01], tangent(np.array(slope_deg))])
+    found = over_unknown_slope(*refined(measured), HEIGHT_M, 2.0)
+    means, covariances, weights = zip(
+        *(inferred(measured, tangent(s)) for s in (0.35, 0.7, 1.4, 2.8)), strict=True
+    )
+    expected = np.average(means, axis=0, weights=weights)
+    off = np.array(means) - expected
+    spread = np.average(np.array(covariances) + off[:, :, None] * off[:, None], axis=0, weights=weights)
+    np.testing.assert_allclose(found.pose.center_m, expected[:3], atol=2e-3)
+    np.testing.assert_allclose(found.pose.slope, expected[6:], atol=1e-5)
+    np.testing.assert_allclose(found.covariance[:2, :2], spread[:2, :2], rtol=1e-3, atol=2e-3)
+    assert found.covariance[2, 2] >= spread[2, 2]
+
+
+@pytest.mark.parametrize(
+    ("off_m", "height_m", "is_confirmed"),
+    [(0.9, HEIGHT_M, True), (1.1, HEIGHT_M, False), (1.1, 2.0 * HEIGHT_M, True)],
+)
+def test_a_pose_that_is_not_the_peak_s_is_not_confirmed(off_m, height_m, is_confirmed):
+    pose, covariance, place = refined(picture() @ np.full(8, 1e-3))
+    found = over_unknown_slope(pose, covariance, place + np.array([off_m, 0.0]), height_m, 2.0)
+    assert (found is not None) == is_confirmed
+
+
+@pytest.fixture(scope="module")
+def site(ground):
+    return ground.map_of(georeference_sigma_m=0.1)
+
+
+@pytest.fixture(scope="module")
+def level_fixes(ground, site, camera):
+    """Over level ground, by telemetry whose tilt is off as assumed: fix and (2,) error, by peak and refined."""
+    frame = ground.frame(camera, NADIR, HEIGHT_M, **TRUE)
+    by_peak, refined = [], []
+    for rows, refine in ((by_peak, False), (refined, True)):
+        matcher = matcher_of(site, camera, refine)
+        for roll_deg, pitch_deg in OFF_DEG:
+            tilt = {"roll_deg": TRUE["roll_deg"] + roll_deg, "pitch_deg": TRUE["pitch_deg"] + pitch_deg}
+            fix = matcher.locate(replace(frame, **tilt), ground.prior(NADIR))
+            rows.append((fix, ground.off_m(fix, NADIR)))
+    return by_peak, refined
+
+
+def test_over_level_ground_a_map_alone_gives_less_than_the_peak_s_error(level_fixes):
+    peaks, refined = (np.array([np.hypot(*off) for _, off in rows]) for rows in level_fixes)
+    assert (refined < peaks).all()
+    assert np.sqrt(np.mean(refined**2)) < 0.75 * np.sqrt(np.mean(peaks**2))
+
+
+def test_the_refined_fix_states_a_smaller_error_and_keeps_to_it(level_fixes):
+    stated = [np.mean([np.trace(fix.relative_covariance_m2) for fix, _ in rows]) for rows in level_fixes]
+    assert 0.3 * stated[0] < stated[1] < stated[0]
+    for fix, off in level_fixes[1]:
+        assert fix.stage == "refined"
+        assert off @ np.linalg.solve(fix.relative_covariance_m2, off) < 9.0
+        assert abs(fix.up_m - HEIGHT_M) < 3.0 * np.sqrt(fix.covariance_m2[2, 2])
+
+
+@pytest.mark.parametrize("shape", [plane, hill])
+def test_over_slopes_the_peak_s_fix_stands(ground, site, camera, shape):
+    frame, _ = seen(ground, camera, shape)
+    peak, fix = (matcher_of(site, camera, refine).locate(frame, ground.prior(NADIR)) for refine in (False, True))
+    assert off_m(ground, fix) < off_m(ground, peak) + 0.5
