@@ -43,11 +43,6 @@ def test_grey_is_the_smoothed_picture_about_middle_grey():
     np.testing.assert_allclose(enhance(gray, score="grey"), binomial(gray) - 127.5, atol=0.51)
 
 
-def test_local_is_what_is_taken_where_no_score_is_named():
-    np.testing.assert_array_equal(enhance(noise()), enhance(noise(), score="local"))
-    assert NccOptions().score == "local"
-
-
 def test_local_without_a_neighbourhood_only_smooths():
     gray = np.random.default_rng(2).integers(0, 256, (9, 7)).astype(np.uint8)
     np.testing.assert_allclose(enhance(gray, radius_px=0), binomial(gray), atol=0.51)

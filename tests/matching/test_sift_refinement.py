@@ -70,15 +70,6 @@ def test_a_refined_pose_is_nearer_and_says_so(ground, camera, matcher, plain):
     assert np.mean(chi_squares) / 2.0 < 3.0
 
 
-def test_a_fix_keeps_the_confidence_of_its_features(ground, camera, matcher):
-    """Refinement says how near the pose is, not whether the place is right."""
-    fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
-    assert fix.confidence is not None
-    assert 1.0 - fix.confidence <= MatcherOptions().risk
-    assert fix.attitude_covariance_deg2 is not None
-    assert fix.up_m is not None
-
-
 def test_doubtful_few_features_give_way_to_all(ground, camera, matcher, monkeypatch):
     few = []
     honest = FeatureMatcher.find_at_once
