@@ -10,14 +10,11 @@ from engine.matching.ncc import Ncc
 from engine.matching.sift import Sift
 from engine.values import Reason
 
-NADIR = np.array([310.0, 305.0])
-
 
 @pytest.mark.parametrize(("off_m", "same_place"), [(4.0, True), (25.0, False)])
 def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
-    ground, site, camera, monkeypatch, off_m, same_place
+    site, camera, frame, prior, monkeypatch, off_m, same_place
 ):
-    frame, prior = ground.frame(camera, NADIR, 150.0, heading_deg=20.0), ground.prior(NADIR)
     own, compared = Ncc.locate, Sift.locate
     seen = []
     monkeypatch.setattr(Sift, "locate", lambda self, *args: seen.append(compared(self, *args)) or seen[-1])
@@ -38,13 +35,10 @@ def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
         assert "m apart" in result.detail
 
 
-def test_few_features_that_disagree_are_not_the_second_opinion(ground, site, camera, monkeypatch):
+def test_few_features_that_disagree_are_not_the_second_opinion(site, camera, frame, prior, monkeypatch):
     """All of them are; a pose of few, a level coarser, is off by more."""
-    frame, prior = ground.frame(camera, NADIR, 150.0, heading_deg=20.0), ground.prior(NADIR)
     matcher = SceneMatcher(site, camera, "auto", "cpu")
-    expected = matcher.locate(frame, prior)
-
-    few = Sift.find_few
+    expected, few = matcher.locate(frame, prior), Sift.find_few
 
     def off(self, *args):
         found = few(self, *args)

@@ -67,11 +67,6 @@ def matcher(_stand_in, ground, camera):
     return SceneMatcher(ground.site, camera, "learned", "cpu", WITH_WEIGHTS)
 
 
-@pytest.fixture(scope="module")
-def frame(ground, camera):
-    return ground.frame(camera, NADIR, heading_deg=25.0, timestamp_ns=77)
-
-
 @pytest.mark.parametrize("heading_deg", [0.0, 140.0, 265.0])
 def test_a_frame_at_any_heading_reaches_the_network_upright(matcher, ground, camera, heading_deg):
     frame = ground.frame(camera, NADIR, heading_deg=heading_deg, roll_deg=5.0, pitch_deg=-4.0, timestamp_ns=77)
@@ -97,9 +92,9 @@ def test_another_place_is_refused(matcher, ground, camera):
 
 
 @pytest.mark.usefixtures("_stand_in")
-def test_a_window_too_large_for_a_network_is_refused(ground, camera, frame):
+def test_a_window_too_large_for_a_network_is_refused(ground, camera, frame, prior):
     options = MatcherOptions(learned=LearnedOptions(weights=("stand-in",), max_window_px=10_000))
-    refusal = SceneMatcher(ground.site, camera, "learned", "cpu", options).locate(frame, ground.prior(NADIR))
+    refusal = SceneMatcher(ground.site, camera, "learned", "cpu", options).locate(frame, prior)
     assert isinstance(refusal, NoFix)
     assert refusal.reason is Reason.MAP_TOO_LARGE
 
@@ -112,8 +107,8 @@ def test_the_map_is_described_once(matcher, ground, frame):
     assert matcher.cache_counters["keypoint tiles"] == created
 
 
-def test_an_explanation_shows_the_matches_of_the_fix(matcher, ground, frame):
-    fix = matcher.locate(frame, ground.prior(NADIR))
+def test_an_explanation_shows_the_matches_of_the_fix(matcher, frame, prior):
+    fix = matcher.locate(frame, prior)
     shown = matcher.explain(frame, fix.window).matches
     assert shown.agree.mean() == pytest.approx(fix.score, abs=0.1)
 

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from engine import (
 from engine.runtime import workers as processes
 from engine.runtime.scheduler import Costs
 from tests.support.fixes import values_of
+from tests.support.threads import called_at_once
 
 METHODS = ("ncc", "sift", "auto")
 PLACES = [np.array([300.0 + 6.0 * k, 290.0 + 4.0 * (k % 3)]) for k in range(6)]
@@ -87,25 +87,19 @@ def test_other_processes_did_the_work(matchers, questions, monkeypatch):
 
 
 def test_threads_of_ones_own_may_share_a_matcher(ground, camera, questions):
-    frames, priors = (part[4:] for part in questions)
+    asked = list(zip(*(part[4:] for part in questions), strict=True))
     for method in ("ncc", "sift"):
         alone = SceneMatcher(ground.site, camera, method, "cpu")
-        expected = [values_of(alone.locate(frame, prior)) for frame, prior in zip(frames, priors, strict=True)]
+        expected = [values_of(alone.locate(*question)) for question in asked]
         shared = SceneMatcher(ground.site, camera, method, "cpu")  # nothing is cached yet
-        with ThreadPoolExecutor(4) as threads:
-            for _ in range(2):
-                assert [values_of(result) for result in threads.map(shared.locate, frames, priors)] == expected
+        found = called_at_once(lambda question, shared=shared: shared.locate(*question), asked * 2)
+        assert [values_of(result) for result in found] == expected * 2
 
 
 def test_threads_learn_one_cost():
     costs = Costs()
-
-    def learn(_):
-        for work in range(1, 200):
-            costs.learn("step", float(work), 2.0 * work, 2.0 * work)
-
-    with ThreadPoolExecutor(4) as threads:
-        list(threads.map(learn, range(8)))
+    works = [float(work) for work in range(1, 200)] * 8
+    called_at_once(lambda work: costs.learn("step", work, 2.0 * work, 2.0 * work), works)
     assert costs.needed_ms("step", 100.0) == pytest.approx(200.0, rel=1e-6)
 
 

@@ -265,11 +265,7 @@ def test_a_wide_search_is_not_begun_where_the_budget_does_not_hold_it(
     monkeypatch.setattr(FeatureMatcher, "_find_with", look)
     result = with_sift(ground, camera).locate(frame, prior, Budget(total_ms=budget_ms))
     assert result.reason is Reason.TOO_FEW_MATCHES
-    expected = [
-        (False, (150.0, 150.0)),
-        (False, (150.0, 150.0)),
-        (True, (75.0, 300.0)),
-    ]  # heading unknown, heights
+    expected = [(False, (150.0, 150.0))] * 2 + [(True, (75.0, 300.0))]  # whether the heading is unknown, heights
     assert [(tried.x_axis_deg is None, tried.heights_m) for tried in hypotheses] == expected[:looks]
 
 

@@ -62,14 +62,6 @@ def off_m(ground, fix):
     return float(np.hypot(*ground.off_m(fix, NADIR)))
 
 
-@pytest.mark.parametrize("method", ["ncc", "sift"])
-def test_with_time_the_finest_level(ground, make, frame, prior, method):
-    for budget in (None, HURRY):
-        fix = make(method).locate(frame, prior, budget)
-        assert off_m(ground, fix) < 1.0
-        assert fix.stage == "refined"
-
-
 def test_a_fix_that_there_is_no_time_to_refine_is_put_out_as_it_is(make, frame, prior):
     fix, fine = make("ncc", refinement=1e9).locate(frame, prior, HURRY), make("ncc").locate(frame, prior, HURRY)
     assert (fix.stage, fix.up_m, fine.stage) == ("fine", None, "refined")

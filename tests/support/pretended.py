@@ -63,7 +63,6 @@ class Crossings(TorchDispatchMode):
         uploads: numbers per copy to the device.
         downloads: numbers per copy to the host.
         waits: operations that the host waits for.
-        trace: every operation on the device with the shapes of its results.
     """
 
     def __init__(self) -> None:
@@ -71,7 +70,6 @@ class Crossings(TorchDispatchMode):
         self.uploads: list[int] = []
         self.downloads: list[int] = []
         self.waits: list[str] = []
-        self.trace: list[tuple[str, tuple[tuple[int, ...], ...]]] = []
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
@@ -96,7 +94,6 @@ class Crossings(TorchDispatchMode):
         out = func(*_mapped(args, Pretended, _inner), **_mapped(kwargs, Pretended, _inner))
         if not on_device:
             return out
-        self.trace.append((str(func), tuple(tuple(t.shape) for t in _tensors(out))))
         return _mapped(out, Tensor, lambda t: _wrapped(t, mine))
 
     def _record(self, func: Any, args: Any, given: list[Tensor], mine: list[Any], on_device: bool) -> None:
