@@ -15,31 +15,23 @@ from tests.support.paths import ROOT
 ENGINE = ROOT / "engine"
 SAY = "\nimport sys; print('TORCH', 'torch' in sys.modules)"
 FLIGHT = """
-import sys, numpy as np, cv2
-from engine import Budget, Camera, Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
-rng = np.random.default_rng(3)
-gray = cv2.GaussianBlur(rng.normal(128, 300, (500, 500)), (0, 0), 2.5).clip(0, 255).astype(np.uint8)
-valid = np.ones(gray.shape, bool)
+import sys, numpy as np
+from engine import Budget, Camera, Fix, Navigator, SceneMatcher
+from tests.support.ground import Ground
+ground, camera = Ground(size=(450, 450)), Camera.from_fov(150, 150, 60.0)
+valid = np.ones(ground.size, bool)
 valid[:150, :180] = False  # within the windows, so that some are masked
-site = OrthoMap.from_arrays(gray, [[0.5, 0, 500_000], [0, -0.5, 5_000_000]], "EPSG:32633", valid=valid)
-camera = Camera.from_fov(120, 120, 60.0)
-def taken(image, index):
-    return Frame(image.copy(), index * 10**9, 0.5 * camera.focal_px, 0.0, 0.0, 0.0)
-def frame(index):
-    x, y = 200 + 4 * index, 190
-    east, north = site.enu_from_pixel(np.array([x + 59.5, y + 59.5]))
-    return taken(gray[y : y + 120, x : x + 120], index), Prior(east_m=east, north_m=north, sigma_m=3)
 for method in sys.argv[1:]:
-    matcher = SceneMatcher(site, camera, method, "cpu")
-    navigator = Navigator(matcher, frame(0)[1])
-    fixes = 0
+    matcher, fixes = SceneMatcher(ground.map_of(valid=valid), camera, method, "cpu"), 0
+    navigator = Navigator(matcher, ground.prior((240, 230)))
     for index in range(6):
-        shown, prior = frame(index)
+        nadir = (240 + 4 * index, 230)
+        shown, prior = ground.frame(camera, nadir, 75.0, timestamp_ns=index * 10**9), ground.prior(nadir)
         fixes += isinstance(matcher.locate(shown, prior), Fix)
         fixes += isinstance(matcher.locate(shown, prior, Budget(total_ms=60_000)), Fix)
         fixes += isinstance(navigator.update(shown), Fix)
-    fixes += isinstance(matcher.locate(frame(3)[0]), Fix)  # of the whole map
-    matcher.locate(taken(gray[:120:-1, 380:][:120], 0), frame(0)[1])  # of no place, upside down
+    fixes += isinstance(matcher.locate(shown), Fix)  # of the whole map
+    matcher.locate(Ground(seed=6).frame(camera, nadir, 75.0), prior)  # of no place
     print(method, fixes)
 """
 
