@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from engine.budget import Budget, Deadline
-from engine.runtime import scheduler
+from engine.runtime import scheduler, threads
 from engine.runtime.device import Device
 from engine.runtime.scheduler import MAX_WAIT_MS, RUNS, SEVERAL, Costs, OutOfTime, Scheduler
 
@@ -177,3 +177,27 @@ def test_beside_a_fix_a_step_is_abandoned_before_a_stage_that_would_lose_it(monk
     with one.with_fix():
         assert abandoned(one, clock, match=6.0, pose=5.0) == "pose"  # the first took longer than usual
     assert one.deadline.met
+
+
+@pytest.mark.parametrize(("count", "used_ms"), [(1, 1.0), (2, 9.0)])
+def test_only_if_one_thread_works_its_waiting_is_told_apart(count, used_ms, monkeypatch):
+    """A thread that lets others work is off the processor for as long as they work."""
+    monkeypatch.setattr(threads, "count", lambda: count)
+    clock_ns, processor_ns = iter([0, 0, 0, 9_000_000]), iter([0, 1_000_000])
+    monkeypatch.setattr(scheduler.time, "thread_time_ns", lambda: next(processor_ns))
+    learned, costs = [], Costs()
+    monkeypatch.setattr(costs, "learn", lambda *run, stage: learned.append(run))
+    one = Scheduler(Deadline(Budget(), lambda: next(clock_ns)), Device("cpu"), costs)
+    with one.costed("step", 5.0):
+        pass
+    assert learned == [("step", 5.0, pytest.approx(used_ms), pytest.approx(9.0))]
+
+
+def test_what_compiled_is_nobodys_cost(monkeypatch):
+    compiled = iter([0, 1, 1, 1])
+    monkeypatch.setattr(scheduler, "loops_compiled", lambda: next(compiled))
+    costs = Costs()
+    for _ in range(2):
+        with Scheduler(Deadline(Budget()), Device("cpu"), costs).costed("step", 5.0):
+            pass
+    assert len(costs._runs["step"]) == 1

@@ -13,6 +13,7 @@ from engine.matching.align import view_of
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.options import NccOptions
 from engine.values import Attitude
+from tests.support.fixes import px_off
 from tests.support.ground import pixels_of, rays_of
 
 NADIR = np.array([315.0, 296.0])
@@ -58,10 +59,6 @@ def scene(request, ground, camera):
     return site_on(ground, request.param), *seen(ground, camera, request.param)
 
 
-def off_m(ground, fix):
-    return float(np.hypot(*ground.off_m(fix, NADIR)))
-
-
 def matcher_of(site, camera, refine=True):
     return SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(refine=refine)))
 
@@ -75,7 +72,7 @@ def test_a_fix_over_hills_lies_where_the_truth_is(scene, ground, camera, stated,
     prior = None if somewhere else ground.prior(NADIR)
     fix = matcher_of(site, camera).locate(frame, prior)
     assert fix.stage == "refined"
-    assert off_m(ground, fix) < 0.35
+    assert px_off(fix, NADIR) < 0.7
     assert fix.up_m == pytest.approx(up_m, abs=0.2)
 
 
@@ -87,13 +84,13 @@ def test_the_frame_is_laid_on_the_slope_below_it(scene, ground, camera, monkeypa
     monkeypatch.setattr("engine.matching.correlation.Correlator._slope", lambda *_: np.zeros(2))
     level = matcher.locate(frame, ground.prior(NADIR))
     assert fix.score > level.score + 0.1
-    assert off_m(ground, fix) < 3.0
+    assert px_off(fix, NADIR) < 6
 
 
 def test_sift_counts_height_from_the_ground_below(scene, ground, camera):
     site, frame, up_m = scene
     fix = SceneMatcher(site, camera, "sift", "cpu").locate(frame, ground.prior(NADIR))
-    assert off_m(ground, fix) < 0.5
+    assert px_off(fix, NADIR) < 1
     assert fix.up_m == pytest.approx(up_m, abs=0.5)
     assert fix.confidence > 0.9995  # nothing speaks against it; a height that is 17 m off would
 
@@ -241,4 +238,4 @@ def test_the_refined_fix_states_a_smaller_error_and_keeps_to_it(level_fixes):
 def test_over_slopes_the_peak_s_fix_stands(ground, site, camera, shape):
     frame, _ = seen(ground, camera, shape)
     peak, fix = (matcher_of(site, camera, refine).locate(frame, ground.prior(NADIR)) for refine in (False, True))
-    assert off_m(ground, fix) < off_m(ground, peak) + 0.5
+    assert px_off(fix, NADIR) < px_off(peak, NADIR) + 1.0
