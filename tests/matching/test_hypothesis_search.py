@@ -19,11 +19,7 @@ PLACES = (0, 5, 9, 13)
 REACH = {"heading_sigma_deg": 5.0 / SPREAD_SIGMAS, "height_sigma_m": 0.05 * 120.0 / SPREAD_SIGMAS}
 ANY_HEADING = {"heading_deg": 123.0, "heading_sigma_deg": 180.0}
 # (degrees, share) by which the telemetry is off; 5 and 0.05 are searched
-OFF = [
-    (5.0, 0.05), pytest.param(0.0, 0.0, marks=pytest.mark.slow), pytest.param(3.3, -0.05, marks=pytest.mark.slow),
-    pytest.param(-5.0, 0.03, marks=pytest.mark.slow), pytest.param(-1.7, -0.02, marks=pytest.mark.slow),
-]  # fmt: skip
-
+OFF = [(5.0, 0.05), (0.0, 0.0), (3.3, -0.05), (-5.0, 0.03), (-1.7, -0.02)]
 KNOWN = pytest.mark.parametrize(
     "known", [pytest.param(True, id="prior"), pytest.param(False, id="whole map", marks=pytest.mark.slow)]
 )
@@ -77,7 +73,7 @@ def test_a_wrong_heading_and_height_are_put_right(matcher, site, flight, error_m
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
+@KNOWN
 def test_a_frame_without_a_heading_is_found_all_around_or_refused(matcher, site, flight, error_m, known):
     bank = matcher()
     fixes = 0

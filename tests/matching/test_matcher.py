@@ -117,15 +117,6 @@ def test_nothing_that_is_handed_in_is_changed(matchers, frame, prior):
     np.testing.assert_array_equal(frame.image, before)
 
 
-@pytest.mark.slow
-def test_without_a_prior_a_place_on_a_large_map_is_found_by_way_of_a_coarse_one(camera):
-    ground = Ground(size=(1200, 1100), seed=9)  # more than the million pixels that are searched at once
-    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
-    for nadir in ((320.4, 850.6), (780.5, 402.5)):
-        shown = ground.frame(camera, np.array(nadir), heading_deg=80.0)
-        assert px_off(matcher.locate(shown), nadir) < 0.3
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_a_prior_is_the_same_in_metres_or_in_degrees_of_either_longitude(matchers, ground, frame, method):
     east, north = ground.enu_from_pixel(NADIR)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 
 import cv2
 import numpy as np
@@ -92,31 +91,12 @@ def measured(rng: np.random.Generator, rotation: Array) -> AttitudePrior:
     return AttitudePrior(np.asarray(cv2.Rodrigues(error)[0] @ rotation), sigma_deg)
 
 
-@cache
-def _lens() -> tuple[Camera, Array]:
-    """A camera with barrel distortion, and where each pixel of its undistorted picture comes from, (H, W, 2)."""
-    camera = Camera(SIZE_PX, SIZE_PX, CAMERA.matrix, distortion=np.array([-0.25, 0.08, 1e-3, -5e-4, -0.01]))
-    maps = cv2.convertMaps(*camera._undistort_maps, cv2.CV_32FC1)
-    return camera, np.stack(maps[:2], axis=-1).astype(np.float64)
-
-
 def through_the_lens(pixels: Array, noise: Array) -> Array:
-    """Ideal pixels as the lens shows them, plus noise, and as the matcher's undistorted picture shows those.
-
-    The way out is OpenCV's formula, the way back the lookup by which :class:`Camera` undistorts a frame.
-    """
-    camera, source = _lens()
-    rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(camera.matrix).T
-    seen = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)[0][:, 0] + noise
-    found = pixels.copy()
-    for _ in range(8):  # source(found) = seen, the lookup read between its pixels
-        low = np.clip(np.floor(found).astype(int), 0, SIZE_PX - 2)
-        fx, fy = (found - low).T[:, :, None]
-        x, y = low.T
-        top = source[y, x] * (1 - fx) + source[y, x + 1] * fx
-        bottom = source[y + 1, x] * (1 - fx) + source[y + 1, x + 1] * fx
-        found += seen - (top * (1 - fy) + bottom * fy)
-    return found
+    """Ideal pixels as a lens with barrel distortion shows them, plus noise, and as OpenCV undistorts those."""
+    distortion = np.array([-0.25, 0.08, 1e-3, -5e-4, -0.01])
+    rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(CAMERA.matrix).T
+    seen = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), CAMERA.matrix, distortion)[0] + noise[:, None]
+    return np.asarray(cv2.undistortPoints(seen, CAMERA.matrix, distortion, P=CAMERA.matrix)[:, 0])
 
 
 # ------------------------------------------------------------------------------------------ nothing to be found
