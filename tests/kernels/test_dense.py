@@ -211,11 +211,8 @@ def fixes_over(flight, site, method="ncc", frames=slice(None)):
     matcher = SceneMatcher(site, flight.camera, method, "cpu")
     for frame, truth in zip(flight.frames[frames], flight.truth[frames], strict=True):
         place = site.frame.enu_from_geodetic(truth.lat_deg, truth.lon_deg)
-        yield (
-            matcher.locate(frame, Prior(east_m=place[0] + 3.0, north_m=place[1] - 2.0, sigma_m=5.0)),
-            truth,
-            place,
-        )
+        prior = Prior(east_m=place[0] + 3.0, north_m=place[1] - 2.0, sigma_m=5.0)
+        yield matcher.locate(frame, prior), truth, place
 
 
 def test_errors_are_as_large_as_the_covariance_says(sim_flight, sim_site):

@@ -73,11 +73,9 @@ def test_derivatives_foretell_what_a_moved_pose_sees(scene, parameter):
     foretold = rows(shown, places, offset_m, rotation)[:, parameter]
     step = 1e-3 * np.eye(8)[parameter] / (1.0 if parameter < 3 else HEIGHT_M)
     seen = []
-    for sign in (-1.0, 1.0):
-        turned = cv2.Rodrigues(sign * step[3:6])[0] @ rotation
-        seen.append(
-            look(scene, center_m=center_m + sign * step[:3], rotation=turned, slope=slope + sign * step[6:])
-        )
+    for moved in (-step, step):
+        turned = cv2.Rodrigues(moved[3:6])[0] @ rotation
+        seen.append(look(scene, center_m=center_m + moved[:3], rotation=turned, slope=slope + moved[6:]))
     both = (weights > 0) & (seen[0][4] > 0) & (seen[1][4] > 0)
     measured = (seen[1][0] - seen[0][0])[both] / (2.0 * step[parameter])
     error = np.linalg.norm(measured - foretold[both]) / np.linalg.norm(foretold[both])

@@ -1,7 +1,9 @@
-"""The map that several methods are tested on, and a frame with its prior."""
+"""The map that several methods are tested on, its matchers, and a frame with its prior."""
 
 import numpy as np
 import pytest
+
+from engine import SceneMatcher
 
 NADIR = np.array([315.0, 296.0])
 
@@ -20,3 +22,8 @@ def frame(ground, camera):
 @pytest.fixture(scope="session")
 def prior(ground):
     return ground.prior(NADIR)
+
+
+@pytest.fixture(scope="module")
+def matchers(ground, camera):
+    return {method: SceneMatcher(ground.site, camera, method, "cpu") for method in ("ncc", "sift", "auto")}

@@ -33,7 +33,6 @@ from engine.runtime.scheduler import Costs
 from tests.support.fixes import values_of
 from tests.support.threads import called_at_once
 
-METHODS = ("ncc", "sift", "auto")
 PLACES = [np.array([300.0 + 6.0 * k, 290.0 + 4.0 * (k % 3)]) for k in range(6)]
 
 
@@ -42,11 +41,6 @@ def _started_at_once(monkeypatch):
     """Workers are started after the first task, however little work it is."""
     monkeypatch.setattr(processes, "_ALONE_S", 0.0)
     monkeypatch.setattr(processes, "_WORTH_S", 0.0)
-
-
-@pytest.fixture(scope="module")
-def matchers(ground, camera):
-    return {method: SceneMatcher(ground.site, camera, method, "cpu") for method in METHODS}
 
 
 @pytest.fixture(scope="module")

@@ -55,11 +55,6 @@ def _landmarks_found_once():
         yield
 
 
-@pytest.fixture(scope="module")
-def matchers(ground, camera):
-    return {method: SceneMatcher(ground.site, camera, method, "cpu") for method in ("ncc", "sift", "auto")}
-
-
 def with_telemetry(image, height_agl_m=150.0, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0):
     return Frame(image, 77, height_agl_m, heading_deg, roll_deg, pitch_deg)
 

@@ -178,12 +178,11 @@ def refined(measured):
 def test_exchanging_the_prior_equals_inference_with_each_and_their_mean_by_evidence(slope_deg):
     measured = picture() @ np.concatenate([[0.3, -0.2, 0.5, 0.004, -0.003, 0.01], tangent(np.array(slope_deg))])
     found = over_unknown_slope(*refined(measured), HEIGHT_M, 2.0)
-    means, covariances, weights = zip(
-        *(inferred(measured, tangent(s)) for s in (0.35, 0.7, 1.4, 2.8)), strict=True
-    )
+    parts = [inferred(measured, tangent(sigma)) for sigma in (0.35, 0.7, 1.4, 2.8)]
+    means, covariances, weights = map(np.array, zip(*parts, strict=True))
     expected = np.average(means, axis=0, weights=weights)
-    off = np.array(means) - expected
-    spread = np.average(np.array(covariances) + off[:, :, None] * off[:, None], axis=0, weights=weights)
+    off = means - expected
+    spread = np.average(covariances + off[:, :, None] * off[:, None], axis=0, weights=weights)
     np.testing.assert_allclose(found.pose.center_m, expected[:3], atol=2e-3)
     np.testing.assert_allclose(found.pose.slope, expected[6:], atol=1e-5)
     np.testing.assert_allclose(found.covariance[:2, :2], spread[:2, :2], rtol=1e-3, atol=2e-3)

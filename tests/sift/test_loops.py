@@ -30,14 +30,12 @@ def picture(height: int, width: int, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(image.clip(0, 1))[None]
 
 
-@pytest.fixture(scope="module", params=[(64, 80), (33, 121), (150, 149), (3, 60)], ids=str)
-def shape(request):
-    return request.param
+SIZES = ((64, 80), (33, 121), (150, 149), (3, 60))
 
 
-@pytest.fixture(scope="module", params=[1, 2], ids=["as it is", "doubled"])
-def plan(shape, request):
-    return loops.plan_loops(*shape, request.param)
+@pytest.fixture(scope="module", params=[(*size, upsample) for size in SIZES for upsample in (1, 2)], ids=str)
+def plan(request):
+    return loops.plan_loops(*request.param)
 
 
 def octaves(plan):
