@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from engine import ncc_fft
-from engine.kernels import tensors
-from tests.support.correlation import reference_scores
+from engine.kernels import blocks, reference, tensors
+from engine.ncc_fft import MapRegion, ncc, prepare, surface
+from engine.runtime import threads as chosen
+from engine.window import place_window, window_size_px
+from tests.support.tensors import assert_close
 
-KERNELS = {"dispatch": ncc_fft.ncc, "tensors": tensors.ncc_surface}
+KERNELS = {"dispatch": ncc, "tensors": tensors.ncc_surface}
 TOLERANCE = {"float32": 1e-5, "float64": 1e-9}
+
+
+def reference_scores(search, templates, zero_mean=True):
+    """Scores (B, T, Y, X) in float64 of windows (B, H, W) and templates (B, T, h, w)."""
+    return np.stack(
+        [
+            [reference.ncc_surface(window, template, zero_mean=zero_mean) for template in hypotheses]
+            for window, hypotheses in zip(search, templates, strict=True)
+        ]
+    )
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)
@@ -45,3 +59,139 @@ def test_kernels_agree_with_the_reference_on_any_size_and_offset(
     np.testing.assert_allclose(scores, reference_scores(*before, zero_mean), rtol=0, atol=TOLERANCE[dtype])
     np.testing.assert_array_equal(search, before[0])  # input is left as it came
     np.testing.assert_array_equal(templates, before[1])
+
+
+# In blocks, as the CPU does it
+
+
+def assert_scores_are_the_references(search, templates):
+    scores = ncc(torch.from_numpy(search), torch.from_numpy(templates)).numpy()
+    np.testing.assert_allclose(scores, reference_scores(search, templates), rtol=0, atol=1e-5)
+
+
+def divide_small_windows(patch):
+    """A cost that grows past 32 px a side: small windows are divided as large ones are."""
+    patch.setattr(blocks, "_CACHED_SIDE", 32)
+    patch.setattr(blocks, "_division", blocks._division.__wrapped__)
+
+
+@pytest.mark.parametrize("side", [63, 64, 65, 96, 97, 127])
+@pytest.mark.parametrize(("more", "count"), [(0, 1), (1, 2), (2, 1), (33, 1)])
+def test_templates_from_64_px_up(side, more, count):
+    rng = np.random.default_rng(side)
+    search = rng.normal(50.0, 20.0, (1, side + more, side + more + 1)).astype(np.float32)
+    templates = rng.normal(50.0, 20.0, (1, count, side, side)).astype(np.float32)
+    templates[0, 0] += search[0, :side, :side]
+    assert_scores_are_the_references(search, templates)
+
+
+@settings(max_examples=12)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    size=st.tuples(st.integers(30, 70), st.integers(30, 70)),
+    model=st.tuples(st.integers(2, 20), st.integers(2, 20)),
+    count=st.integers(1, 3),
+    threads=st.integers(1, 2),
+)
+def test_blocks_are_the_window(seed, size, model, count, threads):
+    rng = np.random.default_rng(seed)
+    search = rng.normal(0.0, 30.0, (1, *size)).astype(np.float32)
+    templates = rng.normal(0.0, 30.0, (1, count, *model)).astype(np.float32)
+    before = chosen.count()
+    with pytest.MonkeyPatch.context() as patch:
+        divide_small_windows(patch)
+        chosen.set_threads(threads)
+        try:
+            assert_scores_are_the_references(search, templates)
+        finally:
+            chosen.set_threads(before)
+
+
+@pytest.mark.parametrize("divided", [False, True])
+def test_weak_patches_beside_strong_ones(divided, monkeypatch):
+    """A thousand times the contrast in one corner: float32 transforms would lose the rest."""
+    if divided:
+        divide_small_windows(monkeypatch)
+    rng = np.random.default_rng(7)
+    search = rng.normal(0.0, 1.0, (1, 80, 90)).astype(np.float32)
+    search[0, :20, :20] *= 1000.0
+    templates = np.stack([search[0, 50:62, 60:75], rng.normal(0.0, 1.0, (12, 15))])[None].astype(np.float32)
+    for count in (1, 2):
+        assert_scores_are_the_references(search, np.ascontiguousarray(templates[:, :count]))
+
+
+@pytest.mark.parametrize("scale", [1e-15, 1e15])
+def test_dim_and_bright_pictures_score_as_others(scale):
+    rng = np.random.default_rng(8)
+    search = (scale * rng.normal(5.0, 1.0, (1, 40, 50))).astype(np.float32)
+    templates = (scale * rng.normal(5.0, 1.0, (1, 1, 12, 15))).astype(np.float32)
+    scores = ncc(torch.from_numpy(search), torch.from_numpy(templates)).numpy()
+    np.testing.assert_allclose(scores, reference_scores(search / scale, templates / scale), rtol=0, atol=1e-5)
+
+
+@given(seed=st.integers(0, 2**32 - 1), model=st.tuples(st.integers(2, 20), st.integers(2, 20)))
+@settings(max_examples=12)
+def test_a_prepared_crop_scores_as_the_reference(seed, model):
+    """By the loops and, as on a device, by running sums, which take four times the picture's memory."""
+    rng = np.random.default_rng(seed)
+    image, templates = (rng.normal(0.0, 1.0, shape).astype(np.float32) for shape in ((60, 70), (2, *model)))
+    expected = reference_scores(image[None, 3:40, 7:48], templates[None])[0]
+    picture = torch.from_numpy(image)
+    with_sums = MapRegion(picture, sums=tensors.integrals(picture))
+    for whole, has_sums in ((prepare(picture), False), (with_sums, True)):
+        part = whole.crop(7, 3, 41, 37)
+        assert (part.sums is not None) == has_sums
+        for count in (1, 2):
+            scores = surface(part, torch.from_numpy(templates[:count]))
+            np.testing.assert_allclose(scores.numpy(), expected[:count], rtol=0, atol=1e-5)
+
+
+def test_views_are_taken():
+    search = torch.randn(2, 50, 60, generator=torch.Generator().manual_seed(0)).transpose(1, 2)
+    templates = torch.randn(1, 1, 9, 11, generator=torch.Generator().manual_seed(1)).expand(2, 3, -1, -1)
+    assert_close(ncc(search, templates), ncc(search.contiguous(), templates.contiguous()))
+
+
+def test_gradients_of_templates_come_from_the_tensor_ops():
+    search = torch.randn(1, 20, 22, generator=torch.Generator().manual_seed(0))
+    templates = torch.randn(1, 1, 8, 9, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    ncc(search, templates).max().backward()
+    assert templates.grad is not None
+
+
+def test_large_windows_are_divided_into_blocks_that_cover_them():
+    for count, model in [(33, 64), (1921, 128), (1537, 512), (9000, 200), (1, 1), (5, 3000)]:
+        number, side = blocks._division(count, model)
+        assert number * (side - model + 1) >= count > (number - 1) * (side - model + 1)
+        assert side % 2 == 0
+
+
+# How many transforms a flight plans: sides are rounded up to lengths that are fast, which many windows share
+
+
+def adaptive_windows(count):
+    """(H, W) of windows of a climb from 100 to 200 m on a curve at 15 m/s, one frame a second, 0.5 m a pixel."""
+    for i in range(count):
+        extent = 2.0 * (100.0 + 100.0 * i / count) * math.tan(math.radians(30.0)) / 0.5
+        course = 2.0 * math.pi * i / count
+        moved = (30.0 * math.sin(course), 30.0 * math.cos(course))
+        window = place_window((2000.0, 2000.0), window_size_px((extent, extent), moved), (4000, 4000))
+        assert window is not None
+        yield window.height_px, window.width_px
+
+
+def test_a_flight_of_many_window_sizes_plans_few_transforms(monkeypatch):
+    plans, real = set(), torch.fft.rfft2
+
+    def recorded(picture, s=None):
+        plans.add(tuple(s or picture.shape[-2:]))
+        return real(picture, s=s)
+
+    monkeypatch.setattr(torch.fft, "rfft2", recorded)
+    sizes = set(adaptive_windows(64))
+    assert len(sizes) > 50
+    template = torch.rand(1, 1, 48, 40, generator=torch.Generator().manual_seed(0))
+    for height, width in sizes:
+        products = tensors.correlate(torch.zeros(1, height, width), template)
+        assert products.shape == (1, 1, height - 47, width - 39)
+    assert len(plans) <= 24

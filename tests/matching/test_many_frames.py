@@ -80,11 +80,10 @@ def test_other_processes_did_the_work(matchers, questions, monkeypatch):
     assert len(here) == 1
 
 
-def test_threads_of_ones_own_may_share_a_matcher(ground, camera, questions):
+def test_threads_of_ones_own_may_share_a_matcher(matchers, ground, camera, questions):
     asked = list(zip(*(part[4:] for part in questions), strict=True))
     for method in ("ncc", "sift"):
-        alone = SceneMatcher(ground.site, camera, method, "cpu")
-        expected = [values_of(alone.locate(*question)) for question in asked]
+        expected = [values_of(matchers[method].locate(*question)) for question in asked]
         shared = SceneMatcher(ground.site, camera, method, "cpu")  # nothing is cached yet
         found = called_at_once(lambda question, shared=shared: shared.locate(*question), asked * 2)
         assert [values_of(result) for result in found] == expected * 2
