@@ -18,6 +18,7 @@ from engine.maps.prepared import PreparedMap
 from engine.maps.samples import BLOCK_PX, SampleMap
 from engine.options import NccOptions
 from engine.values import Window
+from tests.support.rasters import whole
 from tests.support.towns import site_of
 
 NADIR = np.array([315.0, 296.0])
@@ -134,15 +135,16 @@ def test_what_neighbours_share_widens_the_covariance(scene, camera):
     assert (sigmas["patches"] > 1.5 * sigmas["grain"]).all()
 
 
-def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground, flat_site):
-    prepared = PreparedMap(flat_site, torch.device("cpu"), radius_px=12)
+def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground):
+    site = ground.flat_site
+    prepared = PreparedMap(site, torch.device("cpu"), radius_px=12)
     window = Window(100, 120, 200, 160)
-    found = SampleMap(flat_site, prepared.enhanced).find(window, 0)
-    picture = prepared.cut(Window(0, 0, flat_site.width_px, flat_site.height_px), 0).search.image
-    for axis, step in enumerate(np.eye(2) * flat_site.gsd_m_per_px):
-        at = [flat_site.pixel_from_enu(found.points_m[:, :2] + sign * step) for sign in (1, -1)]
+    found = SampleMap(site, prepared.enhanced).find(window, 0)
+    picture = prepared.cut(whole(site), 0).search.image
+    for axis, step in enumerate(np.eye(2) * site.gsd_m_per_px):
+        at = [site.pixel_from_enu(found.points_m[:, :2] + sign * step) for sign in (1, -1)]
         ahead, behind = (cv2.remap(picture, *px.T.astype(np.float32)[:, None], cv2.INTER_LINEAR)[0] for px in at)
-        change = (ahead - behind) / (2 * flat_site.gsd_m_per_px)
+        change = (ahead - behind) / (2 * site.gsd_m_per_px)
         np.testing.assert_allclose(found.gradients[:, axis], change, atol=0.02 * np.abs(change).max())
 
 
@@ -163,22 +165,17 @@ def test_samples_of_odd_shapes_are_refused():
 # ------------------------------------------------------------------------------------------------ as part of NCC
 
 
-@pytest.fixture(scope="module")
-def flat_site(ground):
-    return ground.flat_site
-
-
 def located(site, camera, frame, prior, **options):
     matcher = SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(**options)))
     return matcher.locate(frame, prior)
 
 
-def test_telemetry_that_is_wrong_is_corrected(ground, flat_site, camera):
+def test_telemetry_that_is_wrong_is_corrected(ground, camera):
     """Each error of the telemetry alone moves the fix of the peak by a metre; the picture knows better."""
     true = ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0)
     stated = replace(true, roll_deg=3.5, pitch_deg=-2.4, heading_deg=26.0, height_agl_m=152.0)
-    peak = located(flat_site, camera, stated, ground.prior(NADIR), refine=False)
-    fix = located(flat_site, camera, stated, ground.prior(NADIR))
+    peak = located(ground.flat_site, camera, stated, ground.prior(NADIR), refine=False)
+    fix = located(ground.flat_site, camera, stated, ground.prior(NADIR))
     assert (peak.stage, peak.up_m, fix.stage, fix.method) == ("fine", None, "refined", "ncc")
     assert np.hypot(*ground.off_m(peak, NADIR)) > 1.0
     assert np.hypot(*ground.off_m(fix, NADIR)) < 0.15
@@ -198,10 +195,10 @@ def test_without_a_surface_model_the_covariance_stays_as_wide_as_the_tilt_is_dou
 
 
 @pytest.mark.parametrize("roll_deg", [0.0, 3.0, -5.0])
-def test_without_attitude_the_tilt_is_measured(ground, flat_site, camera, roll_deg):
+def test_without_attitude_the_tilt_is_measured(ground, camera, roll_deg):
     frame = ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=roll_deg)
     untold = replace(frame, roll_deg=None, pitch_deg=None)
-    fix = located(flat_site, camera, untold, ground.prior(NADIR, sigma_m=15))
+    fix = located(ground.flat_site, camera, untold, ground.prior(NADIR, sigma_m=15))
     assert ground.chi_square(fix, NADIR) < 9.0
     assert fix.attitude.roll_deg == pytest.approx(roll_deg, abs=0.2)
 
@@ -249,34 +246,35 @@ def with_noise(frame, part):
     return replace(frame, image=image)
 
 
-def test_a_picture_of_another_place_keeps_its_fix_or_none(ground, flat_site, camera):
+def test_a_picture_of_another_place_keeps_its_fix_or_none(ground, camera):
     """Refinement never makes a fix of what is no fix: the other half of the picture is noise."""
     frame = with_noise(ground.frame(camera, NADIR, heading_deg=25.0), np.s_[:, 150:])
-    fix = located(flat_site, camera, frame, ground.prior(NADIR))
+    fix = located(ground.flat_site, camera, frame, ground.prior(NADIR))
     assert ground.chi_square(fix, NADIR) < 9.0
 
 
-def test_a_tilt_that_nobody_tells_is_refused_and_not_guessed(ground, flat_site, camera):
+def test_a_tilt_that_nobody_tells_is_refused_and_not_guessed(ground, camera):
     """Half of the picture is noise on top of a tilt of 10 degrees: the peak's place is 26 m off."""
     frame = with_noise(ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=10.0), np.s_[150:])
     untold = replace(frame, roll_deg=None, pitch_deg=None)
-    result = located(flat_site, camera, untold, ground.prior(NADIR, sigma_m=25))
+    result = located(ground.flat_site, camera, untold, ground.prior(NADIR, sigma_m=25))
     assert isinstance(result, NoFix) or ground.chi_square(result, NADIR) < 9.0
 
 
-def test_samples_of_the_map_are_taken_once_and_lie_where_the_map_shows_them(flat_site):
-    prepared = PreparedMap(flat_site, torch.device("cpu"), 8)
-    samples = SampleMap(flat_site, prepared.enhanced)
+def test_samples_of_the_map_are_taken_once_and_lie_where_the_map_shows_them(ground):
+    site = ground.flat_site
+    prepared = PreparedMap(site, torch.device("cpu"), 8)
+    samples = SampleMap(site, prepared.enhanced)
     window = Window(100, 60, 200, 160)
     first, second = samples.find(window, 0), samples.find(window, 0)
     assert samples.created == 1
     np.testing.assert_array_equal(first.points_m, second.points_m)
-    xy = flat_site.pixel_from_enu(first.points_m[:, :2])
+    xy = site.pixel_from_enu(first.points_m[:, :2])
     np.testing.assert_allclose(xy, np.round(xy), atol=1e-3)
     assert (xy >= [100 - BLOCK_PX, 60 - BLOCK_PX]).all()
     assert (xy < [300 + BLOCK_PX, 220 + BLOCK_PX]).all()
     x, y = np.round(xy).astype(int).T
-    shown = prepared.cut(Window(0, 0, flat_site.width_px, flat_site.height_px), 0).search.image
+    shown = prepared.cut(whole(site), 0).search.image
     np.testing.assert_allclose(first.values, shown[y, x], atol=1e-6)
 
 

@@ -97,10 +97,11 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(make, frame, pr
     assert apart_m < by_fine.relative_sigma_m
 
 
-def test_steps_that_are_abandoned_leave_the_coarse_fix(make, frame, prior, monkeypatch):
-    def out_of_time(*_):
-        raise OutOfTime
+def out_of_time(*_):
+    raise OutOfTime
 
+
+def test_steps_that_are_abandoned_leave_the_coarse_fix(make, frame, prior, monkeypatch):
     monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
     monkeypatch.setattr(Efforts, "_correlate", out_of_time)
     fix = make("ncc").locate(frame, prior, HURRY)

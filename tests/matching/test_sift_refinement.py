@@ -14,8 +14,7 @@ from engine.matching.refinement import Refinement
 from engine.matching.sift import Sift
 from engine.matching.views import drawn_px
 from engine.options import MatcherOptions, SiftOptions
-from engine.runtime.scheduler import OutOfTime
-from tests.matching.test_scheduler import FixedCosts
+from tests.matching.test_scheduler import FixedCosts, out_of_time
 
 NADIR = np.array([310.0, 305.0])
 PLACES = [np.array([x, y]) for x in (270.0, 330.5, 371.25) for y in (262.5, 301.0, 340.75)]
@@ -43,10 +42,6 @@ def costs_of(others_ms=0.0, **ms):
 def refuse_to_refine(monkeypatch):
     for name in ("refine_at_once", "refine_from_coarser"):
         monkeypatch.setattr(Refinement, name, lambda _self, _fix: None)
-
-
-def out_of_time(*_):
-    raise OutOfTime
 
 
 def shot(ground, camera, nadir_px=NADIR, heading_deg=25.0):
