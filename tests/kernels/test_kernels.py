@@ -159,13 +159,6 @@ def test_gradients_of_templates_come_from_the_tensor_ops():
     assert templates.grad is not None
 
 
-def test_large_windows_are_divided_into_blocks_that_cover_them():
-    for count, model in [(33, 64), (1921, 128), (1537, 512), (9000, 200), (1, 1), (5, 3000)]:
-        number, side = blocks._division(count, model)
-        assert number * (side - model + 1) >= count > (number - 1) * (side - model + 1)
-        assert side % 2 == 0
-
-
 # How many transforms a flight plans: sides are rounded up to lengths that are fast, which many windows share
 
 
