@@ -18,7 +18,6 @@ from engine import Fix, MatcherOptions, NccOptions, SceneMatcher, ShapeError, nc
 from engine.budget import Budget
 from engine.kernels import coarse_to_fine
 from engine.kernels.coarse_to_fine import EarlyStop
-from engine.kernels.local import LocalScores
 from engine.kernels.scores import enhance
 from engine.kernels.sums import counts
 from engine.matching.correlation import _EVERY_PLACE
@@ -233,18 +232,6 @@ def drawn(seed, share, noise=10.0):
 
 def every_place(image, valid, template):
     return ncc(image[None], template[None, None], search_valid=valid[None], min_overlap=MIN_OVERLAP)[0, 0]
-
-
-@pytest.mark.parametrize("share", SHARES)
-def test_scores_at_a_few_places_are_those_of_the_masked_surface(share):
-    search, image, valid, template, (x, y) = drawn(1, share)
-    surface = every_place(image, valid, template)
-    model = template - template.mean()
-    for j, i in ((y, x), (6, 6), (100, 105), (surface.shape[0] - 7, 40)):
-        scorer = LocalScores(search.image, model, (j, i), search.counts, MIN_OVERLAP)
-        around = np.mgrid[j - 5 : j + 6, i - 5 : i + 6].reshape(2, -1)
-        rows, columns = around[:, (around[0] < surface.shape[0]) & (around[1] < surface.shape[1])]
-        np.testing.assert_allclose(scorer.at(rows, columns), surface[rows, columns], rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("share", SHARES)
