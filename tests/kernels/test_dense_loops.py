@@ -132,15 +132,6 @@ def test_a_share_of_the_heights_is_below_their_plane(share):
     assert loss(plane) < min(map(loss, others)) + 0.01 * loss(plane)
 
 
-def test_heights_of_a_plane_have_that_plane():
-    offsets = np.random.default_rng(9).uniform(-1, 1, (40, 2))
-    heights_m = 5.0 + offsets @ [1.0, 2.0]
-    heights_m[::3] = np.nan
-    plane, known = lower_plane(offsets, heights_m, 0.2, 0.3, 8)
-    np.testing.assert_allclose(plane, [5, 1, 2], atol=1e-9)
-    assert known == np.isfinite(heights_m).sum()
-
-
 @given(values=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=60))
 def test_the_median_is_numpys(values):
     assert median(np.array(values)) == pytest.approx(np.median(values), abs=1e-9)
