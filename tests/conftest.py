@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 import os
 import shutil
-from functools import cache, lru_cache
+from functools import cache
 
 import cv2
 import hypothesis
@@ -40,7 +40,6 @@ def pytest_collection():
 def _surroundings(tmp_path_factory):
     """What holds for all tests of a process; those of towns call `build_town` themselves."""
     import torch
-    from pyproj import Transformer
 
     # Results do not depend on the number of cores, and test runs side by side do not fight for them.
     torch.set_num_threads(1)
@@ -48,8 +47,6 @@ def _surroundings(tmp_path_factory):
     if "PYTEST_XDIST_WORKER" in os.environ:  # each worker has a folder of its own in that of the run
         towns.kept_in = tmp_path_factory.getbasetemp().parent
     with pytest.MonkeyPatch.context() as patch:
-        # PROJ looks for the way between two systems for tens of milliseconds, and the tests ask for the same few.
-        patch.setattr(Transformer, "from_crs", staticmethod(lru_cache(maxsize=64)(Transformer.from_crs)))
         # Resampled maps stay out of the home directory.
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         # Who draws a town below the tests takes the one that was drawn before.
