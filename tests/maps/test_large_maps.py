@@ -308,7 +308,6 @@ def test_a_terminal_shows_the_copying_and_a_pipe_does_not(picture, tmp_path, tin
     assert stream.getvalue() == shown  # the copy is there
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["bytes", "cut", "gone", "list cut off", "no list"])
 def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, tiny_limits, made, damage):
     cache = tmp_path / "cache"
