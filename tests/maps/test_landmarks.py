@@ -76,15 +76,6 @@ def test_a_window_holds_what_its_parts_hold_and_nothing_outside(site, marks):
     np.testing.assert_array_equal(in_order(joined), table(found))
 
 
-def test_landmarks_do_not_depend_on_what_was_asked_before(site, marks):
-    fresh = LandmarkMap(site, CPU)
-    for window in (Window(500, 400, 60, 60), Window(10, 10, 300, 30), Window(200, 200, 200, 200)):
-        fresh.find(window, 0, upright=False)
-    np.testing.assert_array_equal(
-        table(fresh.find(whole(site), 0, upright=False)), table(marks.find(whole(site), 0, upright=False))
-    )
-
-
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_landmarks_lie_on_the_surface_above_their_pixel(site, marks, level):
     found = marks.find(whole(site, level), level, upright=True)

@@ -333,16 +333,6 @@ def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, t
         assert made == [tile.name]
 
 
-def test_a_large_file_is_hashed_again_when_it_changes(tmp_path, monkeypatch):
-    monkeypatch.setattr(metric_copy, "_CACHED_HASH_BYTES", 10)
-    path = tmp_path / "file"
-    path.write_bytes(b"a" * 100)
-    first = metric_copy._file_hash(path, tmp_path)
-    assert metric_copy._file_hash(path, tmp_path) == first
-    path.write_bytes(b"b" * 101)
-    assert metric_copy._file_hash(path, tmp_path) != first
-
-
 def test_an_all_valid_file_says_so_without_being_read(tmp_path, large_path):
     from engine.maps.rasters import open_source
 

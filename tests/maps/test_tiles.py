@@ -120,14 +120,18 @@ def test_a_folder_says_of_itself_what_all_its_tiles_say(tmp_path, picture):
     assert OrthoMap.open(cut).georeference_sigma_m is None
 
 
-def test_a_surface_may_be_a_folder_too(tmp_path, plain):
-    rows, columns = np.mgrid[:SIDE, :SIDE]
-    heights = (100.0 + 0.1 * columns + 0.05 * rows).astype(np.float32)[None]
-    cut = tiles_of(tmp_path / "dsm", heights, gap=None)
-    site, other = (OrthoMap.open(plain, f) for f in (cut, write(tmp_path / "dsm.tif", heights)))
+@pytest.mark.parametrize(("kind", "most_m"), [("folder", 0.0), ("GeoPackage", 0.01)])
+def test_a_surface_may_be_tiles_too(tmp_path, plain, kind, most_m):
+    heights = (100.0 + 0.05 * np.add.outer(np.arange(SIDE), 2 * np.arange(SIDE))).astype(np.float32)[None]
+    whole, other = write(tmp_path / "dsm.tif", heights), tmp_path / "dsm.gpkg"
+    if kind == "folder":
+        other = tiles_of(tmp_path / "dsm", heights, gap=None)
+    else:
+        copy(whole, other, driver="GPKG")
+    wanted, found = OrthoMap.open(plain, whole), OrthoMap.open(plain, other)
     xy = np.random.default_rng(0).uniform(0, SIDE - 1, (500, 2))
-    np.testing.assert_array_equal(site.surface_at(xy), other.surface_at(xy))
-    assert site.ground_m == other.ground_m
+    np.testing.assert_allclose(found.surface_at(xy), wanted.surface_at(xy), rtol=0, atol=most_m)
+    assert found.ground_m == pytest.approx(wanted.ground_m, abs=most_m)
 
 
 # ------------------------------------------------------------------------------------------------- refusals
@@ -199,15 +203,6 @@ def test_a_database_of_tiles_is_the_picture_that_it_was_made_of(tmp_path, pictur
     apart = found.gray(lies).astype(float) - whole.gray(Window(20, 20, 200, 200))
     assert np.abs(apart).mean() <= most
     assert found.valid(lies).all()
-
-
-def test_heights_in_a_geopackage_are_a_surface(tmp_path, plain):
-    heights = (200.0 + np.add.outer(np.arange(SIDE), np.arange(SIDE)) / 10.0).astype(np.float32)
-    whole = write(tmp_path / "dsm.tif", heights)
-    copy(whole, tmp_path / "dsm.gpkg", driver="GPKG")
-    wanted, found = OrthoMap.open(plain, whole), OrthoMap.open(plain, tmp_path / "dsm.gpkg")
-    pixels = np.array([[50.0, 60.0], [200.5, 100.25]])
-    assert found.surface_at(pixels) == pytest.approx(wanted.surface_at(pixels), abs=0.01)
 
 
 def test_a_geopackage_of_several_rasters_or_none_is_refused(tmp_path, plain):
