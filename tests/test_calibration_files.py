@@ -11,14 +11,9 @@ from engine.errors import CalibrationError
 K = np.array([[500.0, 0.0, 319.5], [0.0, 505.0, 239.5], [0.0, 0.0, 1.0]])
 MATRIX = str(K.ravel().tolist())
 PLUMB_BOB = [-0.28, 0.09, 0.0007, -0.0004, -0.01]
-TO_THE_LAST_DIGIT = np.array([-0.28, 0.09, 0.0007, -4e-20, -0.01])
+DIGITS = np.array([-0.28, 0.09, 0.0007, -4e-20, -0.01])
 FISHEYE = np.array([0.03, -0.012, 0.004, -0.001])
-SAMPLES = {
-    "image_width": 640,
-    "image_height": 480,
-    "camera_matrix": K,
-    "distortion_coefficients": TO_THE_LAST_DIGIT,
-}
+SAMPLES = {"image_width": 640, "image_height": 480, "camera_matrix": K, "distortion_coefficients": DIGITS}
 
 INFO = f"""\
 image_width: 640
@@ -104,14 +99,11 @@ def test_a_calibration_may_state_its_mount_by_name_or_numbers(save):
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
 @pytest.mark.parametrize("shape", [(1, 5), (5, 1)])
 def test_what_opencv_writes_is_read_to_the_last_digit(tmp_path, suffix, shape):
-    written = SAMPLES | {
-        "distortion_coefficients": TO_THE_LAST_DIGIT.reshape(shape),
-        "calibration_time": "Mon Nov 23 2026",
-    }
-    read = Camera.load(opencvs(tmp_path / f"camera.{suffix}", **written))
+    other = {"distortion_coefficients": DIGITS.reshape(shape), "calibration_time": "Mon Nov 23 2026"}
+    read = Camera.load(opencvs(tmp_path / f"camera.{suffix}", **SAMPLES | other))
     assert (read.width_px, read.height_px, read.distortion_model) == (640, 480, "plumb_bob")
     np.testing.assert_array_equal(read.matrix, K)
-    np.testing.assert_array_equal(read.distortion, TO_THE_LAST_DIGIT)
+    np.testing.assert_array_equal(read.distortion, DIGITS)
     np.testing.assert_array_equal(read.mount, mount_rotation())
 
 
@@ -169,6 +161,7 @@ def test_camera_info_as_ros_prints_it(save):
 
 # ---------------------------------------------------------------------------------------------- refusals
 
+ONE = [1, 0, 0, 0, 1, 0, 0, 0, 1]
 BAD = {
     "missing field": (INFO.replace("image_height: 480\n", ""), "lacks the field image_height"),
     "missing matrix": (INFO.replace("camera_matrix", "matrix"), "lacks the field camera_matrix"),
@@ -191,10 +184,7 @@ BAD = {
     "reflection": (INFO + "mount: [1, 0, 0, 0, 1, 0, 0, 0, -1]\n", "reflection"),
     "short mount": (INFO + "mount: [1, 0, 0]\n", "mount: expected 9 numbers, got 3"),
     "unknown mount": (INFO + "mount: up\n", "mount: expected one of nadir"),
-    "pitch of numbers": (
-        INFO + f"mount: {MATRIX}\ncamera_pitch_deg: -30\n",
-        "camera_pitch_deg: expected a mount by",
-    ),
+    "pitch of numbers": (INFO + f"mount: {ONE}\ncamera_pitch_deg: -30\n", "expected a mount by"),
     "pitch in words": (INFO + "camera_pitch_deg: steep\n", "could not convert"),
     "empty": ("", "no camera_info mapping"),
     "list": ("- 1\n- 2\n", "no camera_info mapping"),
