@@ -57,10 +57,6 @@ def assert_prior(prior, east, north, sigma, moved=None):
         assert (prior.moved_east_m, prior.moved_north_m) == (pytest.approx(moved[0]), pytest.approx(moved[1]))
 
 
-def test_a_flight_begins_at_its_start():
-    assert_prior(flown(None).priors[0], 10.0, 20.0, 5.0)
-
-
 # Prediction
 
 
@@ -92,11 +88,6 @@ def test_dead_reckoning_adds_up_over_refusals():
     assert_prior(run.navigator.prediction, 20.0, 26.0, sigmas_m[2])
 
 
-def test_the_uncertainty_of_a_fix_is_that_of_the_next_prediction():
-    run = flown((10.0, 20.0), None, sigma_m=4.0)
-    assert run.priors[1].sigma_m == pytest.approx(math.hypot(4.0, drift_m(1.0)))
-
-
 def test_frames_without_stamps_are_an_interval_apart():
     options = NavigatorOptions(default_interval_s=0.5)
     run = flown((10.0, 20.0), None, seconds=[None, None], velocity=(8.0, 0.0), options=options)
@@ -106,6 +97,7 @@ def test_frames_without_stamps_are_an_interval_apart():
 def test_a_start_that_leads_nowhere_widens_and_is_left_in_turns():
     """It is right 99 times in 100; seven refusals later the vehicle is as probably elsewhere."""
     run = flown(*[None] * 11)
+    assert_prior(run.priors[0], 10.0, 20.0, 5.0)
     grown_m = [2.0 ** (0.5 * k) * math.hypot(5.0, drift_m(*[1.0] * k)) for k in range(7)]
     assert [prior.sigma_m for prior in run.priors[:7]] == pytest.approx(grown_m)
     assert [prior is None for prior in run.priors[7:]] == [True, False, False, True]

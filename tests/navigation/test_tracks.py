@@ -219,14 +219,6 @@ def test_after_refusals_a_new_place_needs_more_evidence():
     assert Match(fix_at(0.0, confidence=1.0 - 1e-9), AREA_M2, refusals=38).support == CERTAIN
 
 
-def test_a_place_is_lost_when_misses_have_eaten_its_odds_and_the_search_has_grown_as_much():
-    track = a_track(support=500.0)
-    while not track.is_lost:
-        track = track.missed()
-    assert track.misses == math.ceil(CERTAIN / MISS) == 14
-    assert track.widened**2 == pytest.approx(math.exp(CERTAIN))
-
-
 @given(places=st.lists(st.tuples(st.floats(-500, 500), st.floats(-500, 500)), min_size=1, max_size=60))
 @settings(max_examples=40)
 def test_the_set_is_bounded_and_sorted_and_holds_two_motions_of_each_account(places):
