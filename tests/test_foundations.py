@@ -146,8 +146,7 @@ def test_a_frame_is_uint8(image):
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps"],
+    "name", ["height_agl_m", "heading_deg", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps"]
 )
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_numbers_of_a_frame_are_finite_or_unknown(name, value):

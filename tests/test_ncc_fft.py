@@ -112,12 +112,7 @@ def test_a_window_or_template_of_one_grey_level_scores_zero(level, dtype):
     assert float(scores.abs().max()) < 1e-6
 
 
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    bright=st.floats(1.0, 1e6),
-    flat=st.booleans(),
-    zero_mean=st.booleans(),
-)
+@given(seed=st.integers(0, 2**32 - 1), bright=st.floats(1.0, 1e6), flat=st.booleans(), zero_mean=st.booleans())
 def test_scores_stay_within_minus_one_and_one(seed, bright, flat, zero_mean):
     rng = np.random.default_rng(seed)
     search = rng.normal(0.0, 1.0, (1, 30, 30)).astype(np.float32)

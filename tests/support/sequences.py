@@ -14,17 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from engine import (
-    Camera,
-    EngineError,
-    Fix,
-    Frame,
-    MatcherOptions,
-    Navigator,
-    NoFix,
-    Prior,
-    SceneMatcher,
-)
+from engine import Camera, EngineError, Fix, Frame, MatcherOptions, Navigator, NoFix, Prior, SceneMatcher
 from engine.options import PoseOptions, SiftOptions
 from tests.support import ground
 
