@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from scipy.ndimage import gaussian_filter, shift
 
 from engine import DtypeError, OptionError, ShapeError
 from engine.ncc_fft import find_peak, ncc
+from tests.support.refusals import refusal
 
 MODES = {True: cv2.TM_CCOEFF_NORMED, False: cv2.TM_CCORR_NORMED}
 LEVELS = {
@@ -146,9 +149,7 @@ def test_scores_stay_within_minus_one_and_one(seed, bright, flat, zero_mean):
     ],
 )  # fmt: skip
 def test_errors_name_the_argument_what_was_expected_and_what_came(search, templates, error, names):
-    with pytest.raises(error, match=rf"^{names}: expected .+, got .+") as caught:
-        ncc(search, templates)
-    assert "\n" not in str(caught.value)
+    assert re.match(rf"{names}: expected .+, got .+", refusal(ncc, search, templates, error=error))
 
 
 def paraboloid(x0, y0, size=(15, 19), bend=((-0.05, 0.01), (0.01, -0.03)), top=0.8):

@@ -24,6 +24,7 @@ from scenematch.runs.map_fetch import FetchSettings, fetch_map
 from tests.support.map_servers import HALF_WORLD_M, serving
 from tests.support.photos import gimbal, photograph
 from tests.support.rasters import whole, write_raster
+from tests.support.refusals import refusal
 
 SIZE = 700
 GSD_M = 0.5
@@ -261,10 +262,9 @@ def test_what_is_no_picture_is_refused_in_one_line(server, settings, tmp_path):
         ((401, {}), "the server answers 401: access denied"),
     ):
         server.trouble[:] = [("/tiles/", answer)]
-        with pytest.raises(MapError, match=re.escape(text)) as error:
-            fetch_map(settings(source), tmp_path / "map.tif")
-        assert "\n" not in str(error.value)
-        assert "S3CRET" not in str(error.value)
+        message = refusal(fetch_map, settings(source), tmp_path / "map.tif", error=MapError)
+        assert text in message
+        assert "S3CRET" not in message
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,5 +1,6 @@
 """Folders of tiles, VRTs, MBTiles and GeoPackages: the picture that they were cut from, or one clear line."""
 
+import re
 import shutil
 import sqlite3
 from contextlib import closing
@@ -15,6 +16,7 @@ from engine.maps.rasters import GEOREFERENCE_TAG
 from engine.orthomap import OrthoMap
 from engine.values import Window
 from tests.support.rasters import write_raster
+from tests.support.refusals import refusal
 
 UTM, WEST, NORTH, STEP_M = "EPSG:32633", 607400.0, 5345369.0, 0.5
 SIDE, TILE = 300, 128
@@ -151,9 +153,7 @@ def test_tiles_that_do_not_fit_together_are_refused(tmp_path, picture, changed, 
     cut = tiles_of(tmp_path / "tiles", picture)
     changed = {"transform": transform_at(0, 400)} | changed
     write(cut / "9-9.tif", picture[:, :50, :50].astype(changed.pop("dtype", np.uint8)), **changed)
-    with pytest.raises(MapError, match=words) as caught:
-        OrthoMap.open(cut)
-    assert "\n" not in str(caught.value)
+    assert re.search(words, refusal(OrthoMap.open, cut, error=MapError))
 
 
 @pytest.mark.parametrize(
@@ -175,9 +175,7 @@ def test_a_vrt_that_does_more_than_to_lay_local_files_side_by_side_is_refused(tm
     text = vrt_of_folder(here, "map")
     (here / "self.vrt").write_text(text)
     (tmp_path / "map.vrt").write_text(text.replace(old.format(folder=here), new))
-    with pytest.raises(MapError, match=words) as caught:
-        OrthoMap.open(tmp_path / "map.vrt")
-    assert "\n" not in str(caught.value)
+    assert re.search(words, refusal(OrthoMap.open, tmp_path / "map.vrt", error=MapError))
 
 
 # ------------------------------------------------------------------------------------ MBTiles and GeoPackages
