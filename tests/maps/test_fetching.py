@@ -71,10 +71,7 @@ def server(one_server, raster, monkeypatch):
     """Asked without a proxy, and nothing of another test left."""
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     monkeypatch.setattr(pictures, "FIRST_WAIT_S", 0.01)
-    one_server.asked.clear()
-    one_server.trouble.clear()
-    one_server.raster = raster
-    one_server.wms_version, one_server.most_px, one_server.layers, one_server.kvp = "1.3.0", 200, ("ortho",), False
+    one_server.begin(raster)
     return one_server
 
 

@@ -23,7 +23,7 @@ def site():
     """More than two tiles a side, with ground that rises to the east."""
     ground = Ground(size=(560, 600))
     rising = np.tile(np.linspace(10.0, 40.0, 600, dtype=np.float32), (560, 1))
-    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=rising)
+    return ground.map_of(surface_m=rising)
 
 
 @pytest.fixture(scope="module")
@@ -94,8 +94,7 @@ def test_no_landmark_lies_on_nodata():
     ground = Ground(size=(300, 400))
     valid = np.zeros(ground.gray.shape, bool)
     valid[40:220, 100:310] = True
-    gray = np.where(valid, ground.gray, 255).astype(np.uint8)
-    site = OrthoMap.from_arrays(gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", valid=valid)
+    site = ground.map_of(np.where(valid, ground.gray, 255).astype(np.uint8), valid=valid)
     marks = LandmarkMap(site, CPU)
     x, y = marks.find(whole(site), 0, upright=True).features.xy_px[0].round().astype(int).T
     assert len(x) > 100

@@ -1,7 +1,6 @@
 """Folders of tiles, VRTs, MBTiles and GeoPackages: the picture that they were cut from, or one clear line."""
 
 import re
-import shutil
 import sqlite3
 from contextlib import closing
 
@@ -56,11 +55,6 @@ def picture():
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory, picture):
     return write(tmp_path_factory.mktemp("plain") / "map.tif", picture)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory, picture):
-    return tiles_of(tmp_path_factory.mktemp("cut") / "tiles", picture)
 
 
 @pytest.mark.parametrize("nodata", [None, 1])
@@ -170,8 +164,8 @@ def test_tiles_that_do_not_fit_together_are_refused(tmp_path, picture, changed, 
         ("</VRTDataset>", "", "cannot read"),
     ],
 )  # fmt: skip
-def test_a_vrt_that_does_more_than_to_lay_local_files_side_by_side_is_refused(tmp_path, folder, old, new, words):
-    here = shutil.copytree(folder, tmp_path / "tiles")
+def test_a_vrt_that_does_more_than_to_lay_local_files_side_by_side_is_refused(tmp_path, picture, old, new, words):
+    here = tiles_of(tmp_path / "tiles", picture)
     text = vrt_of_folder(here, "map")
     (here / "self.vrt").write_text(text)
     (tmp_path / "map.vrt").write_text(text.replace(old.format(folder=here), new))

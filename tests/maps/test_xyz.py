@@ -2,7 +2,6 @@
 
 import io
 import re
-import shutil
 
 import cv2
 import numpy as np
@@ -72,15 +71,10 @@ def plain(tmp_path_factory, picture):
     return write_raster(path, np.moveaxis(picture, -1, 0), crs="EPSG:3857", transform=at)
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory, picture):
-    return cut(tmp_path_factory.mktemp("cut") / "tiles", picture)
-
-
 @pytest.fixture
-def own(cache, tmp_path):
+def own(picture, tmp_path):
     """A cache that a test may change."""
-    return shutil.copytree(cache, tmp_path / "tiles")
+    return cut(tmp_path / "tiles", picture)
 
 
 @pytest.fixture
