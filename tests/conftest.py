@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import os
 import shutil
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -15,7 +16,7 @@ import hypothesis
 import numpy as np
 import pytest
 
-from engine import Fix, OrthoMap
+from engine import Fix
 from scenematch.simulator import plan_flight
 from tests.support import towns
 from tests.support.paths import NO_SHARED, SHARED
@@ -125,11 +126,8 @@ def sim_site(sim_town):
 @pytest.fixture(scope="session")
 def mirrored_site(sim_town):
     """The town as a mirror shows it: the same kind of streets, and none of its places."""
-    gray, surface = (
-        np.ascontiguousarray(raster[:, ::-1])
-        for raster in (cv2.cvtColor(sim_town.ortho, cv2.COLOR_RGB2GRAY), sim_town.surface_m)
-    )
-    return OrthoMap.from_arrays(gray, sim_town.pixel_to_crs, f"EPSG:{sim_town.crs_epsg}", surface_m=surface)
+    ortho, surface_m = (np.ascontiguousarray(raster[:, ::-1]) for raster in (sim_town.ortho, sim_town.surface_m))
+    return site_of(replace(sim_town, ortho=ortho, surface_m=surface_m))
 
 
 @pytest.fixture(scope="session")
