@@ -32,7 +32,8 @@ def errors_of(shared, error_m):
     def measure(name, method, picked, *, sigma_m=5.0, frames="frames", middle=False):
         """Metres from the truth of a slice of the frames, infinite where one was refused.
 
-        Without a sigma nothing is known before. The truth may be the ground in the middle of each frame instead of the camera's own place.
+        Without a sigma nothing is known before. The truth may be the ground in the middle of each frame instead
+        of the camera's own place.
         """
         site, camera, flight, known = recorded(shared / name, frames)
         matcher, errors = SceneMatcher(site, camera, method, "cpu"), []
