@@ -8,14 +8,15 @@ from __future__ import annotations
 import gc
 import os
 import shutil
-from functools import cache, lru_cache
+from dataclasses import replace
+from functools import cache
 
 import cv2
 import hypothesis
 import numpy as np
 import pytest
 
-from engine import Fix, OrthoMap
+from engine import Fix
 from scenematch.simulator import plan_flight
 from tests.support import towns
 from tests.support.paths import NO_SHARED, SHARED
@@ -40,7 +41,6 @@ def pytest_collection():
 def _surroundings(tmp_path_factory):
     """What holds for all tests of a process; those of towns call `build_town` themselves."""
     import torch
-    from pyproj import Transformer
 
     # Results do not depend on the number of cores, and test runs side by side do not fight for them.
     torch.set_num_threads(1)
@@ -48,8 +48,6 @@ def _surroundings(tmp_path_factory):
     if "PYTEST_XDIST_WORKER" in os.environ:  # each worker has a folder of its own in that of the run
         towns.kept_in = tmp_path_factory.getbasetemp().parent
     with pytest.MonkeyPatch.context() as patch:
-        # PROJ looks for the way between two systems for tens of milliseconds, and the tests ask for the same few.
-        patch.setattr(Transformer, "from_crs", staticmethod(lru_cache(maxsize=64)(Transformer.from_crs)))
         # Resampled maps stay out of the home directory.
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         # Who draws a town below the tests takes the one that was drawn before.
@@ -128,11 +126,8 @@ def sim_site(sim_town):
 @pytest.fixture(scope="session")
 def mirrored_site(sim_town):
     """The town as a mirror shows it: the same kind of streets, and none of its places."""
-    gray, surface = (
-        np.ascontiguousarray(raster[:, ::-1])
-        for raster in (cv2.cvtColor(sim_town.ortho, cv2.COLOR_RGB2GRAY), sim_town.surface_m)
-    )
-    return OrthoMap.from_arrays(gray, sim_town.pixel_to_crs, f"EPSG:{sim_town.crs_epsg}", surface_m=surface)
+    ortho, surface_m = (np.ascontiguousarray(raster[:, ::-1]) for raster in (sim_town.ortho, sim_town.surface_m))
+    return site_of(replace(sim_town, ortho=ortho, surface_m=surface_m))
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""camera.py: camera_info files, undistortion against OpenCV, and files that must be refused."""
+"""camera.py: undistortion against OpenCV, mounts, other sizes of frames; files in test_calibration_files."""
 
 import math
 
@@ -19,31 +19,6 @@ LENSES = {
     "fisheye": FISHEYE,
 }
 
-INFO = """\
-image_width: 640
-image_height: 480
-camera_name: nadir
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [500.0, 0.0, 319.5, 0.0, 505.0, 239.5, 0.0, 0.0, 1.0]
-distortion_model: plumb_bob
-distortion_coefficients:
-  rows: 1
-  cols: 5
-  data: [-0.28, 0.09, 0.0007, -0.0004, -0.01]
-"""
-
-
-@pytest.fixture
-def save(tmp_path):
-    def write(text):
-        path = tmp_path / "camera.yaml"
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return path
-
-    return write
-
 
 def camera(model="plumb_bob", distortion=PLUMB_BOB):
     return Camera(640, 480, np.reshape(K, (3, 3)), model, np.array(distortion))
@@ -52,29 +27,6 @@ def camera(model="plumb_bob", distortion=PLUMB_BOB):
 def texture(shape=(480, 640, 3)):
     noise = np.random.default_rng(5).integers(0, 256, shape, dtype=np.uint8)
     return cv2.GaussianBlur(noise, (0, 0), 3.0)
-
-
-def test_reads_camera_info_with_the_default_mount(save):
-    read = Camera.load(save(INFO))
-    assert (read.width_px, read.height_px, read.distortion_model) == (640, 480, "plumb_bob")
-    np.testing.assert_array_equal(read.matrix.ravel(), K)
-    np.testing.assert_array_equal(read.distortion, PLUMB_BOB)
-    assert read.focal_px == 502.5
-    np.testing.assert_array_equal(read.mount, mount_rotation("nadir"))
-
-
-@pytest.mark.parametrize("zeros", ["[]", "[0, 0, 0, 0]", "[0, 0, 0, 0, 0]"])
-def test_an_ideal_camera_may_be_written_in_any_length_of_zeros(save, zeros):
-    read = Camera.load(save(INFO.replace(str(PLUMB_BOB), zeros)))
-    assert not read.distorts
-    image = texture()
-    assert read.undistort(image) is image
-
-
-@pytest.mark.parametrize("model", ["equidistant", "fisheye"])
-def test_a_fisheye_lens_distorts_even_with_zero_coefficients(save, model):
-    read = Camera.load(save(INFO.replace("plumb_bob", model).replace(str(PLUMB_BOB), "[0, 0, 0, 0]")))
-    assert read.distorts
 
 
 def test_focal_length_from_the_field_of_view_is_the_papers():
@@ -104,60 +56,6 @@ def test_undistortion_is_opencvs(model, shape):
 def test_a_frame_of_another_size_is_refused():
     with pytest.raises(CalibrationError, match=r"640 x 480.*frame is 320 x 240"):
         camera().undistort(texture((240, 320)))
-
-
-BAD = {
-    "missing field": (INFO.replace("image_height: 480\n", ""), "lacks the field image_height"),
-    "missing matrix": (INFO.replace("camera_matrix", "matrix"), "lacks the field camera_matrix"),
-    "matrix without data": (INFO.replace("data: [500", "values: [500"), "camera_matrix: expected 9 numbers"),
-    "short matrix": (INFO.replace(", 0.0, 0.0, 1.0]", "]"), "camera_matrix: expected 9 numbers, got 6"),
-    "words": (INFO.replace("[500.0,", "[wide,"), "camera_matrix: expected numbers"),
-    "nan": (INFO.replace("[500.0,", "[.nan,"), "camera_matrix: expected 9 finite"),
-    "focal length": (INFO.replace("[500.0,", "[-500.0,"), "positive focal lengths"),
-    "transposed": (
-        INFO.replace(
-            "[500.0, 0.0, 319.5, 0.0, 505.0, 239.5, 0.0, 0.0, 1.0]", "[500, 0, 0, 0, 505, 0, 319, 239, 1]"
-        ),
-        "camera_matrix: expected fx 0 cx, 0 fy cy, 0 0 1",
-    ),
-    "model": (INFO.replace("plumb_bob", "omni"), "distortion_model: expected one of plumb_bob"),
-    "coefficients": (INFO.replace(str(PLUMB_BOB), "[0.1, 0.2]"), "plumb_bob takes 4 or 5"),
-    "fisheye with five": (INFO.replace("plumb_bob", "equidistant"), "equidistant takes 4"),
-    "size": (INFO.replace("480", "0"), "image size: expected 1 x 1 or more"),
-    "fractional size": (INFO.replace("480", "480.5"), "image_height: expected a whole number"),
-    "blank size": (INFO.replace("480", ""), "image_height: expected a whole number"),
-    "mount": (INFO + "mount: [1, 0, 0, 0, 2, 0, 0, 0, 1]\n", "not orthonormal"),
-    "reflection": (INFO + "mount: [1, 0, 0, 0, 1, 0, 0, 0, -1]\n", "reflection"),
-    "short mount": (INFO + "mount: [1, 0, 0]\n", "mount: expected 9 numbers, got 3"),
-    "unknown mount": (INFO + "mount: up\n", "mount: expected one of nadir"),
-    "pitch of numbers": (
-        INFO + "mount: [1, 0, 0, 0, 1, 0, 0, 0, 1]\ncamera_pitch_deg: -30\n",
-        "camera_pitch_deg: expected a mount by",
-    ),
-    "pitch in words": (INFO + "camera_pitch_deg: steep\n", "could not convert"),
-    "empty": ("", "no camera_info mapping"),
-    "list": ("- 1\n- 2\n", "no camera_info mapping"),
-    "not yaml": ("image_width: [1, 2\n", "not a readable YAML file"),
-    "not text": (b"\xff\xfe\x00\x80", "not a readable YAML file"),
-}
-
-
-@pytest.mark.parametrize("case", BAD, ids=list(BAD))
-def test_a_bad_file_is_refused_in_one_line_that_names_it(save, case):
-    text, expected = BAD[case]
-    with pytest.raises(CalibrationError) as caught:
-        Camera.load(save(text))
-    message = str(caught.value)
-    assert expected in message
-    assert "camera.yaml" in message
-    assert "\n" not in message
-
-
-def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    with pytest.raises(CalibrationError, match="no such file"):
-        Camera.load(tmp_path / "none.yaml")
-    with pytest.raises(CalibrationError, match="not a readable"):
-        Camera.load(tmp_path)
 
 
 # -------------------------------------------------------------------------------------------------- mounts
@@ -203,15 +101,6 @@ def test_pitch_turns_the_axis_up_towards_the_top_of_the_picture(name):
 def test_a_mount_that_is_none_is_refused(arguments, words):
     with pytest.raises(CalibrationError, match=words):
         mount_rotation(*arguments)
-
-
-def test_a_calibration_may_state_its_mount_by_name_or_numbers(save):
-    assert np.allclose(Camera.load(save(INFO + "mount: nadir-tail\n")).mount, mount_rotation("nadir-tail"))
-    pitched = Camera.load(save(INFO + "mount: nadir\ncamera_pitch_deg: -30\n"))
-    assert np.allclose(pitched.mount, mount_rotation("nadir", -30.0))
-    assert np.allclose(Camera.load(save(INFO + "camera_pitch_deg: -30\n")).mount, pitched.mount)
-    by_numbers = Camera.load(save(INFO + "mount: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"))
-    np.testing.assert_array_equal(by_numbers.mount, np.eye(3))
 
 
 # ------------------------------------------------------------------------------------------- another frame size

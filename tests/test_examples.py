@@ -20,21 +20,18 @@ import pytest
 from engine import Budget
 from scenematch.files.flight import open_flight
 from scenematch.files.truth import read_truth
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
 from tests.support.fields import fields_of
 from tests.support.paths import ROOT
-from tests.support.towns import drawn_town
 
 EXAMPLES = ROOT / "examples"
 FRAMES = 8
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory):
+def flight(flight_in, tmp_path_factory):
     """A flight folder."""
     folder = tmp_path_factory.mktemp("examples")
-    write_flight(folder, plan_flight(town=drawn_town(), frames=FRAMES, rate_hz=2.0))
+    flight_in(folder, FRAMES)
     return folder
 
 

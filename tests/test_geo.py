@@ -87,11 +87,6 @@ def test_true_north_is_where_a_step_of_latitude_leads(lat_deg, lon_deg, away_lat
     assert abs(math.remainder(frame.convergence_deg(lat, lon) - expected, 360.0)) < 1e-5
 
 
-@pytest.mark.parametrize(("lat_deg", "lon_deg"), PLACES)
-def test_true_north_is_the_planes_at_its_origin(lat_deg, lon_deg):
-    assert LocalFrame(lat_deg, lon_deg).convergence_deg(lat_deg, lon_deg) == 0.0
-
-
 FORWARD, RIGHT, DOWN = np.eye(3)
 
 

@@ -1,6 +1,7 @@
 """Truths about learned matchers: their pixels, and what a weights file must be. No weights are downloaded."""
 
 import pickle
+import re
 import socket
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from engine.errors import DtypeError, OptionError, ShapeError
 from engine.learned import KeypointMatcher, Loftr, load_matcher
 from engine.learned.keypoints import Disk, SuperPointKeypoints
 from engine.learned.superpoint import SuperPoint, sample, strongest
+from tests.support.refusals import refusal
 
 
 @pytest.fixture(autouse=True)
@@ -235,9 +237,8 @@ REFUSED = {
 
 @pytest.mark.parametrize("names", REFUSED)
 def test_files_that_make_no_matcher_are_refused_in_one_line(files, names):
-    with pytest.raises(OptionError, match=REFUSED[names]) as caught:
-        load_matcher([files / name for name in names.split()], device="cpu")
-    assert "\n" not in str(caught.value)
+    paths = [files / name for name in names.split()]
+    assert re.search(REFUSED[names], refusal(load_matcher, paths, device="cpu", error=OptionError))
 
 
 # SuperPoint.
@@ -286,8 +287,6 @@ def test_a_pickle_that_runs_code_is_refused(by, tmp_path):
     with pytest.raises(OptionError, match=r"evil.pth: expected tensors alone"):
         load_matcher([path], device="cpu")
     assert not mark.exists()
-    torch.load(path, weights_only=False) if by == "torch" else pickle.loads(path.read_bytes())
-    assert mark.exists()  # it would have run
 
 
 # Wrong use.

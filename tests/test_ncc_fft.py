@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
+import re
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter, shift
 
 from engine import DtypeError, OptionError, ShapeError
 from engine.ncc_fft import find_peak, ncc
+from tests.support.refusals import refusal
 
 MODES = {True: cv2.TM_CCOEFF_NORMED, False: cv2.TM_CCORR_NORMED}
 LEVELS = {
@@ -51,13 +52,10 @@ def test_ncc_equals_opencv(size, model, dtype, zero_mean):
     scores = ncc(torch.from_numpy(search), torch.from_numpy(templates), zero_mean=zero_mean)
     assert scores.shape == (2, 3, size[0] - model[0] + 1, size[1] - model[1] + 1)
     assert scores.dtype == (torch.float64 if dtype == "float64" else torch.float32)
-    for b in range(2):
-        for t in range(3):
-            # OpenCV's matchTemplate takes uint8 and float32 alone.
-            expected = cv2.matchTemplate(
-                search[b].astype(np.float32), templates[b, t].astype(np.float32), MODES[zero_mean]
-            )
-            np.testing.assert_allclose(scores[b, t].numpy(), expected, rtol=0, atol=1e-5)
+    search, templates = search.astype(np.float32), templates.astype(np.float32)  # what matchTemplate takes
+    for b, t in np.ndindex(2, 3):
+        expected = cv2.matchTemplate(search[b], templates[b, t], MODES[zero_mean])
+        np.testing.assert_allclose(scores[b, t].numpy(), expected, rtol=0, atol=1e-5)
 
 
 def test_whole_numbers_are_not_rounded_to_float32():
@@ -70,7 +68,7 @@ def test_whole_numbers_are_not_rounded_to_float32():
 def test_a_dark_window_in_a_batch_does_not_disturb_a_bright_one():
     rng = torch.Generator().manual_seed(4)
     search = torch.rand(2, 60, 60, generator=rng) * torch.tensor([1e-3, 1e4])[:, None, None]
-    templates = torch.stack([search[b : b + 1, 20:40, 10:30] for b in range(2)])
+    templates = search[:, None, 20:40, 10:30]
     for scores in ncc(search, templates):
         assert float(scores[0, 20, 10]) == pytest.approx(1.0, abs=1e-6)
 
@@ -117,12 +115,7 @@ def test_a_window_or_template_of_one_grey_level_scores_zero(level, dtype):
     assert float(scores.abs().max()) < 1e-6
 
 
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    bright=st.floats(1.0, 1e6),
-    flat=st.booleans(),
-    zero_mean=st.booleans(),
-)
+@given(seed=st.integers(0, 2**32 - 1), bright=st.floats(1.0, 1e6), flat=st.booleans(), zero_mean=st.booleans())
 def test_scores_stay_within_minus_one_and_one(seed, bright, flat, zero_mean):
     rng = np.random.default_rng(seed)
     search = rng.normal(0.0, 1.0, (1, 30, 30)).astype(np.float32)
@@ -156,9 +149,7 @@ def test_scores_stay_within_minus_one_and_one(seed, bright, flat, zero_mean):
     ],
 )  # fmt: skip
 def test_errors_name_the_argument_what_was_expected_and_what_came(search, templates, error, names):
-    with pytest.raises(error, match=rf"^{names}: expected .+, got .+") as caught:
-        ncc(search, templates)
-    assert "\n" not in str(caught.value)
+    assert re.match(rf"{names}: expected .+, got .+", refusal(ncc, search, templates, error=error))
 
 
 def paraboloid(x0, y0, size=(15, 19), bend=((-0.05, 0.01), (0.01, -0.03)), top=0.8):
@@ -177,11 +168,6 @@ def test_the_peak_of_a_paraboloid_is_found_exactly(x0, y0):
     assert (peak.x, peak.y) == (pytest.approx(x0, abs=1e-6), pytest.approx(y0, abs=1e-6))
     assert peak.score == float(surface.max())
     np.testing.assert_allclose(peak.curvature, [[-0.05, 0.01], [0.01, -0.03]], atol=1e-9)
-
-
-def test_the_peak_is_never_further_than_half_a_pixel_from_the_best_whole_pixel():
-    peak = find_peak(paraboloid(2.375, 2.625), exclusion_px=3.0)
-    assert (peak.x, peak.y) == (pytest.approx(2.375, abs=1e-6), 2.5)
 
 
 @pytest.mark.parametrize(("dx", "dy"), [(0.0, 0.0), (0.3, -0.2), (-0.45, 0.4), (0.5, 0.1)])
@@ -235,6 +221,5 @@ def test_a_surface_of_one_level_has_a_finite_peak(size):
 
 @pytest.mark.parametrize("size", [(4,), (0, 4), (1, 4, 4)])
 def test_a_peak_needs_a_surface(size):
-    with pytest.raises(ShapeError, match=r"^\w+: expected \(H, W\) with no empty axis, got ") as caught:
+    with pytest.raises(ShapeError, match=r"^scores: expected \(H, W\) with no empty axis, got "):
         find_peak(torch.zeros(size), exclusion_px=1.0)
-    assert str(caught.value).split(":")[0] == next(iter(inspect.signature(find_peak).parameters))

@@ -24,6 +24,7 @@ from scenematch.runs.map_fetch import FetchSettings, fetch_map
 from tests.support.map_servers import HALF_WORLD_M, serving
 from tests.support.photos import gimbal, photograph
 from tests.support.rasters import whole, write_raster
+from tests.support.refusals import refusal
 
 SIZE = 700
 GSD_M = 0.5
@@ -70,10 +71,7 @@ def server(one_server, raster, monkeypatch):
     """Asked without a proxy, and nothing of another test left."""
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     monkeypatch.setattr(pictures, "FIRST_WAIT_S", 0.01)
-    one_server.asked.clear()
-    one_server.trouble.clear()
-    one_server.raster = raster
-    one_server.wms_version, one_server.most_px, one_server.layers, one_server.kvp = "1.3.0", 200, ("ortho",), False
+    one_server.begin(raster)
     return one_server
 
 
@@ -261,10 +259,9 @@ def test_what_is_no_picture_is_refused_in_one_line(server, settings, tmp_path):
         ((401, {}), "the server answers 401: access denied"),
     ):
         server.trouble[:] = [("/tiles/", answer)]
-        with pytest.raises(MapError, match=re.escape(text)) as error:
-            fetch_map(settings(source), tmp_path / "map.tif")
-        assert "\n" not in str(error.value)
-        assert "S3CRET" not in str(error.value)
+        message = refusal(fetch_map, settings(source), tmp_path / "map.tif", error=MapError)
+        assert text in message
+        assert "S3CRET" not in message
     assert list(tmp_path.iterdir()) == []
 
 

@@ -23,7 +23,7 @@ def site():
     """More than two tiles a side, with ground that rises to the east."""
     ground = Ground(size=(560, 600))
     rising = np.tile(np.linspace(10.0, 40.0, 600, dtype=np.float32), (560, 1))
-    return OrthoMap.from_arrays(ground.gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", surface_m=rising)
+    return ground.map_of(surface_m=rising)
 
 
 @pytest.fixture(scope="module")
@@ -76,15 +76,6 @@ def test_a_window_holds_what_its_parts_hold_and_nothing_outside(site, marks):
     np.testing.assert_array_equal(in_order(joined), table(found))
 
 
-def test_landmarks_do_not_depend_on_what_was_asked_before(site, marks):
-    fresh = LandmarkMap(site, CPU)
-    for window in (Window(500, 400, 60, 60), Window(10, 10, 300, 30), Window(200, 200, 200, 200)):
-        fresh.find(window, 0, upright=False)
-    np.testing.assert_array_equal(
-        table(fresh.find(whole(site), 0, upright=False)), table(marks.find(whole(site), 0, upright=False))
-    )
-
-
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_landmarks_lie_on_the_surface_above_their_pixel(site, marks, level):
     found = marks.find(whole(site, level), level, upright=True)
@@ -103,8 +94,7 @@ def test_no_landmark_lies_on_nodata():
     ground = Ground(size=(300, 400))
     valid = np.zeros(ground.gray.shape, bool)
     valid[40:220, 100:310] = True
-    gray = np.where(valid, ground.gray, 255).astype(np.uint8)
-    site = OrthoMap.from_arrays(gray, ground.pixel_to_crs, f"EPSG:{ground.epsg}", valid=valid)
+    site = ground.map_of(np.where(valid, ground.gray, 255).astype(np.uint8), valid=valid)
     marks = LandmarkMap(site, CPU)
     x, y = marks.find(whole(site), 0, upright=True).features.xy_px[0].round().astype(int).T
     assert len(x) > 100

@@ -261,39 +261,39 @@ def test_a_copy_that_was_interrupted_is_carried_on(picture, tmp_path, tiny_limit
     assert len(made) == count
 
 
+@pytest.fixture
+def opened(picture, tmp_path):
+    """Open the picture with a cache: the map, and what was said of its copying."""
+
+    def open_picture():
+        stated = []
+        site = OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: stated.append(pixels))
+        return site, stated
+
+    return open_picture
+
+
+@pytest.mark.parametrize(("picture", "copies"), [("metric", False), ("in degrees", True)], indirect=["picture"])
+def test_a_small_map_is_copied_only_where_it_is_resampled(opened, copies):
+    assert bool(opened()[1]) == copies
+    assert opened()[1] == []
+
+
 @pytest.mark.parametrize("picture", ["metric", "in degrees"], indirect=True)
-@pytest.mark.parametrize("size", ["small", "large"])
-def test_a_copy_says_how_far_it_is_and_one_that_is_there_says_nothing(picture, tmp_path, request, size):
-    if size == "large":
-        request.getfixturevalue("tiny_limits")
-    stated = []
-
-    def opened():
-        return OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: stated.append(pixels))
-
-    site = opened()
-    if size == "small" and not site.info()["resampled"]:
-        assert stated == []  # nothing to copy
-        return
+def test_a_copy_says_how_far_it_is_and_one_that_is_there_says_nothing(opened, tiny_limits):
+    site, stated = opened()
     area_px, done = site.width_px * site.height_px, [pixels for pixels, _ in stated]
-    assert stated[-1] == (area_px, area_px)
+    assert (done[0], done[-1]) == (0, area_px)  # the first before anything is read
     assert done == sorted(done)
     assert {total for _, total in stated} == {area_px}
-    if size == "large":
-        assert done[0] == 0  # before anything is read
-        assert len(stated) == 2 * -(-site.width_px // 128) * -(-site.height_px // 128)
-    count = len(stated)
+    assert len(stated) == 2 * -(-site.width_px // 128) * -(-site.height_px // 128)
+    assert opened()[1] == []
+
+
+def test_a_copy_that_is_carried_on_begins_where_it_was(opened, tmp_path, tiny_limits):
     opened()
-    assert len(stated) == count
-
-
-def test_a_copy_that_is_carried_on_begins_where_it_was(picture, tmp_path, tiny_limits):
-    OrthoMap.open(picture, cache_dir=tmp_path / "cache")
-    folder = copy_in(tmp_path / "cache")
-    (folder / "0003-0003.tif").unlink()  # the last one: 116 x 16 px
-    stated = []
-    OrthoMap.open(picture, cache_dir=tmp_path / "cache", on_copy=lambda *pixels: stated.append(pixels))
-    assert stated == [(500 * 400 - 116 * 16, 500 * 400), (500 * 400, 500 * 400)]
+    (copy_in(tmp_path / "cache") / "0003-0003.tif").unlink()  # the last one: 116 x 16 px
+    assert opened()[1] == [(500 * 400 - 116 * 16, 500 * 400), (500 * 400, 500 * 400)]
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -308,7 +308,6 @@ def test_a_terminal_shows_the_copying_and_a_pipe_does_not(picture, tmp_path, tin
     assert stream.getvalue() == shown  # the copy is there
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["bytes", "cut", "gone", "list cut off", "no list"])
 def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, tiny_limits, made, damage):
     cache = tmp_path / "cache"
@@ -332,16 +331,6 @@ def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, t
     assert np.array_equal(again.gray(whole(again))[valid], pixels[valid])
     if damage in ("bytes", "cut", "gone"):
         assert made == [tile.name]
-
-
-def test_a_large_file_is_hashed_again_when_it_changes(tmp_path, monkeypatch):
-    monkeypatch.setattr(metric_copy, "_CACHED_HASH_BYTES", 10)
-    path = tmp_path / "file"
-    path.write_bytes(b"a" * 100)
-    first = metric_copy._file_hash(path, tmp_path)
-    assert metric_copy._file_hash(path, tmp_path) == first
-    path.write_bytes(b"b" * 101)
-    assert metric_copy._file_hash(path, tmp_path) != first
 
 
 def test_an_all_valid_file_says_so_without_being_read(tmp_path, large_path):

@@ -1,6 +1,7 @@
 """The map: where its pixels lie, what is nodata, and what is refused."""
 
 import json
+import math
 import warnings
 
 import numpy as np
@@ -18,8 +19,8 @@ from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.orthomap import OrthoMap
 from engine.values import Window
 from scenematch.files.geotiff import write_geotiff
-from tests.support.paths import SHARED
 from tests.support.rasters import whole, write_raster
+from tests.support.refusals import refusal
 
 UTM = "EPSG:32636"
 STEP_M = 0.5
@@ -27,8 +28,6 @@ WEST, NORTH = 686000.0, 3630000.0
 CORNER = Affine(STEP_M, 0.0, WEST, 0.0, -STEP_M, NORTH)
 DEGREES = {"crs": "EPSG:4326", "transform": Affine(1e-5, 0, 33, 0, -8e-6, 32)}
 CENTRED = np.array([[STEP_M, 0.0, WEST + STEP_M / 2], [0.0, -STEP_M, NORTH - STEP_M / 2]])
-
-needs_data = pytest.mark.skipif(not SHARED.is_dir(), reason="the flights of ../shared/data are not there")
 
 
 def noise(*shape, low=1, high=255, seed=0):
@@ -52,7 +51,7 @@ def site():
 @pytest.mark.parametrize("kind", ["Area", "Point"])
 def test_corner_origin_becomes_the_centre_once(tmp_path, kind):
     path = write(tmp_path / "map.tif", noise(40, 60), tags={"AREA_OR_POINT": kind})
-    site = OrthoMap.open(path)
+    site = OrthoMap.open(path, crs=UTM)  # its own may be named again
     with rasterio.open(path) as dataset, warnings.catch_warnings():
         warnings.simplefilter("ignore", PendingDeprecationWarning)
         east, north = dataset.xy(7, 11)  # row, column; the centre of the pixel
@@ -327,7 +326,6 @@ def test_surface_is_bilinear_and_ground_is_a_low_percentile(site):
     assert np.allclose(site.surface_at(xy), xy @ [0.25, 0.5], atol=1e-4)
     heights = 0.25 * np.arange(120) + 0.5 * np.arange(90)[:, None]
     assert site.ground_m == pytest.approx(np.percentile(heights, 20), abs=0.5)
-    assert np.array_equal(site.surface_at([[-1.0, 5.0], [5.0, 400.0]]), [site.ground_m] * 2)
 
 
 def test_no_surface_is_flat_ground_at_zero():
@@ -410,13 +408,6 @@ def test_picture_with_bounds(tmp_path, driver):
     assert np.linalg.norm(site.enu_from_pixel(found) - site.frame.enu_from_geodetic(lat, lon)) < 0.15
 
 
-def test_picture_whose_rows_run_evenly_in_web_mercator(tmp_path):
-    path = write(tmp_path / "p.png", noise(100, 100), driver="PNG", crs=None, transform=None)
-    site = OrthoMap.open(path, bounds_deg=(33.0, 32.0, 33.001, 32.00084805), crs="EPSG:3857")
-    assert site.crs.to_epsg() == 3857
-    assert np.allclose(site.bounds_deg, (33.0, 32.0, 33.001, 32.00084805), atol=1e-9)
-
-
 @pytest.mark.parametrize(("ending", "driver"), [("pgw", "PNG"), ("jgw", "JPEG"), ("wld", "PNG"), ("tfw", "GTiff")])
 def test_world_file_counts_from_the_centre_of_the_first_pixel(tmp_path, ending, driver):
     path = tmp_path / {"PNG": "p.png", "JPEG": "p.jpg", "GTiff": "p.tif"}[driver]
@@ -433,27 +424,12 @@ def test_world_file_counts_from_the_centre_of_the_first_pixel(tmp_path, ending, 
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [
-        ({}, "bounds_deg.*world file"),
-        ({"bounds_deg": (33, 32, 32.9, 32.1)}, "west < east"),
-        ({"bounds_deg": (33, 32, float("nan"), 32.1)}, "west < east"),
-        ({"bounds_deg": (35, 32, 35.5, 32.5), "crs": UTM}, "expected a rectangle"),
-        ({"bounds_deg": (33, 32, 33.1, 32.1), "crs": "EPSG:99999999"}, "crs: expected"),
-    ],
+    [({}, "bounds_deg.*world file"), ({"bounds_deg": (33, 32, math.nan, 32.1)}, "west < east")],
 )
 def test_picture_without_a_place_is_refused(tmp_path, options, words):
     path = write(tmp_path / "p.png", noise(60, 70), driver="PNG", crs=None, transform=None)
     with pytest.raises(MapError, match=words):
         OrthoMap.open(path, **options)
-
-
-def test_options_that_contradict_the_file_are_refused(tmp_path):
-    path = write(tmp_path / "map.tif", noise(20, 20))
-    assert OrthoMap.open(path, crs=UTM).crs.to_string() == UTM
-    with pytest.raises(MapError, match="crs: expected none"):
-        OrthoMap.open(path, crs="EPSG:32637")
-    with pytest.raises(MapError, match="bounds_deg: expected none"):
-        OrthoMap.open(path, bounds_deg=(33, 32, 33.1, 32.1))
 
 
 # --- refusals -----------------------------------------------------------------------------------------------
@@ -462,7 +438,6 @@ def test_options_that_contradict_the_file_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("profile", "words"),
     [
-        ({"crs": None}, "names no CRS"),
         ({"transform": None}, "without georeference"),
         ({"transform": Affine(float("nan"), 0, 0, 0, -1, 0)}, "geotransform"),
         ({"transform": Affine(1, 1, 0, 1, 1, 5)}, "geotransform"),
@@ -475,9 +450,8 @@ def test_options_that_contradict_the_file_are_refused(tmp_path):
     ],
 )
 def test_georeference_that_makes_no_sense_is_refused(tmp_path, profile, words):
-    with pytest.raises(MapError, match=words) as caught:
-        OrthoMap.open(write(tmp_path / "map.tif", noise(60, 120), **profile), cache_dir=tmp_path)
-    assert "\n" not in str(caught.value)
+    path = write(tmp_path / "map.tif", noise(60, 120), **profile)
+    assert words in refusal(OrthoMap.open, path, cache_dir=tmp_path, error=MapError)
 
 
 def test_what_is_no_local_raster_is_refused(tmp_path):
@@ -497,9 +471,7 @@ def test_truncated_file_is_refused(tmp_path, share):
     path = write(tmp_path / "map.tif", noise(3, 300, 300), tiled=True, compress="deflate", photometric="rgb")
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(MapError, match="map") as caught:
-        OrthoMap.open(path)
-    assert "\n" not in str(caught.value)
+    assert "map" in refusal(OrthoMap.open, path, error=MapError)
 
 
 def test_map_of_nothing_but_nodata_is_refused(tmp_path):
@@ -539,7 +511,11 @@ def geographic(tmp_path):
     return write(tmp_path / "map.tif", noise(80, 90), **DEGREES)
 
 
-def test_resampled_map_is_made_once_and_again_for_other_content(tmp_path, geographic):
+@pytest.mark.parametrize("bytes_read_anew", [1 << 22, 10], ids=["small file", "large file"])
+def test_resampled_map_is_made_once_and_again_for_other_content(
+    tmp_path, geographic, bytes_read_anew, monkeypatch
+):
+    monkeypatch.setattr("engine.maps.metric_copy._CACHED_HASH_BYTES", bytes_read_anew)
     cache = tmp_path / "cache"
     first = OrthoMap.open(geographic, cache_dir=cache)
     (made,) = cache.glob("*/*.tif")
@@ -549,22 +525,7 @@ def test_resampled_map_is_made_once_and_again_for_other_content(tmp_path, geogra
     assert np.array_equal(first.gray(whole(first)), second.gray(whole(second)))
     write(geographic, noise(80, 90, seed=5), **DEGREES)
     OrthoMap.open(geographic, cache_dir=cache)
-    assert len(list(cache.iterdir())) == 2
-
-
-@pytest.mark.parametrize("damage", ["cut", "empty", "other", "gone"])
-def test_damaged_cache_is_made_anew(tmp_path, geographic, damage):
-    cache = tmp_path / "cache"
-    first = OrthoMap.open(geographic, cache_dir=cache)
-    (made,) = cache.glob("*/*.tif")
-    content = made.read_bytes()
-    made.unlink()
-    if damage == "other":
-        write(made, noise(9, 9))
-    elif damage != "gone":
-        made.write_bytes(content[: len(content) // 2] if damage == "cut" else b"")
-    second = OrthoMap.open(geographic, cache_dir=cache)
-    assert np.array_equal(first.gray(whole(first)), second.gray(whole(second)))
+    assert len(list(cache.glob("*/*.tif"))) == 2
 
 
 def test_cache_that_cannot_be_written_does_not_matter(tmp_path, geographic, monkeypatch):
@@ -590,23 +551,11 @@ def test_info_can_be_written_as_json(tmp_path, geographic, site):
     assert facts["convergence_deg"] == pytest.approx(convergence_deg, abs=1e-4)
 
 
-@needs_data
-def test_satellite_map_with_a_colour_table_and_a_black_collar():
-    site = OrthoMap.open(SHARED / "nust" / "map.tif")
+def test_satellite_map_with_a_colour_table_and_a_black_collar(shared):
+    site = OrthoMap.open(shared / "nust" / "map.tif")
     valid = site.valid(whole(site))
     assert 0.3 < 1.0 - valid.mean() < 0.4
     assert (site.gray(whole(site))[~valid] == 0).all()  # index 255 of the table, which stands for black
-
-
-@pytest.mark.slow
-@needs_data
-def test_geographic_orthophoto_with_a_black_collar(tmp_path):
-    folder = SHARED / "caliterra"
-    site = OrthoMap.open(folder / "map.tif", folder / "dsm.tif", cache_dir=tmp_path)
-    assert site.crs.to_epsg() == 32614
-    assert site.gsd_m_per_px == pytest.approx(0.08, abs=1e-3)
-    assert 0.2 < site.info()["nodata_share"] < 0.3
-    assert site.has_surface
 
 
 # ----------------------------------------------------------------------------------- how well it says that it lies
@@ -626,13 +575,9 @@ def test_a_map_says_how_well_it_lies_and_its_surface_how_it_leans(tmp_path, epsg
 
     assert opened() == opened() == (0.12, 0.04)
     assert opened(georeference_sigma_m=2.0, slope_sigma_deg=0.5) == (2.0, 0.5)
-    assert OrthoMap.open(tmp_path / "map.tif", cache_dir=tmp_path / "cache").slope_sigma_deg is None
-
-
-def test_a_map_that_says_nothing_of_its_accuracy_says_none(tmp_path):
-    write_geotiff(tmp_path / "map.tif", noise(40, 50), CENTRED, 32633)
-    site = OrthoMap.open(tmp_path / "map.tif")
-    assert (site.georeference_sigma_m, site.slope_sigma_deg) == (None, None)
+    write_geotiff(tmp_path / "map.tif", noise(40, 50), affine, epsg)
+    write_geotiff(tmp_path / "dsm.tif", np.ones((40, 50), np.float32), affine, epsg)
+    assert opened() == (None, None)  # of files that say nothing
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "1e200", "half a metre"])

@@ -1,4 +1,4 @@
-"""Samples of the map: where large levels end, and for several threads at once."""
+"""Samples of the map: where large levels end, and without a prepared map."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from engine.maps.prepared import PreparedMap
 from engine.maps.samples import BLOCK_PX, SampleMap
 from engine.maps.tiles import TILE_PX
 from engine.values import Window
-from tests.support.threads import called_at_once
 
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])
 
@@ -47,19 +46,6 @@ def test_a_level_may_end_anywhere_beyond_a_cell(more_px, by_cells):
     columns = range((width_px - 40) // BLOCK_PX, width_px // BLOCK_PX)
     rows = range((height_px - 30) // BLOCK_PX, height_px // BLOCK_PX)
     assert sorted(map(tuple, blocks.tolist())) == list(itertools.product(columns, rows))
-
-
-@pytest.mark.slow
-def test_several_threads_may_take_samples_at_once(by_cells, monkeypatch):
-    """The worker that a live flight left behind may still be at work beside the one that replaced it."""
-    sampled, _ = make_map(3 * TILE_PX, 3 * TILE_PX)
-    rng = np.random.default_rng(0)
-    one = Samples(np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), np.ones(1))
-    monkeypatch.setattr(samples, "MAX_CELLS", 1)
-    monkeypatch.setattr(sampled, "_sampled", lambda cell, level: (one, (1, 1)))
-    windows = [Window(x, y, 40, 40) for x, y in rng.integers(0, 3 * TILE_PX - 40, (6000, 2)).tolist()]
-    assert len(called_at_once(lambda window: sampled.find(window, 0), windows)) == len(windows)
-    assert len(sampled._cells) == 1
 
 
 def test_samples_are_the_same_with_and_without_a_prepared_map(by_cells):

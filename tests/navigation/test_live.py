@@ -73,23 +73,6 @@ def fail():
     raise OSError("map is gone")
 
 
-class Sink:
-    """Collects answers and lets a test wait for them."""
-
-    def __init__(self):
-        self.answers, self.changed = [], threading.Condition()
-
-    def __call__(self, answer):
-        with self.changed:
-            self.answers.append(answer)
-            self.changed.notify_all()
-
-    def wait_for(self, count: int, timeout_s: float = 60.0):
-        with self.changed:
-            assert self.changed.wait_for(lambda: len(self.answers) >= count, timeout_s), self.answers
-            return list(self.answers)
-
-
 class Clock:
     """Stands still until a test turns it."""
 
@@ -118,40 +101,51 @@ def wait_until(condition, timeout_s: float = 60.0):
         time.sleep(0.005)
 
 
+def wait_for(answers, count: int):
+    wait_until(lambda: len(answers) >= count)
+    return answers
+
+
 @contextmanager
-def running(navigators, deadline_ms=60_000.0, patience_ms=1000.0, clock=None, sink=None):
-    """A pipeline and its answers."""
-    sink, options = sink or Sink(), LiveOptions(deadline_ms=deadline_ms, patience_ms=patience_ms)
-    with Live(navigators, sink, options=options, clock_ns=clock, machine_ns=clock) as live:
-        yield live, sink
+def running(navigators, deadline_ms=60_000.0, patience_ms=1000.0, clock=None, fails=None):
+    """A pipeline and its answers; whoever receives them may fail."""
+    answers, options = [], LiveOptions(deadline_ms=deadline_ms, patience_ms=patience_ms)
+
+    def deliver(answer):
+        answers.append(answer)
+        if fails is not None:
+            raise fails
+
+    with Live(navigators, deliver, options=options, clock_ns=clock, machine_ns=clock) as live:
+        yield live, answers
 
 
-def send(live, sink, *numbers):
+def send(live, answers, *numbers):
     """Submit frames, each once the one before it was answered; the ends of all that were."""
     for number in numbers:
-        count = len(sink.answers) + 1
+        count = len(answers) + 1
         live.submit(frame(number))
-        sink.wait_for(count)
-    return reasons(sink.answers)
+        wait_for(answers, count)
+    return reasons(answers)
 
 
 def test_each_frame_has_its_own_fix():
-    with running(Navigators()) as (live, sink):
-        send(live, sink, *range(20))
-    assert [a.result.timestamp_ns for a in sink.answers] == list(range(20))
-    assert all(a.frame.timestamp_ns == a.result.timestamp_ns == a.result.east_m for a in sink.answers)
+    with running(Navigators()) as (live, answers):
+        send(live, answers, *range(20))
+    assert [a.result.timestamp_ns for a in answers] == list(range(20))
+    assert all(a.frame.timestamp_ns == a.result.timestamp_ns == a.result.east_m for a in answers)
     assert (live.counts.submitted, live.counts.answered, live.counts.dropped, live.counts.late) == (20, 20, 0, 0)
 
 
 def test_the_newest_wins_and_drops_are_counted():
     gate = Gate()
-    with running(Navigators({0: gate})) as (live, sink):
+    with running(Navigators({0: gate})) as (live, answers):
         live.submit(frame(0))
         assert gate.begun.wait(60.0)
         for number in range(1, 8):
             live.submit(frame(number))
         gate.opened.set()
-        answers = sink.wait_for(2)
+        wait_for(answers, 2)
     assert [a.frame.timestamp_ns for a in answers] == [0, 7]
     assert live.counts.dropped == 6
 
@@ -162,36 +156,36 @@ def test_more_frames_than_it_can_take(times):
     """The age at output stays within the deadline and one frame, however many come."""
     takes_ms, deadline_ms = 20.0, 60.0
     begun_ns = time.monotonic_ns()
-    with running(Navigators(takes_ms=takes_ms), deadline_ms) as (live, sink):
+    with running(Navigators(takes_ms=takes_ms), deadline_ms) as (live, answers):
         for number in range(30 * times):
             live.submit(frame(number))
             time.sleep(takes_ms / times * 1e-3)
-        sink.wait_for(5)
+        wait_for(answers, 5)
     counts, took_ms = live.counts, (time.monotonic_ns() - begun_ns) * 1e-6
     assert counts.submitted == 30 * times == counts.answered + counts.dropped
     assert counts.answered <= took_ms / takes_ms + took_ms / deadline_ms + 2  # one in work, one that waits
-    stamps = [a.frame.timestamp_ns for a in sink.answers]
+    stamps = [a.frame.timestamp_ns for a in answers]
     assert stamps == sorted(set(stamps))
-    assert all(isinstance(a.result, NoFix) or a.age_ms <= deadline_ms for a in sink.answers)
+    assert all(isinstance(a.result, NoFix) or a.age_ms <= deadline_ms for a in answers)
 
 
 def test_an_answer_comes_at_the_deadline_and_the_late_fix_never():
     gate = Gate()
-    with running(Navigators({0: gate}), deadline_ms=50, patience_ms=60_000) as (live, sink):
-        assert send(live, sink, 0) == [Reason.LATE]
+    with running(Navigators({0: gate}), deadline_ms=50, patience_ms=60_000) as (live, answers):
+        assert send(live, answers, 0) == [Reason.LATE]
         gate.opened.set()
-        send(live, sink, 1)
-    assert [a.frame.timestamp_ns for a in sink.answers] == [0, 1]
+        send(live, answers, 1)
+    assert [a.frame.timestamp_ns for a in answers] == [0, 1]
     assert live.counts.workers_replaced == 0
 
 
 def test_the_navigator_is_given_what_is_left():
     navigators = Navigators()
-    with running(navigators) as (live, sink):
+    with running(navigators) as (live, answers):
         live.submit(frame(0), captured_ns=time.monotonic_ns() - 3_000_000_000)
-        sink.wait_for(1)
+        wait_for(answers, 1)
         live.submit(frame(1), captured_ns=time.monotonic_ns() - 61_000_000_000)
-        answers = sink.wait_for(2)
+        wait_for(answers, 2)
     assert 0 < navigators.budgets[0] <= 57_000
     assert len(navigators.budgets) == 1  # nothing is begun that cannot be in time
     assert reasons(answers) == ["fix", Reason.LATE]
@@ -201,30 +195,30 @@ def test_the_navigator_is_given_what_is_left():
 def test_a_worker_that_hangs_is_replaced_and_starts_from_the_last_fix():
     clock, gate = Clock(), Gate()
     navigators = Navigators({1: gate})
-    with running(navigators, deadline_ms=1000, patience_ms=500, clock=clock) as (live, sink):
-        send(live, sink, 0)
+    with running(navigators, deadline_ms=1000, patience_ms=500, clock=clock) as (live, answers):
+        send(live, answers, 0)
         live.submit(frame(1))
         assert gate.begun.wait(60.0)
         clock.advance(1000)
-        sink.wait_for(2)
+        wait_for(answers, 2)
         clock.advance(500)
         wait_until(lambda: live.counts.workers_replaced)
-        send(live, sink, 2)
+        send(live, answers, 2)
         gate.opened.set()  # the one that hung comes back, and is not heard
-        assert send(live, sink, 3) == ["fix", Reason.LATE, "fix", "fix"]
-    assert [a.age_ms for a in sink.answers] == [0.0, 1000.0, 0.0, 0.0]
+        assert send(live, answers, 3) == ["fix", Reason.LATE, "fix", "fix"]
+    assert [a.age_ms for a in answers] == [0.0, 1000.0, 0.0, 0.0]
     assert live.counts.workers_replaced == 1
     first, second = navigators.starts
     assert first is None
     assert (second.east_m, second.sigma_m) == (0.0, 1.0 + 15.0 * 1.5)
-    assert [a.frame.timestamp_ns for a in sink.answers] == [0, 1, 2, 3]
+    assert [a.frame.timestamp_ns for a in answers] == [0, 1, 2, 3]
 
 
 def test_a_worker_that_dies_is_replaced_and_its_frame_answered():
     navigators = Navigators({0: die})
-    with running(navigators) as (live, sink):
-        assert send(live, sink, 0, 1) == [Reason.FAILED, "fix"]
-    assert "ZeroDivisionError: a bug" in sink.answers[0].result.detail
+    with running(navigators) as (live, answers):
+        assert send(live, answers, 0, 1) == [Reason.FAILED, "fix"]
+    assert "ZeroDivisionError: a bug" in answers[0].result.detail
     assert len(navigators.starts) == 2
     assert live.counts.workers_replaced == 1
 
@@ -233,30 +227,25 @@ def test_a_frame_that_cannot_be_used_costs_no_worker():
     def refuse():
         raise TelemetryError("timestamp_ns: expected later than 5, got 0")
 
-    with running(Navigators({0: refuse})) as (live, sink):
-        assert send(live, sink, 0) == [Reason.FAILED]
+    with running(Navigators({0: refuse})) as (live, answers):
+        assert send(live, answers, 0) == [Reason.FAILED]
     assert live.counts.workers_replaced == 0
 
 
 @pytest.mark.slow
 def test_a_maker_that_fails_is_asked_again(caplog):
     navigators = Navigators({0: die}, fail)
-    with running(navigators, deadline_ms=1000) as (live, sink):
+    with running(navigators, deadline_ms=1000) as (live, answers):
         number = 0
-        while send(live, sink, number)[-1] != "fix":
+        while send(live, answers, number)[-1] != "fix":
             number += 1
     assert len(navigators.starts) == 3
     assert "make_navigator failed" in caplog.text
 
 
 def test_a_receiver_that_fails_stops_nothing(caplog):
-    class Failing(Sink):
-        def __call__(self, answer):
-            super().__call__(answer)
-            raise ValueError("the receiver's own")
-
-    with running(Navigators(), sink=Failing()) as (live, sink):
-        assert send(live, sink, 0, 1, 2) == ["fix"] * 3
+    with running(Navigators(), fails=ValueError("the receiver's own")) as (live, answers):
+        assert send(live, answers, 0, 1, 2) == ["fix"] * 3
     assert "deliver failed" in caplog.text
 
 
@@ -272,9 +261,9 @@ def test_after_closing_there_is_nothing_more():
 def test_closing_waits_for_a_worker_whose_frame_was_answered_without_it(patience_ms):
     """And for one that was given up: a process that ends while its thread is within compiled code is aborted."""
     gate, number = Gate(), 0
-    with running(Navigators(dict.fromkeys(range(1000), gate)), 20, patience_ms) as (live, sink):
+    with running(Navigators(dict.fromkeys(range(1000), gate)), 20, patience_ms) as (live, answers):
         while not gate.begun.is_set():  # on a machine that is busy a frame may be due before its work begins
-            assert set(send(live, sink, number)) == {Reason.LATE}
+            assert set(send(live, answers, number)) == {Reason.LATE}
             number += 1
         wait_until(lambda: patience_ms > 30 or live.counts.workers_replaced > 0)
         assert not gate.left
@@ -284,8 +273,8 @@ def test_closing_waits_for_a_worker_whose_frame_was_answered_without_it(patience
 
 def test_closing_ends_the_attempts_of_a_maker_that_fails(caplog):
     navigators = Navigators({0: die}, *[fail] * 1000)
-    with running(navigators, patience_ms=60) as (live, sink):
-        send(live, sink, 0)
+    with running(navigators, patience_ms=60) as (live, answers):
+        send(live, answers, 0)
         wait_until(lambda: len(navigators.starts) > 1)
     wait_until(no_threads)
     made, replaced = len(navigators.starts), live.counts.workers_replaced
@@ -306,11 +295,11 @@ def test_closing_does_not_replace_a_worker_that_hangs(monkeypatch):
     monkeypatch.setattr("engine.navigation.live._JOIN_S", 0.05)
     clock, gate = Clock(), Gate()
     navigators = Navigators({0: gate})
-    with running(navigators, deadline_ms=500, patience_ms=100, clock=clock) as (live, sink):
+    with running(navigators, deadline_ms=500, patience_ms=100, clock=clock) as (live, answers):
         live.submit(frame(0))
         assert gate.begun.wait(60.0)
         clock.advance(500)
-        assert reasons(sink.wait_for(1)) == [Reason.LATE]
+        assert reasons(wait_for(answers, 1)) == [Reason.LATE]
     clock.advance(100)
     wait_until(lambda: "scenematch-_watch" not in [thread.name for thread in threading.enumerate()])
     assert len(navigators.starts) == 1
@@ -327,18 +316,18 @@ def test_a_worker_that_hangs_in_making_its_navigator_is_replaced():
         gate()
 
     navigators = Navigators({0: die}, hang, hang, lambda: calls_ms.append(clock() * 1e-6))
-    with running(navigators, deadline_ms=100, patience_ms=10, clock=clock) as (live, sink):
-        send(live, sink, 0)
+    with running(navigators, deadline_ms=100, patience_ms=10, clock=clock) as (live, answers):
+        send(live, answers, 0)
         wait_until(lambda: len(calls_ms) == 1)
         live.submit(frame(1))
         clock.advance(100)
-        assert reasons(sink.wait_for(2))[-1] is Reason.LATE  # nothing waits for longer than its deadline
+        assert reasons(wait_for(answers, 2))[-1] is Reason.LATE  # nothing waits for longer than its deadline
         for made in (2, 3):
             wait_until(lambda made=made: live.counts.workers_replaced == made or clock.advance(1))
             wait_until(lambda made=made: len(calls_ms) == made)  # the clock stands still while its thread starts
-        send(live, sink, 2)
+        send(live, answers, 2)
         gate.opened.set()  # those that hung come back, and are not heard
-        assert send(live, sink, 3)[2:] == ["fix", "fix"]
+        assert send(live, answers, 3)[2:] == ["fix", "fix"]
     assert live.counts.workers_replaced == 3
     # A maker that is only slow comes through in the end: each is waited for twice as long as the one before.
     first_ms, second_ms, third_ms = calls_ms

@@ -12,7 +12,7 @@ from engine.geo import LocalFrame
 from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
 from engine.navigation.motion import PositionEstimate
 from tests.support.fixes import a_fix
-from tests.support.matchers import ScriptedMatcher, a_site, at
+from tests.support.matchers import ScriptedMatcher, a_site, at, flown
 
 STILL = (0.0, 0.0)
 
@@ -28,11 +28,8 @@ def scripted(*places):
 
 
 def fly(places, given=None):
-    """What comes of frames a second apart, what was asked, and the navigator."""
-    script = scripted(*places)
-    navigator = Navigator(script, Prior(east_m=0.0, north_m=0.0, sigma_m=5.0))
-    results = [navigator.update(at(k, STILL), given and given[k]) for k in range(len(places))]
-    return results, script.priors, navigator
+    """Frames a second apart, from a start."""
+    return flown(scripted(*places), Prior(east_m=0.0, north_m=0.0, sigma_m=5.0), velocity=STILL, given=given)
 
 
 def test_a_fix_tells_what_of_its_covariance_is_the_maps():
@@ -44,11 +41,11 @@ def test_a_fix_tells_what_of_its_covariance_is_the_maps():
 
 def test_the_maps_error_cancels_between_fixes_on_it():
     """The window of the next frame is not wider for it, and a match 5 m off contradicts a fix known to 0.5 m."""
-    results, priors, _ = fly([(0.0, 0.0), (5.0, 0.0)])
-    assert [isinstance(result, Fix) for result in results] == [True, False]
-    assert priors[1].sigma_m == pytest.approx(math.hypot(0.5, 0.5, math.sqrt(9.0 / 12.0)))
-    navigator = fly([(0.0, 0.0), (90.0, 0.0)])[2]
-    assert navigator.prediction.sigma_m == pytest.approx(math.hypot(priors[1].sigma_m, 3.0))  # in the world
+    run = fly([(0.0, 0.0), (5.0, 0.0)])
+    assert run.fixed == [0]
+    assert run.priors[1].sigma_m == pytest.approx(math.hypot(0.5, 0.5, math.sqrt(9.0 / 12.0)))
+    predicted = fly([(0.0, 0.0), (90.0, 0.0)]).navigator.prediction
+    assert predicted.sigma_m == pytest.approx(math.hypot(run.priors[1].sigma_m, 3.0))  # in the world
 
 
 @pytest.mark.parametrize("is_start", [True, False])
@@ -64,9 +61,9 @@ def test_the_offset_is_estimated_in_flight_and_moves_no_fix():
     rng = np.random.default_rng(1)
     places = rng.normal([2.0, -1.0], 0.3, (300, 2))
     given = [Prior(east_m=float(e), north_m=float(n), sigma_m=0.5) for e, n in places]
-    results, _, navigator = fly([(0.0, 0.0)] * 300, given)
-    assert all(isinstance(result, Fix) and result.east_m == 0.0 for result in results)
-    offset = navigator.map_offset
+    run = fly([(0.0, 0.0)] * 300, given)
+    assert all(isinstance(result, Fix) and result.east_m == 0.0 for result in run.results)
+    offset = run.navigator.map_offset
     sigma_m = np.sqrt(np.diag(offset.covariance_m2))
     assert (np.abs(offset.en_m - [2.0, -1.0]) < 3.0 * sigma_m).all()
     assert sigma_m.min() > 0.1  # five minutes count as some six differences
@@ -74,7 +71,7 @@ def test_the_offset_is_estimated_in_flight_and_moves_no_fix():
 
 
 def test_without_another_source_nothing_is_known_of_the_offset():
-    assert fly([(0.0, 0.0)] * 3)[2].map_offset is None
+    assert fly([(0.0, 0.0)] * 3).navigator.map_offset is None
     estimator = MapOffsetEstimator()
     estimator.add(fix_at(0.0, 0.0, map_sigma_m=0.0), PositionEstimate(np.ones(2), 1.0), 0.0)
     assert estimator.offset is None

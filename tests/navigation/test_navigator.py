@@ -12,7 +12,6 @@ from engine import (
     Attitude,
     Budget,
     Fix,
-    Frame,
     MatcherOptions,
     Navigator,
     NavigatorOptions,
@@ -26,12 +25,12 @@ from engine import (
     TelemetryError,
 )
 from engine.options import ACCEPT_ALL
+from tests.support import matchers
 from tests.support.fixes import a_fix
 from tests.support.matchers import ScriptedMatcher, a_site, at
 
 START = Prior(east_m=10.0, north_m=20.0, sigma_m=5.0)
 STILL, UNKNOWN = (0.0, 0.0), (None, None)
-SECOND = 1_000_000_000
 
 
 def fix_at(east_m, north_m, sigma_m=1.0, **stated):
@@ -44,20 +43,10 @@ def script(*answers, sigma_m=1.0, site=None, **stated):
     return ScriptedMatcher(*fixes, site=site)
 
 
-def reasons(results):
-    return ["fix" if isinstance(result, Fix) else result.reason.value for result in results]
-
-
 def flown(*answers, start=START, every_s=1.0, seconds=None, velocity=STILL, options=None, **known):
-    """The ends of frames that are answered from a list, what was asked, and the navigator.
-
-    They are so far apart, or come at these seconds; the velocity is that of all, or a list of each one's.
-    """
-    matcher = script(*answers, **known)
-    navigator, results = Navigator(matcher, start, options=options), []
-    for k, at_s in enumerate(seconds or [every_s * k for k in range(len(answers))]):
-        results.append(navigator.update(at(at_s, velocity[k] if isinstance(velocity, list) else velocity)))
-    return reasons(results), matcher.priors, navigator
+    """Frames that are answered from a list: see :func:`tests.support.matchers.flown`."""
+    timing = {"every_s": every_s, "seconds": seconds}
+    return matchers.flown(script(*answers, **known), start, velocity=velocity, options=options, **timing)
 
 
 def assert_prior(prior, east, north, sigma, moved=None):
@@ -65,10 +54,6 @@ def assert_prior(prior, east, north, sigma, moved=None):
     assert prior.sigma_m == pytest.approx(sigma)
     if moved is not None:
         assert (prior.moved_east_m, prior.moved_north_m) == (pytest.approx(moved[0]), pytest.approx(moved[1]))
-
-
-def test_a_flight_begins_at_its_start():
-    assert_prior(flown(None)[1][0], 10.0, 20.0, 5.0)
 
 
 # Prediction
@@ -82,7 +67,7 @@ def drift_m(*legs_s, sigma_mps=0.5):
 def test_it_predicts_with_the_last_fixes_where_the_telemetry_has_no_velocity():
     """Six fixes a second, each 6 m further east; then it goes on, less and less certain."""
     places = [(10.0 + 6.0 * k, 20.0) for k in range(6)]
-    _, priors, _ = flown(*places, None, None, velocity=UNKNOWN)
+    priors = flown(*places, None, None, velocity=UNKNOWN).priors
     assert priors[1].sigma_m > 7.0  # at an unknown speed, either way
     first, second = priors[6:]
     assert (first.east_m, first.north_m) == (pytest.approx(46.0, abs=1.0), pytest.approx(20.0))
@@ -93,42 +78,36 @@ def test_it_predicts_with_the_last_fixes_where_the_telemetry_has_no_velocity():
 def test_dead_reckoning_adds_up_over_refusals():
     """By the mean of two velocities; a refusal doubles the area searched, and not the prediction's."""
     velocities = [(4.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)]
-    _, (_, first, second, third), navigator = flown((10.0, 20.0), None, None, None, velocity=velocities)
+    run = flown((10.0, 20.0), None, None, None, velocity=velocities)
+    _, first, second, third = run.priors
     sigmas_m = [math.hypot(1.0, drift_m(*[1.0] * legs)) for legs in (1, 2, 3)]
     assert_prior(first, 14.0, 20.0, sigmas_m[0], moved=(4.0, 0.0))
     assert_prior(second, 18.0, 22.0, sigmas_m[1] * math.sqrt(2.0), moved=(4.0, 2.0))
     assert_prior(third, 20.0, 26.0, sigmas_m[2] * 2.0, moved=(2.0, 4.0))
-    assert_prior(navigator.prediction, 20.0, 26.0, sigmas_m[2])
-
-
-def test_the_uncertainty_of_a_fix_is_that_of_the_next_prediction():
-    _, priors, _ = flown((10.0, 20.0), None, sigma_m=4.0)
-    assert priors[1].sigma_m == pytest.approx(math.hypot(4.0, drift_m(1.0)))
+    assert_prior(run.navigator.prediction, 20.0, 26.0, sigmas_m[2])
 
 
 def test_frames_without_stamps_are_an_interval_apart():
     options = NavigatorOptions(default_interval_s=0.5)
-    _, priors, _ = flown((10.0, 20.0), None, seconds=[None, None], velocity=(8.0, 0.0), options=options)
-    assert_prior(priors[1], 14.0, 20.0, math.hypot(1.0, drift_m(0.5)))
+    run = flown((10.0, 20.0), None, seconds=[None, None], velocity=(8.0, 0.0), options=options)
+    assert_prior(run.priors[1], 14.0, 20.0, math.hypot(1.0, drift_m(0.5)))
 
 
 def test_a_start_that_leads_nowhere_widens_and_is_left_in_turns():
     """It is right 99 times in 100; seven refusals later the vehicle is as probably elsewhere."""
-    _, priors, navigator = flown(*[None] * 11)
+    run = flown(*[None] * 11)
+    assert_prior(run.priors[0], 10.0, 20.0, 5.0)
     grown_m = [2.0 ** (0.5 * k) * math.hypot(5.0, drift_m(*[1.0] * k)) for k in range(7)]
-    assert [prior.sigma_m for prior in priors[:7]] == pytest.approx(grown_m)
-    assert [prior is None for prior in priors[7:]] == [True, False, False, True]
-    assert navigator.state is NavigatorState.SEARCHING
+    assert [prior.sigma_m for prior in run.priors[:7]] == pytest.approx(grown_m)
+    assert [prior is None for prior in run.priors[7:]] == [True, False, False, True]
+    assert run.states[-1] == "SEARCHING"
 
 
 @pytest.mark.parametrize(("sigma_m", "used"), [(0.2, True), (50.0, False)])
 def test_the_tighter_of_its_own_prediction_and_a_given_prior_is_used(sigma_m, used):
-    matcher = script((10.0, 20.0), None)
-    navigator = Navigator(matcher, START)
-    navigator.update(at(0.0))
     given = Prior(east_m=77.0, north_m=0.0, sigma_m=sigma_m)
-    navigator.update(at(1.0, STILL), given)
-    assert (matcher.priors[1] == given) == used
+    run = matchers.flown(script((10.0, 20.0), None), START, velocity=STILL, given=[None, given])
+    assert (run.priors[1] == given) == used
 
 
 # Belief
@@ -137,95 +116,82 @@ def test_the_tighter_of_its_own_prediction_and_a_given_prior_is_used(sigma_m, us
 def test_a_match_of_the_whole_map_is_believed_once_others_agree():
     """Right with a probability of 0.99 each, by the motion that was measured; others are sought near the first."""
     answers = None, (100.0, 0.0), (104.1, 0.0), (108.0, 0.0), (112.0, 0.0), None
-    ends, priors, navigator = flown(*answers, start=None, velocity=(4.0, 0.0), confidence=0.99)
-    assert ends == ["low_score", *["unconfirmed"] * 3, "fix", "low_score"]
-    assert priors[:2] == [None, None]
-    assert_prior(priors[2], 104.0, 0.0, math.hypot(1.0, drift_m(1.0)))
-    assert priors[5].east_m == pytest.approx(116.0, abs=0.2)
-    assert (navigator.state, navigator.reset_count) == (NavigatorState.COASTING, 0)
+    run = flown(*answers, start=None, velocity=(4.0, 0.0), confidence=0.99)
+    assert run.ends == ["low_score", *["unconfirmed"] * 3, "fix", "low_score"]
+    assert run.priors[:2] == [None, None]
+    assert_prior(run.priors[2], 104.0, 0.0, math.hypot(1.0, drift_m(1.0)))
+    assert run.priors[5].east_m == pytest.approx(116.0, abs=0.2)
+    assert (run.states[-1], run.navigator.reset_count) == ("COASTING", 0)
 
 
 @pytest.mark.parametrize("second", [None, (140.0, 0.0)])
 def test_a_match_that_is_not_confirmed_waits_longer(second):
     """A frame that finds nothing there, or finds another place, speaks against it."""
     places = (100.0, 0.0), second, *[(100.0 + 4.0 * k, 0.0) for k in range(2, 7)]
-    ends, _, _ = flown(*places, start=None, velocity=(4.0, 0.0), confidence=0.99)
+    ends = flown(*places, start=None, velocity=(4.0, 0.0), confidence=0.99).ends
     assert "fix" not in ends[:3]
     assert ends[5:] == ["fix"] * 2
 
 
 def test_a_fix_that_contradicts_the_prediction_is_held_and_the_next_right_one_believed():
-    matcher = script((10.0, 20.0), (10.0, 60.0), (10.0, 20.0))
-    navigator = Navigator(matcher, START)
-    results = [navigator.update(at(k, STILL)) for k in range(3)]
-    assert reasons(results) == ["fix", "inconsistent", "fix"]
-    assert "40.0 m from the prediction, sigma 1.7 m" in results[1].detail
-    assert results[1].timestamp_ns == SECOND
-    assert navigator.reset_count == 0
+    run = flown((10.0, 20.0), (10.0, 60.0), (10.0, 20.0))
+    assert run.ends == ["fix", "inconsistent", "fix"]
+    assert "40.0 m from the prediction, sigma 1.7 m" in run.results[1].detail
+    assert run.results[1].timestamp_ns == 1_000_000_000
+    assert run.navigator.reset_count == 0
 
 
 def test_the_gate_is_a_chi_square_of_the_prediction_and_the_fix():
     """Both known to 1 m, and the way besides: 18.4 lies at 4.29 sigmas."""
     sigma_m = math.hypot(1.0, 1.0, drift_m(1.0))
     for off_m, end in ((4.28 * sigma_m, "fix"), (4.30 * sigma_m, "inconsistent")):
-        assert flown((10.0, 20.0), (10.0 + off_m, 20.0), confidence=1.0 - 1e-9)[0][1] == end
+        assert flown((10.0, 20.0), (10.0 + off_m, 20.0), confidence=1.0 - 1e-9).ends[1] == end
 
 
 def test_within_the_gate_a_match_of_little_evidence_must_lie_nearer():
     off_m = 3.5 * math.hypot(1.0, 1.0, drift_m(1.0))
-    ends = [flown((10.0, 20.0), (10.0 + off_m, 20.0), confidence=1.0 - wrong)[0][1] for wrong in (1e-9, 1e-3)]
+    ends = [flown((10.0, 20.0), (10.0 + off_m, 20.0), confidence=1.0 - wrong).ends[1] for wrong in (1e-9, 1e-3)]
     assert ends == ["fix", "unconfirmed"]
 
 
 def test_fixes_that_agree_outweigh_a_track_that_was_as_short():
     """One fix, and it was wrong: a few that agree with each other are more."""
-    ends, _, navigator = flown((10.0, 20.0), *[(60.0, 20.0)] * 6)
-    first = ends.index("fix", 1)
-    assert 4 <= first <= 5
-    assert ends[1] == "inconsistent"
-    assert navigator.reset_count == 1
+    run = flown((10.0, 20.0), *[(60.0, 20.0)] * 6)
+    assert 4 <= run.fixed[1] <= 5
+    assert run.ends[1] == "inconsistent"
+    assert run.navigator.reset_count == 1
 
 
 def test_without_a_velocity_a_jump_is_believed_once_a_vehicle_could_have_flown_it():
     """50 m, from where it stood still: some three seconds at 3 m/s2 that change every second."""
     places = [(10.0, 20.0)] * 20 + [(60.0, 20.0)] * 25
-    ends, _, _ = flown(*places, every_s=0.2, velocity=UNKNOWN)
-    first = ends.index("fix", 20)
-    assert 2.0 < 0.2 * (first - 19) < 4.0
-    assert ends[:20] + ends[first:] == ["fix"] * (65 - first)
+    fixed = flown(*places, every_s=0.2, velocity=UNKNOWN).fixed
+    assert 2.0 < 0.2 * (fixed[20] - 19) < 4.0
+    assert fixed == [*range(20), *range(fixed[20], 45)]
 
 
 @pytest.mark.parametrize(("seconds_before", "held_s"), [(20.0, 10.0), (150.0, 18.0)])
 def test_a_jump_that_lasts_is_unhealthy_at_first_and_believed_in_the_end(seconds_before, held_s):
     """A map that shifts by 40 m. Past evidence fades within a minute, however long the flight was right."""
     right = round(5 * seconds_before)
-    places = [(10.0, 20.0)] * right + [(50.0, 20.0)] * 125
-    navigator, seen = Navigator(script(*places), START), []
-    for k in range(len(places)):
-        result = navigator.update(at(0.2 * k, STILL))
-        seen.append((isinstance(result, Fix), navigator.healthy))
-    assert seen[:right] == [(True, True)] * right
-    first = next(k for k, (fixed, _) in enumerate(seen[right:]) if fixed)
-    assert 0.2 * (first + 1) == pytest.approx(held_s, abs=1.0)
-    assert not any(healthy for _, healthy in seen[right + 5 : right + first])  # a second after the last right fix
-    assert all(fixed for fixed, _ in seen[right + first :])
-    assert (navigator.state, navigator.reset_count) == (NavigatorState.TRACKING, 1)
+    run = flown(*[(10.0, 20.0)] * right, *[(50.0, 20.0)] * 125, every_s=0.2)
+    assert all(run.healthy[:right])
+    first = run.fixed[right]
+    assert run.fixed == [*range(right), *range(first, right + 125)]
+    assert 0.2 * (first - right + 1) == pytest.approx(held_s, abs=1.0)
+    assert not any(run.healthy[right + 5 : first])  # a second after the last right fix
+    assert (run.states[-1], run.navigator.reset_count) == ("TRACKING", 1)
 
 
 def test_two_methods_that_disagree_for_a_second_are_unhealthy():
-    matcher = script(*[(10.0, 20.0)] * 10, *[Reason.INCONSISTENT] * 10)
-    navigator, healthy = Navigator(matcher, START), []
-    for k in range(20):
-        navigator.update(at(0.2 * k, STILL))
-        healthy.append(navigator.healthy)
+    healthy = flown(*[(10.0, 20.0)] * 10, *[Reason.INCONSISTENT] * 10, every_s=0.2).healthy
     assert healthy[:14] == [True] * 14  # for less than a second
     assert healthy[16:] == [False] * 4
 
 
 def test_the_baseline_is_handed_out_as_it_comes():
     answers = (10.0, 20.0), (400.0, 20.0), None, (10.0, 20.0)
-    ends, _, _ = flown(*answers, start=None, every_s=0.2, options=ACCEPT_ALL)
-    assert ends == ["fix", "fix", "low_score", "fix"]
+    assert flown(*answers, start=None, every_s=0.2, options=ACCEPT_ALL).ends == ["fix", "fix", "low_score", "fix"]
 
 
 def test_a_broken_covariance_is_no_fix():
@@ -240,58 +206,52 @@ def test_a_broken_covariance_is_no_fix():
 def test_lost_after_enough_refusals_it_searches_the_whole_map_and_then_confirms():
     """Fourteen halve the odds from 1 in 10,000 to even. The whole map and dead reckoning take turns."""
     found = [(400.0, 2.0)] * 5
-    answers = [(10.0, 20.0), *[None] * 15, *found, None]
-    matcher = script(*answers, confidence=0.99)
-    navigator, states = Navigator(matcher, START, options=NavigatorOptions(search_every=2)), []
-    for k in range(len(answers)):
-        navigator.update(at(k, STILL))
-        states.append(navigator.state)
-    assert states[:14] == [NavigatorState.TRACKING, *[NavigatorState.COASTING] * 13]
-    assert states[14:18] == [NavigatorState.LOST] * 4
-    assert states[-2:] == [NavigatorState.TRACKING, NavigatorState.COASTING]
-    known = [prior is not None for prior in matcher.priors]
-    assert known == [True] * 15 + [False, True, *[True] * 5]
-    assert_prior(matcher.priors[17], 400.0, 2.0, math.hypot(1.0, drift_m(1.0)))  # near what was found
-    assert navigator.reset_count == 1
+    options = NavigatorOptions(search_every=2)
+    run = flown((10.0, 20.0), *[None] * 15, *found, None, confidence=0.99, options=options)
+    assert run.states[:14] == ["TRACKING", *["COASTING"] * 13]
+    assert run.states[14:18] == ["LOST"] * 4
+    assert run.states[-2:] == ["TRACKING", "COASTING"]
+    assert [k for k, prior in enumerate(run.priors) if prior is None] == [15]
+    assert_prior(run.priors[17], 400.0, 2.0, math.hypot(1.0, drift_m(1.0)))  # near what was found
+    assert run.navigator.reset_count == 1
 
 
 def test_late_frames_are_no_sign_of_being_lost():
-    assert all(prior is not None for prior in flown(*[Reason.LATE] * 30)[1])
+    assert all(prior is not None for prior in flown(*[Reason.LATE] * 30).priors)
 
 
 def test_lost_over_a_map_too_large_to_search_it_looks_where_dead_reckoning_leads():
     options = NavigatorOptions(search_every=2, lost_sigma_m=3.0)
-    _, priors, navigator = flown((10.0, 20.0), *[None] * 9, site=a_site(is_searchable=False), options=options)
-    assert navigator.state is NavigatorState.LOST
-    sigmas_m = [prior.sigma_m for prior in priors[1:]]
+    run = flown((10.0, 20.0), *[None] * 9, site=a_site(is_searchable=False), options=options)
+    assert run.states[-1] == "LOST"
+    sigmas_m = [prior.sigma_m for prior in run.priors[1:]]
     assert sigmas_m == sorted(sigmas_m)
 
 
 def test_no_single_match_of_little_evidence_is_believed_after_a_run_of_refusals():
     """Not even where dead reckoning leads."""
     answers = (10.0, 20.0), *[None] * 14, (10.0, 20.0), None, *[(10.0, 20.0)] * 5
-    ends, _, _ = flown(*answers, every_s=0.2, confidence=0.99)
-    assert ends[0] == ends[-1] == "fix"
-    assert "fix" not in ends[1:17]
+    fixed = flown(*answers, every_s=0.2, confidence=0.99).fixed
+    assert (fixed[0], fixed[-1]) == (0, 21)
+    assert fixed[1] >= 17
 
 
 def test_a_prediction_that_is_too_uncertain_is_given_up():
     """100 m at 0.5 m/s: after 200 s in which there was no time to match."""
-    *_, navigator = flown((10.0, 20.0), *[Reason.LATE] * 198)
-    assert navigator.state is NavigatorState.COASTING
-    *_, navigator = flown((10.0, 20.0), *[Reason.LATE] * 200)
-    assert navigator.state is NavigatorState.LOST
+    states = flown((10.0, 20.0), *[Reason.LATE] * 200).states
+    assert states[1:199] == ["COASTING"] * 198
+    assert states[200] == "LOST"
 
 
 def test_its_state_and_age_are_told():
-    navigator = Navigator(script((10.0, 20.0), None, (10.0, 20.0)), START)
+    navigator = Navigator(script(), START)
     assert (navigator.state, navigator.tracking, navigator.healthy) == (NavigatorState.SEARCHING, False, False)
     assert navigator.anchor_age_s is None
-    for seconds, state, age_s in ((0.0, "TRACKING", 0.0), (0.8, "COASTING", 0.8), (1.6, "TRACKING", 0.0)):
-        navigator.update(at(seconds, STILL))
-        assert (navigator.state, navigator.anchor_age_s) == (NavigatorState[state], pytest.approx(age_s))
-        assert navigator.tracking
-        assert navigator.healthy
+    run = flown((10.0, 20.0), None, (10.0, 20.0), every_s=0.8)
+    assert run.states == ["TRACKING", "COASTING", "TRACKING"]
+    assert run.ages_s == pytest.approx([0.0, 0.8, 0.0])
+    assert all(run.healthy)
+    assert run.navigator.tracking
 
 
 # Stamps
@@ -299,48 +259,45 @@ def test_its_state_and_age_are_told():
 
 @pytest.mark.parametrize("stamp", [3.0, 1.0, 0.9, 0.0])
 def test_a_frame_that_came_before_or_is_too_old_is_an_error_and_changes_nothing(stamp):
-    _, priors, navigator = flown((10.0, 20.0), (10.0, 20.0), None, seconds=[1.0, 3.0])
+    run = flown((10.0, 20.0), (10.0, 20.0), None, seconds=[1.0, 3.0])
     again = r"a frame that did not come before, got \d+ again"
     old = r"1000000000 or later \(3000000000 was the newest frame\), got "
     with pytest.raises(TelemetryError, match=rf"^timestamp_ns: expected {again if stamp >= 1.0 else old}"):
-        navigator.update(at(stamp, STILL))
-    assert len(priors) == 2
-    navigator.update(at(4.0, STILL))
-    assert_prior(priors[2], 10.0, 20.0, pytest.approx(math.hypot(1.0, drift_m(1.0)), rel=0.1))
+        run.navigator.update(at(stamp, STILL))
+    assert len(run.priors) == 2
+    run.navigator.update(at(4.0, STILL))
+    assert_prior(run.priors[2], 10.0, 20.0, pytest.approx(math.hypot(1.0, drift_m(1.0)), rel=0.1))
 
 
 def test_a_late_frame_is_matched_where_the_vehicle_was_and_moves_nothing_back():
     """Half way between frames at 10 m and 14 m east."""
     places = (10.0, 20.0), (14.0, 20.0), (12.2, 20.0), None
-    ends, priors, navigator = flown(*places, seconds=[1.0, 2.0, 1.5], velocity=(4.0, 0.0))
-    assert ends == ["fix"] * 3
-    assert_prior(priors[2], 12.0, 20.0, math.hypot(1.0, 0.25, 0.5 * math.sqrt(1.5)), moved=(0.0, 0.0))
-    newest = navigator.prediction
-    navigator.update(at(3.0, (4.0, 0.0)))
-    assert_prior(priors[3], newest.east_m + 4.0, 20.0, pytest.approx(math.hypot(1.0, drift_m(1.0)), rel=0.1))
+    run = flown(*places, seconds=[1.0, 2.0, 1.5, 3.0], velocity=(4.0, 0.0))
+    assert run.fixed == [0, 1, 2]
+    assert_prior(run.priors[2], 12.0, 20.0, math.hypot(1.0, 0.25, 0.5 * math.sqrt(1.5)), moved=(0.0, 0.0))
+    newest = run.predictions[2]
+    assert_prior(run.priors[3], newest.east_m + 4.0, 20.0, pytest.approx(math.hypot(1.0, drift_m(1.0)), rel=0.1))
 
 
 def test_a_late_fix_that_is_newer_than_the_last_one_is_applied_at_its_capture_time():
     """The frame of second 2 was refused; one of 1.5 s says that the vehicle is 1 m north of dead reckoning."""
     places = (10.0, 20.0), None, (12.0, 21.0), None
-    ends, priors, navigator = flown(*places, seconds=[1.0, 2.0, 1.5], velocity=(4.0, 0.0))
-    assert ends[2] == "fix"
-    predicted = navigator.prediction
+    run = flown(*places, seconds=[1.0, 2.0, 1.5, 3.0], velocity=(4.0, 0.0))
+    assert run.ends[2] == "fix"
+    predicted = run.predictions[2]
     assert (predicted.east_m, predicted.north_m) == pytest.approx((14.0, 21.0), abs=0.1)
     assert predicted.sigma_m < 1.4  # 2.0 without it
-    assert navigator.anchor_age_s == pytest.approx(0.5)
-    navigator.update(at(3.0, (4.0, 0.0)))
-    assert priors[3].east_m == pytest.approx(predicted.east_m + 4.0, abs=0.1)
+    assert run.ages_s[2] == pytest.approx(0.5)
+    assert run.priors[3].east_m == pytest.approx(predicted.east_m + 4.0, abs=0.1)
 
 
 def test_a_late_frame_that_contradicts_the_track_is_refused_and_counts_for_nothing():
     places = (10.0, 20.0), (10.0, 20.0), (90.0, 20.0), None, None
-    ends, priors, navigator = flown(*places, seconds=[1.0, 2.0, 1.5, 1.2])
-    assert ends[2:] == ["inconsistent", "low_score"]
-    assert navigator.state is NavigatorState.TRACKING
-    before = navigator.prediction
-    navigator.update(at(3.0, STILL))
-    assert_prior(priors[4], 10.0, 20.0, pytest.approx(math.hypot(before.sigma_m, drift_m(1.0)), rel=0.1))
+    run = flown(*places, seconds=[1.0, 2.0, 1.5, 1.2, 3.0])
+    assert run.ends[2:4] == ["inconsistent", "low_score"]
+    assert run.states[3] == "TRACKING"
+    before = run.predictions[3]
+    assert_prior(run.priors[4], 10.0, 20.0, pytest.approx(math.hypot(before.sigma_m, drift_m(1.0)), rel=0.1))
 
 
 # What is handed on
@@ -377,91 +334,88 @@ def test_options_are_refused_by_name(name):
 # The simulated flight
 
 
-def fly(sim_site, flight, method, *, profile="engine", start=True, skip=0):
-    matcher = SceneMatcher(sim_site, flight.camera, method, "cpu", MatcherOptions(profile=profile))
-    first = flight.truth[skip]
-    prior = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=10.0) if start else None
-    navigator = Navigator(matcher, prior, options=ACCEPT_ALL if profile == "paper" else None)
-    return [navigator.update(frame) for frame in flight.frames[skip:]]
-
-
 @pytest.fixture(scope="module")
-def errors_of(error_m, sim_site, sim_flight):
-    def measure(results, skip=0):
-        rows = zip(results, sim_flight.truth[skip:], strict=True)
-        return np.array([error_m(sim_site, fix, truth) for fix, truth in rows if isinstance(fix, Fix)])
+def fly(error_m, sim_site, sim_flight):
+    def fly(method, *, profile="engine", start=True, skip=0, dark=()):
+        """Frames from one on: their results, and the errors of those that are fixes."""
+        matcher = SceneMatcher(sim_site, sim_flight.camera, method, "cpu", MatcherOptions(profile=profile))
+        truth = sim_flight.truth[skip:]
+        prior = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=10.0) if start else None
+        navigator = Navigator(matcher, prior, options=ACCEPT_ALL if profile == "paper" else None)
+        frames = list(sim_flight.frames[skip:])
+        for k in dark:
+            frames[k] = replace(frames[k], image=np.full_like(frames[k].image, k))
+        results = [navigator.update(frame) for frame in frames]
+        fixes = [(fix, place) for fix, place in zip(results, truth, strict=True) if isinstance(fix, Fix)]
+        return results, np.array([error_m(sim_site, *each) for each in fixes])
 
-    return measure
+    return fly
 
 
 @pytest.mark.parametrize(("method", "rms_m"), [("ncc", 2.4), ("sift", 2.1)])
-def test_the_simulated_flight_is_followed_better_than_the_paper(sim_site, sim_flight, errors_of, method, rms_m):
-    results = fly(sim_site, sim_flight, method)
-    errors = errors_of(results)
+def test_the_simulated_flight_is_followed_better_than_the_paper(fly, sim_flight, method, rms_m):
+    results, errors = fly(method)
     assert len(errors) >= 0.95 * len(results)
     assert math.sqrt(np.mean(errors**2)) < rms_m
     assert [result.timestamp_ns for result in results] == [frame.timestamp_ns for frame in sim_flight.frames]
     claimed = np.array([result.sigma_m for result in results if isinstance(result, Fix)])
     assert not ((errors > 10.0) & (errors > 3.0 * claimed)).any()  # no false fix
     if method == "sift":
-        rise = [
-            fix.up_m - truth.height_agl_m
-            for fix, truth in zip(results, sim_flight.truth, strict=True)
-            if isinstance(fix, Fix)
-        ]
+        rows = zip(results, sim_flight.truth, strict=True)
+        rise = [fix.up_m - truth.height_agl_m for fix, truth in rows if isinstance(fix, Fix)]
         assert math.sqrt(np.mean(np.square(rise))) < 2.0
 
 
-def test_the_simulated_flight_is_joined_without_a_start(sim_site, sim_flight, errors_of):
+def test_the_simulated_flight_is_joined_without_a_start(fly):
     """By its first frame, one of twelve: a place that stands out on the whole map needs no second."""
-    errors = errors_of(fly(sim_site, sim_flight, "ncc", start=False, skip=12), skip=12)
+    _, errors = fly("ncc", start=False, skip=12)
     assert len(errors) == 12
     assert errors.max() < 10.0
 
 
 @pytest.mark.parametrize("method", ["ncc", pytest.param("sift", marks=pytest.mark.slow)])
-def test_the_papers_profile_flies_the_simulated_flight(sim_site, sim_flight, errors_of, method):
+def test_the_papers_profile_flies_the_simulated_flight(fly, method):
     """Its NCC knows no tilt: at 7 degrees it is 18.4 m off at 150 m, and more where height and heading err."""
-    results = fly(sim_site, sim_flight, method, profile="paper")
-    errors = errors_of(results)
+    results, errors = fly(method, profile="paper")
     assert len(errors) >= 0.9 * len(results)
     assert np.median(errors) < (18.4 if method == "ncc" else 2.1)
 
 
-def test_a_flight_is_found_again_after_an_outage(sim_site, sim_flight, error_m):
+def test_a_flight_is_found_again_after_an_outage(fly):
     """The camera sees nothing for 5 frames, 4.5 s: the window grows until the town is back in it."""
-    start = Prior(lat_deg=sim_flight.truth[0].lat_deg, lon_deg=sim_flight.truth[0].lon_deg, sigma_m=10.0)
-    navigator = Navigator(SceneMatcher(sim_site, sim_flight.camera, "ncc", "cpu"), start)
-    for k, (frame, truth) in enumerate(zip(sim_flight.frames, sim_flight.truth, strict=True)):
-        if 8 <= k < 13:
-            black = Frame(np.zeros_like(frame.image), frame.timestamp_ns, 150.0, 0.0)
-            assert navigator.update(black).reason is Reason.NO_TEXTURE
-        else:
-            assert error_m(sim_site, navigator.update(frame), truth) < 10.0
+    results, errors = fly("ncc", dark=range(8, 13))
+    assert [result.reason for result in results if isinstance(result, NoFix)] == [Reason.NO_TEXTURE] * 5
+    assert errors.max() < 10.0
+
+
+# Pictures that repeat
+
+PICTURE = np.full((8, 8), 90, np.uint8)
+
+
+def shown(images, velocities):
+    """The results of pictures a second apart, all of which match where the first one does."""
+    navigator = Navigator(script(*[(10.0, 20.0)] * len(velocities)), START)
+    frames = (at(k, velocity) for k, velocity in enumerate(velocities))
+    return [navigator.update(replace(frame, image=image)) for frame, image in zip(frames, images, strict=True)]
 
 
 def test_a_picture_that_repeats_while_the_vehicle_moves_is_refused():
     """Of a camera that hangs: its match is where the vehicle was."""
-    navigator = Navigator(script(*[(10.0, 20.0)] * 8), START)
-    first = at(0.0, (4.0, 0.0))
-    assert isinstance(navigator.update(first), Fix)
-    again = replace(at(1.0, (4.0, 0.0)), image=first.image.copy())
-    result = navigator.update(again)
-    assert result.reason is Reason.FAILED
-    assert result.detail == "the picture repeats the one 1.0 s and 4.0 m ago"
-    assert navigator.state.value == "coasting"
-    assert isinstance(navigator.update(replace(at(1.1, (0.0, 0.0)), image=first.image.copy())), NoFix)
+    first, again, still = shown([PICTURE, PICTURE.copy(), PICTURE.copy()], [(4.0, 0.0), (4.0, 0.0), STILL])
+    assert isinstance(first, Fix)
+    assert (again.reason, still.reason) == (Reason.FAILED, Reason.FAILED)
+    assert again.detail == "the picture repeats the one 1.0 s and 4.0 m ago"
 
 
 def test_a_buffer_that_is_filled_again_is_no_repeat():
-    navigator, buffer = Navigator(script(*[(10.0, 20.0)] * 3), START), np.zeros((8, 8), np.uint8)
-    for seconds in (0.0, 0.1, 0.2):
-        buffer[:] = round(100 * seconds)
-        assert isinstance(navigator.update(replace(at(seconds, (0.1, 0.0)), image=buffer)), Fix)
+    def filled(buffer):
+        for level in (0, 10, 20):
+            buffer[:] = level
+            yield buffer
+
+    assert all(isinstance(result, Fix) for result in shown(filled(PICTURE.copy()), [(0.6, 0.0)] * 3))
 
 
 def test_a_camera_without_noise_may_show_one_place_twice():
-    navigator = Navigator(script(*[(10.0, 20.0)] * 8), START)
-    first = at(0.0, (0.0, 0.0))
-    navigator.update(first)
-    assert isinstance(navigator.update(replace(at(1.0, (0.0, 0.0)), image=first.image)), Fix)
+    assert isinstance(shown([PICTURE, PICTURE], [STILL, STILL])[1], Fix)

@@ -19,36 +19,22 @@ from engine.navigation.motion import FrameClock, GroundMotion, Ways
 from engine.navigation.odometry import NoMotion, VisualOdometry
 from engine.navigation.tracks import Track
 from scenematch.runs.settings import TrackSettings, load_settings
+from tests.support.ground import Ground
 from tests.support.matchers import ScriptedMatcher, a_site
 
 CAMERA = Camera.from_fov(320, 240, 60.0)
-HEIGHT_M, GROUND_M_PER_PX = 120.0, 0.25
-SIDE_PX = 1600
+HEIGHT_M = 120.0
 LEVEL = Attitude(0.0, 0.0, 0.0)
 INTERVAL_S = 0.5
 
 
-def texture(seed: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    layers = [cv2.resize(rng.normal(size=(n, n)), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_CUBIC)
-              for n in (50, 200, 800)]  # fmt: skip
-    total = sum(layer / np.sqrt(k + 1.0) for k, layer in enumerate(layers))
-    return np.clip(128.0 + 40.0 * total, 0, 255).astype(np.uint8)
+GROUND = Ground()
 
 
-GROUND = texture(0)
-
-
-def picture(place_m, attitude: Attitude, height_m=HEIGHT_M, ground=GROUND, camera=CAMERA):
+def picture(place_m, attitude=LEVEL, height_m=HEIGHT_M, ground=GROUND, camera=CAMERA):
     """What a pinhole camera shows of the ground, whose middle is the origin of east and north."""
-    turn = camera.enu_from_camera(attitude)
-    middle = (SIDE_PX - 1) / 2
-    enu = np.array([[GROUND_M_PER_PX, 0, -middle * GROUND_M_PER_PX - place_m[0]],
-                    [0, -GROUND_M_PER_PX, middle * GROUND_M_PER_PX - place_m[1]],
-                    [0, 0, -height_m]])  # fmt: skip
-    image_from_ground = camera.matrix @ turn.T @ enu
-    size = (camera.width_px, camera.height_px)
-    return cv2.warpPerspective(ground, image_from_ground, size, flags=cv2.INTER_AREA)
+    angles_deg = {"roll_deg": attitude.roll_deg, "pitch_deg": attitude.pitch_deg}
+    return ground.picture_from(camera, place_m, height_m, heading_deg=attitude.heading_deg, **angles_deg)
 
 
 def frame(image, seconds=0.0, attitude=LEVEL, height_m=HEIGHT_M, **more):
@@ -96,7 +82,7 @@ def test_a_known_motion_is_found_at_every_attitude(east_m, north_m, heading_deg,
 
 
 def test_a_climb_is_no_motion_over_the_ground():
-    first = frame(picture((0.0, 0.0), LEVEL))
+    first = frame(picture((0.0, 0.0)))
     second = frame(picture((4.0, -3.0), LEVEL, 1.05 * HEIGHT_M), INTERVAL_S, height_m=1.05 * HEIGHT_M)
     assert motion_between(first, second).moved_m == pytest.approx([4.0, -3.0], abs=0.2)
 
@@ -129,21 +115,21 @@ def test_a_distorting_lens_shows_the_same_motion():
     assert again[:, 0] == pytest.approx(np.column_stack([columns.ravel(), rows.ravel()]), abs=0.01)
     wide = Camera.from_fov(480, 360, 80.0)
     at = (flat @ wide.matrix[:2, :2].T + wide.matrix[:2, 2]).astype(np.float32).reshape(240, 320, 2)
-    shown = (picture(place, LEVEL, camera=wide) for place in ((0, 0), (9, 5)))
+    shown = (picture(place, camera=wide) for place in ((0, 0), (9, 5)))
     images = [cv2.remap(one, at, None, cv2.INTER_LINEAR) for one in shown]
     assert motion_between(*images, camera=lens).moved_m == pytest.approx([9.0, 5.0], abs=0.3)
 
 
 def test_large_pictures_are_followed_smaller_with_the_same_answer():
     camera = Camera.from_fov(1280, 960, 60.0)
-    images = [picture(place, LEVEL, camera=camera) for place in ((0, 0), (6, -7))]
+    images = [picture(place, camera=camera) for place in ((0, 0), (6, -7))]
     assert motion_between(*images, camera=camera).moved_m == pytest.approx([6.0, -7.0], abs=0.3)
 
 
 def test_something_fixed_to_the_camera_does_not_stop_the_ground():
-    moved = [picture(place, LEVEL) for place in ((0, 0), (10, 0))]
+    moved = [picture(place) for place in ((0, 0), (10, 0))]
     for image in moved:
-        image[:80, :120] = GROUND[:80, :120]
+        image[:80, :120] = GROUND.gray[:80, :120]
     assert motion_between(*moved).moved_m == pytest.approx([10, 0], abs=0.3)
 
 
@@ -153,22 +139,22 @@ def test_something_fixed_to_the_camera_does_not_stop_the_ground():
 def test_pictures_that_show_no_one_motion_are_refused():
     rng = np.random.default_rng(1)
     refused(*(np.full((240, 320), level, np.uint8) for level in (90, 91)), "0 points")
-    refused(*(picture((0, 0), LEVEL, ground=texture(seed)) for seed in (1, 2)), "agree on one motion")
+    refused(*(picture((0, 0), ground=Ground(seed=seed)) for seed in (1, 2)), "agree on one motion")
     dark = [np.clip(rng.normal(6.0, 2.0, (240, 320)), 0, 255).astype(np.uint8) for _ in range(2)]
     refused(*dark, "agree on one motion")
-    refused(*[picture((0, 0), LEVEL)] * 2, "repeats the last one")
+    refused(*[picture((0, 0))] * 2, "repeats the last one")
 
 
 def test_what_is_fixed_to_the_camera_over_water_is_no_hover():
     """An overlay in a corner is all that can be followed: it stands still, whatever the vehicle does."""
     shown = [np.full((240, 320), grey, np.uint8) for grey in (90, 92)]
     for image in shown:
-        image[:80, :100] = GROUND[:80, :100]
+        image[:80, :100] = GROUND.gray[:80, :100]
     refused(*shown, "small part")
 
 
 def test_telemetry_that_does_not_support_a_motion_is_refused():
-    first, second = frame(picture((0, 0), LEVEL)), frame(picture((5, 0), LEVEL), INTERVAL_S)
+    first, second = frame(picture((0, 0))), frame(picture((5, 0)), INTERVAL_S)
     refused(replace(first, height_agl_m=None), second, "height or heading")
     refused(first, replace(second, heading_deg=None), "height or heading")
     refused(replace(first, timestamp_ns=None), second, "no timestamp")
@@ -181,20 +167,20 @@ def test_telemetry_that_does_not_support_a_motion_is_refused():
 
 def test_a_velocity_that_is_too_uncertain_is_refused(monkeypatch):
     monkeypatch.setattr("engine.navigation.odometry._MAX_SIGMA_MPS", 1e-6)
-    refused(picture((0, 0), LEVEL), picture((5, 0), LEVEL), "uncertain")
+    refused(picture((0, 0)), picture((5, 0)), "uncertain")
 
 
 @pytest.mark.parametrize("as_given", [np.asarray, torch.from_numpy])
 def test_a_buffer_that_is_filled_again_is_no_picture_that_repeats(as_given):
-    odometry, buffer = VisualOdometry(CAMERA), as_given(picture((0, 0), LEVEL))
+    odometry, buffer = VisualOdometry(CAMERA), as_given(picture((0, 0)))
     odometry.update(frame(buffer))
-    buffer[:] = as_given(picture((5, 0), LEVEL))
+    buffer[:] = as_given(picture((5, 0)))
     assert odometry.update(frame(buffer, INTERVAL_S)).moved_m == pytest.approx([5.0, 0.0], abs=0.2)
 
 
 def test_the_way_after_a_picture_that_repeats_is_unknown():
     odometry = VisualOdometry(CAMERA)
-    shown = [picture((3.0 * k, 0.0), LEVEL) for k in (0, 0, 2, 3)]
+    shown = [picture((3.0 * k, 0.0)) for k in (0, 0, 2, 3)]
     motions = [odometry.update(frame(image, k * INTERVAL_S)) for k, image in enumerate(shown)]
     assert [isinstance(motion, GroundMotion) for motion in motions] == [False, False, False, True]
     assert motions[3].moved_m == pytest.approx([3.0, 0.0], abs=0.2)
@@ -247,7 +233,7 @@ def test_a_velocity_with_its_own_accuracy_is_taken_at_its_word(sigma_mps, expect
 def test_a_navigator_follows_the_ground_where_it_is_asked_to():
     navigator = Navigator(blind(camera=CAMERA), START, options=NavigatorOptions(odometry=True))
     for k in range(6):
-        navigator.update(frame(picture((3.0 * k, -2.0 * k), LEVEL), INTERVAL_S * k))
+        navigator.update(frame(picture((3.0 * k, -2.0 * k)), INTERVAL_S * k))
     predicted = navigator.prediction
     assert navigator.ground_motion is not None
     assert (predicted.east_m, predicted.north_m) == pytest.approx((15.0, -10.0), abs=0.5)
@@ -257,7 +243,7 @@ def test_a_navigator_follows_the_ground_where_it_is_asked_to():
 def test_only_odometry_needs_a_camera_of_the_matcher():
     matcher = blind()
     navigator = Navigator(matcher, START)
-    assert isinstance(navigator.update(frame(picture((0, 0), LEVEL))), NoFix)
+    assert isinstance(navigator.update(frame(picture((0, 0)))), NoFix)
     assert navigator.ground_motion is None
     with pytest.raises(OptionError, match=r"^odometry: expected a matcher with a `camera`, got ScriptedM"):
         Navigator(matcher, START, options=NavigatorOptions(odometry=True))
@@ -272,20 +258,20 @@ def test_the_time_that_odometry_takes_is_the_frames(monkeypatch, total_ms, searc
     matcher, limit = blind(camera=CAMERA), Budget(total_ms=total_ms, search_ms=search_ms)
     navigator = Navigator(matcher, START, limit, NavigatorOptions(odometry=True))
     monkeypatch.setattr(VisualOdometry, "update", slow)
-    navigator.update(frame(picture((0, 0), LEVEL)))
+    navigator.update(frame(picture((0, 0))))
     assert 0.0 < matcher.budgets[0].total_ms <= max(total_ms - 100.0, 1e-6)
     assert matcher.budgets[0].search_ms is None if search_ms is None else matcher.budgets[0].search_ms <= 1900.0
 
 
 def test_odometry_flies_at_the_height_that_fixes_showed(monkeypatch):
     navigator = Navigator(blind(camera=CAMERA), START, options=NavigatorOptions(odometry=True))
-    errors, flown = navigator._errors, frame(picture((0.0, 0.0), LEVEL))
+    errors, flown = navigator._errors, frame(picture((0.0, 0.0)))
     higher = SimpleNamespace(attitude=None, up_m=1.2 * HEIGHT_M, stage="refined")
     for _ in range(5):
         errors.corrected(flown, 0.0, late=False)
         errors.note(higher, 0.0)
     for k in range(2):
-        navigator.update(frame(picture((5.0 * k, 0.0), LEVEL), k * INTERVAL_S))
+        navigator.update(frame(picture((5.0 * k, 0.0)), k * INTERVAL_S))
     assert navigator.ground_motion.moved_m[0] == pytest.approx(5.0 * 1.2, rel=0.05)
 
 

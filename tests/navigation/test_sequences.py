@@ -8,16 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.support.sequences import (
-    IMAGES,
-    METHODS,
-    PRIORS,
-    STAMPS,
-    TELEMETRY,
-    Ground,
-    Step,
-    fly,
-)
+from tests.support.sequences import IMAGES, METHODS, PRIORS, STAMPS, TELEMETRY, Ground, Step, fly
 
 RIGHT = Step("right", "next", "none", "right")
 WORDS = (IMAGES, STAMPS, PRIORS, tuple(TELEMETRY))

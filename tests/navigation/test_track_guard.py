@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -20,8 +18,8 @@ def fix(east_m, north_m=0.0, sigma_m=0.3):
     return a_fix(east_m, north_m, sigma_m)
 
 
-def refused(match):
-    return NoFix(reason=Reason.INCONSISTENT, match=match)
+def refused(result):
+    return lambda east_m: NoFix(reason=Reason.INCONSISTENT, match=result(east_m))
 
 
 class Flight:
@@ -30,19 +28,19 @@ class Flight:
     def __init__(self, guard=None):
         self.guard, self.time_s, self.east_m = guard or TrackGuard(), 0.0, 0.0
 
-    def step(self, result, *, velocity=True, off_mps=0.0):
+    def step(self, result, *, velocity=True, off_mps=0.0, sigma_mps=None):
         """The next frame; its velocity is off to the west."""
         self.time_s += STEP_S
         self.east_m += SPEED_MPS * STEP_S
         east_mps, north_mps = (SPEED_MPS - off_mps, 0.0) if velocity else (None, None)
-        frame = Frame(np.zeros((2, 2), np.uint8), None, 50.0, 0.0, 0.0, 0.0, east_mps, north_mps)
-        self.guard.advance(frame, round(self.time_s * 1e9))
+        told = {"east_velocity_mps": east_mps, "north_velocity_mps": north_mps, "velocity_sigma_mps": sigma_mps}
+        self.guard.advance(Frame(np.zeros((2, 2), np.uint8), None, 50.0, 0.0, **told), round(self.time_s * 1e9))
         trusted = self.guard.trusts(result(self.east_m))
         self.guard.has_fix |= trusted
         return trusted
 
-    def fly(self, seconds, result, *, velocity=True, off_mps=0.0):
-        return [self.step(result, velocity=velocity, off_mps=off_mps) for _ in range(round(seconds / STEP_S))]
+    def fly(self, seconds, result, **told):
+        return [self.step(result, **told) for _ in range(round(seconds / STEP_S))]
 
 
 def true(east_m):
@@ -61,9 +59,9 @@ def shifted(east_m):
     return fix(east_m, 40.0)
 
 
-def noisy(east_m, flight, noise_m, sigma_m):
-    east, north = noise_m[round(flight.time_s / STEP_S) % len(noise_m)]
-    return fix(east_m + east, north, sigma_m)
+def noisy(sigma_m, north_m=0.0):
+    rng = np.random.default_rng(1)
+    return lambda east_m: fix(*rng.normal((east_m, north_m), sigma_m), sigma_m)
 
 
 def covered(_):
@@ -79,8 +77,8 @@ def test_the_first_fix_after_a_covered_camera_is_trusted(flight, cover_s):
 
 @pytest.mark.slow
 def test_a_map_that_shifts_in_flight_is_never_followed_however_long_it_agrees_with_itself(flight):
-    answers = flight.fly(7.0, lambda east_m: refused(shifted(east_m)))
-    answers += flight.fly(8.0, lambda east_m: refused(shifted(east_m)), velocity=False)
+    answers = flight.fly(7.0, refused(shifted))
+    answers += flight.fly(8.0, refused(shifted), velocity=False)
     answers += flight.fly(60.0, shifted, velocity=False)  # the navigator has given in
     assert not any(answers)
     assert flight.guard.is_disputed
@@ -88,7 +86,7 @@ def test_a_map_that_shifts_in_flight_is_never_followed_however_long_it_agrees_wi
 
 @pytest.mark.parametrize(
     ("seconds", "wrong"),
-    [(2.0, lambda east_m: refused(shifted(east_m))), (0.3, lambda east_m: fix(east_m + 30.0))],
+    [(2.0, refused(shifted)), (0.3, lambda east_m: fix(east_m + 30.0))],
     ids=["refused for long", "three fixes"],
 )
 def test_matches_that_return_to_the_track_end_the_dispute(flight, seconds, wrong):
@@ -99,7 +97,7 @@ def test_matches_that_return_to_the_track_end_the_dispute(flight, seconds, wrong
 
 
 def test_a_refused_match_is_never_sent_however_well_it_agrees(flight):
-    assert not any(flight.fly(2.0, lambda east_m: refused(true(east_m))))
+    assert not any(flight.fly(2.0, refused(true)))
     assert flight.step(true)
 
 
@@ -161,20 +159,17 @@ def test_right_fixes_outweigh_a_stated_velocity_that_is_wrong(good_s, off_mps):
 @pytest.mark.parametrize(("off_mps", "sigma_m"), [(2.5, 0.05), (2.5, 1.0), (4.3, 0.3), (8.0, 0.05), (8.0, 1.0)])
 def test_an_outage_with_a_wrong_velocity_is_recovered_from(off_mps, sigma_m):
     """By the fixes' own way it is wrong, and that explains how far off they are: 43 m by 4.3 m/s in 10 s."""
-    noise_m = np.random.default_rng(1).normal(0.0, sigma_m, (200, 2))
-    flight = Flight()
+    flight, seen = Flight(), noisy(sigma_m)
     flight.fly(3.0, true)
     flight.fly(10.0, covered, off_mps=off_mps)
-    answers = flight.fly(10.0, lambda east_m: noisy(east_m, flight, noise_m, sigma_m), off_mps=off_mps)
-    assert all(answers[30:])
-    assert all(flight.fly(5.0, lambda east_m: noisy(east_m, flight, noise_m, sigma_m)))  # it is right again
+    assert all(flight.fly(10.0, seen, off_mps=off_mps)[30:])
+    assert all(flight.fly(5.0, seen))  # it is right again
 
 
 @pytest.mark.parametrize(("cover_s", "sigma_m"), [(0.0, 1.0), (5.0, 0.05), (10.0, 0.05), (10.0, 1.0)])
 def test_a_map_that_shifts_is_not_explained_by_a_velocity_that_is_right(flight, cover_s, sigma_m):
-    noise_m = np.random.default_rng(2).normal((0.0, 40.0), sigma_m, (400, 2))
     flight.fly(cover_s, covered, off_mps=0.5)
-    assert not any(flight.fly(20.0, lambda east_m: noisy(east_m, flight, noise_m, sigma_m), off_mps=0.5))
+    assert not any(flight.fly(20.0, noisy(sigma_m, 40.0), off_mps=0.5))
 
 
 def test_a_map_that_shifts_is_not_explained_by_a_velocity_that_is_known_to_be_wrong():
@@ -187,8 +182,6 @@ def test_a_map_that_shifts_is_not_explained_by_a_velocity_that_is_known_to_be_wr
 @pytest.mark.parametrize(("sigma_mps", "contradicts"), [(None, True), (0.1, True), (5.0, False)])
 def test_a_velocity_counts_with_the_accuracy_that_it_states(sigma_mps, contradicts):
     """10 s without a fix, then matches 40 m aside: too far for 0.5 m/s, not for 5."""
-    guard = TrackGuard(PositionEstimate(np.zeros(2), 1.0))
-    frame = Frame(np.zeros((2, 2), np.uint8), None, 50.0, 0.0, 0.0, 0.0, SPEED_MPS, 0.0)
-    for k in range(101):
-        guard.advance(replace(frame, velocity_sigma_mps=sigma_mps), round(k * STEP_S * 1e9))
-    assert guard.trusts(fix(SPEED_MPS * 10.0, 40.0)) != contradicts
+    flight = Flight(TrackGuard(PositionEstimate(np.zeros(2), 1.0)))
+    flight.fly(10.0, covered, sigma_mps=sigma_mps)
+    assert flight.step(shifted, sigma_mps=sigma_mps) != contradicts

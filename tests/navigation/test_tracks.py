@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine import Fix, Navigator, NavigatorOptions, Prior, Window
+from engine import NavigatorOptions, Prior, Window
 from engine.matching.evidence import nats_of
 from engine.navigation.motion import PositionEstimate, Step, Ways
 from engine.navigation.odds import CERTAIN, MAX_PROBABILITY, MISS, stated_nats
 from engine.navigation.tracks import MAX_TRACKS, Match, Track, Tracks
 from tests.support.fixes import a_fix
-from tests.support.matchers import ScriptedMatcher, at
+from tests.support.matchers import ScriptedMatcher, flown
 
 OPTIONS = NavigatorOptions()
 UNKNOWN = (None, None)  # velocity
@@ -219,14 +219,6 @@ def test_after_refusals_a_new_place_needs_more_evidence():
     assert Match(fix_at(0.0, confidence=1.0 - 1e-9), AREA_M2, refusals=38).support == CERTAIN
 
 
-def test_a_place_is_lost_when_misses_have_eaten_its_odds_and_the_search_has_grown_as_much():
-    track = a_track(support=500.0)
-    while not track.is_lost:
-        track = track.missed()
-    assert track.misses == math.ceil(CERTAIN / MISS) == 14
-    assert track.widened**2 == pytest.approx(math.exp(CERTAIN))
-
-
 @given(places=st.lists(st.tuples(st.floats(-500, 500), st.floats(-500, 500)), min_size=1, max_size=60))
 @settings(max_examples=40)
 def test_the_set_is_bounded_and_sorted_and_holds_two_motions_of_each_account(places):
@@ -245,13 +237,9 @@ def test_the_set_is_bounded_and_sorted_and_holds_two_motions_of_each_account(pla
 
 def fly(places, confidence=0.9999, seconds=1.0, velocity=UNKNOWN, priors=None, sigma_m=1.0, start=None):
     """Which frames, so many seconds apart, are fixed, and the navigator."""
-    answers = (place and fix_at(*place, confidence, sigma_m) for place in places)
-    navigator, fixed = Navigator(ScriptedMatcher(*answers), start), []
-    for k in range(len(places)):
-        told = velocity[k] if isinstance(velocity, list) else velocity
-        if isinstance(navigator.update(at(k * seconds, told), priors and priors[k]), Fix):
-            fixed.append(k)
-    return fixed, navigator
+    matcher = ScriptedMatcher(*(place and fix_at(*place, confidence, sigma_m) for place in places))
+    run = flown(matcher, start, every_s=seconds, velocity=velocity, given=priors)
+    return run.fixed, run.navigator
 
 
 def test_chance_never_adds_up():
@@ -273,25 +261,22 @@ def test_photographs_seconds_apart_are_fixes_with_and_without_positions_of_their
 def test_an_attitude_that_nothing_confirmed_does_not_outweigh_a_start_however_often(stage, first):
     """Its error moves all matches by 80 m alike: they agree with each other, and not with the start."""
     fixes = [replace(fix_at(80.0 + 1.4 * k), stage=stage) for k in range(20)]
-    navigator = Navigator(ScriptedMatcher(*fixes), Prior(east_m=0.0, north_m=0.0, sigma_m=10.0))
-    fixed = [isinstance(navigator.update(at(0.2 * k, (7.0, 0.0))), Fix) for k in range(20)]
-    assert fixed == [first is not None and k >= first for k in range(20)]
+    start = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0)
+    run = flown(ScriptedMatcher(*fixes), start, every_s=0.2, velocity=(7.0, 0.0))
+    assert run.fixed == ([] if first is None else list(range(first, 20)))
 
 
 @pytest.mark.parametrize("stage", ["coarse", "unconfirmed"])
 def test_an_attitude_that_nothing_confirmed_is_believed_where_the_start_predicts(stage):
     fixes = [replace(fix_at(1.4 * k), stage=stage) for k in range(20)]
-    navigator = Navigator(ScriptedMatcher(*fixes), Prior(east_m=3.0, north_m=0.0, sigma_m=10.0))
-    assert all(isinstance(navigator.update(at(0.2 * k, (7.0, 0.0))), Fix) for k in range(20))
+    start = Prior(east_m=3.0, north_m=0.0, sigma_m=10.0)
+    assert len(flown(ScriptedMatcher(*fixes), start, every_s=0.2, velocity=(7.0, 0.0)).fixed) == 20
 
 
 def test_telemetry_that_leads_nowhere_is_left_in_turns():
     """It is right 99 times in 100: after seven refusals every third frame searches the whole map."""
-    script = ScriptedMatcher(*[None] * 18)
-    navigator = Navigator(script)
-    for k in range(18):
-        navigator.update(at(k), Prior(east_m=0.0, north_m=0.0, sigma_m=15.0))
-    assert [k for k, prior in enumerate(script.priors) if prior is None] == [9, 12, 15]
+    run = flown(ScriptedMatcher(*[None] * 18), given=[Prior(east_m=0.0, north_m=0.0, sigma_m=15.0)] * 18)
+    assert [k for k, prior in enumerate(run.priors) if prior is None] == [9, 12, 15]
 
 
 # Velocities that are wrong
@@ -306,7 +291,7 @@ FAULTS = {
 }
 
 
-def flown(told=lambda v: v, seconds=30.0, rate_hz=5.0, seed=1):
+def measured(told=lambda v: v, seconds=30.0, rate_hz=5.0, seed=1):
     """How many frames are refused of a vehicle that turns and brakes, and the navigator."""
     rng, count = np.random.default_rng(seed), int(seconds * rate_hz)
     place, places, velocities, phase = np.zeros(2), [], [], rng.uniform(0, 2 * math.pi)
@@ -325,7 +310,7 @@ def flown(told=lambda v: v, seconds=30.0, rate_hz=5.0, seed=1):
 @pytest.mark.parametrize("rate_hz", [1.0, 5.0, pytest.param(30.0, marks=pytest.mark.slow)])
 def test_a_right_velocity_costs_no_fix_and_is_believed(rate_hz):
     for seed in range(6):
-        refused, navigator = flown(rate_hz=rate_hz, seed=seed)
+        refused, navigator = measured(rate_hz=rate_hz, seed=seed)
         assert refused == 0
         assert navigator._moments[-1].tracks.best.trusts_velocity
 
@@ -333,7 +318,7 @@ def test_a_right_velocity_costs_no_fix_and_is_believed(rate_hz):
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_wrong_velocity_costs_few_fixes_and_is_not_believed_for_long(fault):
     for seed in range(3):
-        refused, navigator = flown(FAULTS[fault], seed=seed)
+        refused, navigator = measured(FAULTS[fault], seed=seed)
         assert refused <= 8
         assert navigator.reset_count == 0
 

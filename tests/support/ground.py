@@ -135,10 +135,13 @@ class Ground:
         return np.clip(np.rint(self.levels(enu_m[..., 0], enu_m[..., 1])), 0, 255).astype(np.uint8)
 
     def picture(self, camera, nadir_px, height_m, **attitude):
-        """What the camera sees above a map pixel (x, y): one ray a pixel, onto flat ground."""
+        """What the camera sees above a map pixel (x, y)."""
+        return self.picture_from(camera, self.enu_from_pixel(nadir_px), height_m, **attitude)
+
+    def picture_from(self, camera, place_m, height_m, **attitude):
+        """What the camera sees above true east and north: one ray a pixel, onto flat ground."""
         rays = rays_of(camera, pixels_of(camera.height_px, camera.width_px), **attitude)
-        hits = rays[..., :2] * (height_m / -rays[..., 2:])
-        return self.seen_at(hits + self.enu_from_pixel(nadir_px))
+        return self.seen_at(place_m + rays[..., :2] * (height_m / -rays[..., 2:]))
 
     def frame(self, camera, nadir_px, height_m=150.0, *, timestamp_ns=0, **attitude):
         """The picture with the telemetry that is true of it."""

@@ -37,10 +37,14 @@ class MapServer(ThreadingHTTPServer):
 
     def __init__(self, raster: Path, files: Path) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
-        self.raster, self.files = raster, files
+        self.files, self.over = files, threading.Event()
+        self.begin(raster)
+
+    def begin(self, raster: Path) -> None:
+        """As nobody has asked it yet."""
+        self.raster = raster
         self.asked: list[str] = []
         self.agents: set[str] = set()
-        self.over = threading.Event()
         self.trouble: list[tuple[str, object]] = []  # part of a path and what happens, once each
         self.wms_version, self.most_px, self.layers, self.kvp = "1.3.0", 200, ("ortho",), False
 

@@ -1,4 +1,4 @@
-"""A matcher for navigators that answers from a list, over a map that is none, and frames for it."""
+"""A matcher for navigators that answers from a list, over a map that is none, and flights of frames by it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from engine import Fix, Frame, NoFix, Reason
+from engine import Fix, Frame, Navigator, NavigatorOptions, NoFix, Prior, Reason
 
 _NUMBERS = itertools.count()
 
@@ -49,3 +49,37 @@ class ScriptedMatcher:
         if isinstance(answer, Fix):
             return replace(answer, timestamp_ns=frame.timestamp_ns)
         return NoFix(reason=answer or Reason.LOW_SCORE, timestamp_ns=frame.timestamp_ns)
+
+
+def flown(
+    matcher: ScriptedMatcher, start: Prior | None = None, *, every_s: float = 1.0, seconds: Any = None,
+    velocity: Any = (None, None), given: list[Prior | None] | None = None, options: NavigatorOptions | None = None,
+) -> SimpleNamespace:  # fmt: skip
+    """A frame for each of a matcher's answers.
+
+    Args:
+        matcher: which keeps what it was asked.
+        start: where the flight begins.
+        every_s: between frames.
+        seconds: of each frame, in place of an interval.
+        velocity: of all frames, or a list of each one's.
+        given: priors of the frames.
+        options: of the navigator.
+
+    Returns:
+        SimpleNamespace: ``results`` and their ``ends``, the indices of those ``fixed``, what the navigator said
+        after each (``states``, ``healthy``, ``ages_s``, ``predictions``), ``priors`` that it asked, and itself.
+    """
+    navigator = Navigator(matcher, start, options=options)
+    run = SimpleNamespace(results=[], states=[], healthy=[], ages_s=[], predictions=[])
+    for k, at_s in enumerate(seconds or [every_s * k for k in range(len(matcher.answers))]):
+        frame = at(at_s, velocity[k] if isinstance(velocity, list) else velocity)
+        run.results.append(navigator.update(frame, given and given[k]))
+        run.states.append(navigator.state.name)
+        run.healthy.append(navigator.healthy)
+        run.ages_s.append(navigator.anchor_age_s)
+        run.predictions.append(navigator.prediction)
+    run.ends = ["fix" if isinstance(result, Fix) else result.reason.value for result in run.results]
+    run.fixed = [k for k, end in enumerate(run.ends) if end == "fix"]
+    run.priors, run.navigator = matcher.priors, navigator
+    return run

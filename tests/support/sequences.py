@@ -12,22 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
-from engine import (
-    Camera,
-    EngineError,
-    Fix,
-    Frame,
-    MatcherOptions,
-    Navigator,
-    NoFix,
-    OrthoMap,
-    Prior,
-    SceneMatcher,
-)
+from engine import Camera, EngineError, Fix, Frame, MatcherOptions, Navigator, NoFix, Prior, SceneMatcher
 from engine.options import PoseOptions, SiftOptions
+from tests.support import ground
 
 SIDE_PX, MAP_PX, GSD_M = 64, 192, 0.5
 HEIGHT_M = GSD_M * SIDE_PX / (2.0 * math.tan(math.radians(30.0)))  # a pixel of the frame is one of the map
@@ -71,16 +60,12 @@ class Ground:
     """A tiny map with its matchers, and the frames that are taken over it."""
 
     def __init__(self) -> None:
-        rng = np.random.default_rng(3)
-        fine, broad = (cv2.GaussianBlur(rng.normal(size=(MAP_PX, MAP_PX)), (0, 0), s) for s in (1.0, 4.0))
-        mixed = fine / fine.std() + broad / broad.std()
-        self.gray = np.clip(128.0 + 35.0 * mixed, 0, 255).astype(np.uint8)
-        to_crs = np.array([[GSD_M, 0.0, 5e5], [0.0, -GSD_M, 5.3e6]])
-        self.site = OrthoMap.from_arrays(self.gray, to_crs, "EPSG:32633")
-        self.camera = Camera.from_fov(SIDE_PX, SIDE_PX, 60.0)
+        drawn = ground.Ground(size=(MAP_PX, MAP_PX), gsd_m=GSD_M)
+        self.gray, self.site = drawn.gray, drawn.site
+        camera = Camera.from_fov(SIDE_PX, SIDE_PX, 60.0)
         # The frame is too small to be halved, and for matches 16 px apart to be many.
         options = MatcherOptions(sift=SiftOptions(scale=1.0, pose=PoseOptions(distinct_px=4.0)))
-        self.matchers = {m: SceneMatcher(self.site, self.camera, m, "cpu", options) for m in METHODS}
+        self.matchers = {m: SceneMatcher(self.site, camera, m, "cpu", options) for m in METHODS}
 
     def frame(self, step: Step, stamp_ns: int | None, time_ns: int) -> Frame:
         """The frame of a step; the vehicle flies along the map's diagonal and back."""
@@ -125,7 +110,7 @@ def stamp_after(kind: str, newest_ns: int, number: int) -> int | None:
     return newest_ns + round(STAMPS_S[kind] * SECOND) + number * (kind == "before")
 
 
-def fly(ground: Ground, steps: Sequence[Step], method: str, *, start: bool) -> Counter[str]:
+def fly(over: Ground, steps: Sequence[Step], method: str, *, start: bool) -> Counter[str]:
     """Fly a sequence; returns how often each ending came.
 
     Raises:
@@ -133,13 +118,13 @@ def fly(ground: Ground, steps: Sequence[Step], method: str, *, start: bool) -> C
             frame's stamp.
     """
     newest_ns = SECOND
-    begin = ground.prior(Step("right", "next", "right", "right"), newest_ns) if start else None
-    navigator, endings, resets = Navigator(ground.matchers[method], begin), Counter[str](), 0
+    begin = over.prior(Step("right", "next", "right", "right"), newest_ns) if start else None
+    navigator, endings, resets = Navigator(over.matchers[method], begin), Counter[str](), 0
     for number, step in enumerate(steps):
         stamp = stamp_after(step.stamp, newest_ns, number)
         time_ns = newest_ns if stamp is None else stamp
         try:
-            result = navigator.update(ground.frame(step, stamp, time_ns), ground.prior(step, time_ns))
+            result = navigator.update(over.frame(step, stamp, time_ns), over.prior(step, time_ns))
         except EngineError as error:
             endings[type(error).__name__] += 1
             continue
