@@ -7,25 +7,22 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from engine.camera import Camera
 from engine.errors import (
     CalibrationError,
     DtypeError,
-    EngineError,
     MapError,
     OptionError,
     ShapeError,
-    TelemetryError,
 )
 from engine.values import Frame, NoFix, Prior, Reason, Truth, Window
 from scenematch.files.flight import open_flight, write_flight_folder
 from scenematch.files.frames import open_frames, read_image
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.telemetry import (
+    BOUNDS,
     DEFAULT_PRIOR_SIGMA_M,
     TelemetryRow,
     ground_amsl_m,
@@ -42,16 +39,6 @@ from tests.support.videos import write_video
 FLIGHTS = {"gazebo-a1": (627, 0), "gazebo-a2": (591, 0), "caliterra": (37, 0), "nust": (271, 1081)}
 
 HEADER = "timestamp_ns,frame,height_agl_m,heading_deg,lat_deg,lon_deg\n"
-
-
-@pytest.fixture
-def save(tmp_path):
-    def write(text, name="telemetry.csv"):
-        path = tmp_path / name
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return path
-
-    return write
 
 
 def picture(value, size=(8, 6)):
@@ -105,35 +92,22 @@ def test_a_prior_without_sigma_takes_the_default(save):
     assert rows[1].prior == Prior(lat_deg=32.5, lon_deg=35.25, sigma_m=4.0)
 
 
-def cells(number, low=-180.0, high=180.0):
-    return st.none() | st.integers(int(low * 10**number), int(high * 10**number)).map(lambda v: v / 10**number)
-
-
-@given(
-    st.lists(
-        st.builds(
-            TelemetryRow,
-            timestamp_ns=st.integers(-(2**63) // 10**8 + 1, 2**63 // 10**8).map(lambda v: v * 10**8),
-            frame=st.from_regex(r"[a-z0-9,\"]{1,6}\.jpg", fullmatch=True),
-            height_agl_m=cells(3, 0.001, 9000),
-            alt_amsl_m=cells(3, -500, 9000),
-            heading_deg=cells(4, 0, 359.9),
-            roll_deg=cells(4),
-            pitch_deg=cells(4, -90, 90),
-            east_velocity_mps=cells(4),
-            sigma_m=cells(3, 0, 500),
-        ),
-        min_size=1,
-        max_size=6,
-        unique_by=(lambda row: row.timestamp_ns, lambda row: row.frame),
-    ),
-    st.tuples(cells(9, -90, 90).filter(lambda v: v is not None), cells(9).filter(lambda v: v is not None)),
-)
-@settings(max_examples=25, deadline=None)
-def test_telemetry_round_trip(tmp_path_factory, rows, place):
-    path = tmp_path_factory.mktemp("t") / "telemetry.csv"
-    rows.sort(key=lambda row: row.timestamp_ns)
-    rows[0] = dataclasses.replace(rows[0], lat_deg=place[0], lon_deg=place[1])
+def test_telemetry_round_trip(tmp_path):
+    """With values at the ends of their ranges, unknown cells, stamps before 1970 and a name that needs quotes."""
+    path, second = tmp_path / "telemetry.csv", 10**9
+    known = {name: 1.25 + k for k, name in enumerate(BOUNDS)}
+    ends = {
+        "heading_deg": 359.9,
+        "roll_deg": -180.0,
+        "pitch_deg": 90.0,
+        "lat_deg": -90.0,
+        "lon_deg": 179.123456789,
+    }
+    rows = [
+        TelemetryRow(timestamp_ns=-(2**62) // second * second, frame='a,"b".jpg', **known),
+        TelemetryRow(timestamp_ns=-second, frame="b.jpg"),
+        TelemetryRow(timestamp_ns=2**62 // second * second, frame="c.jpg", **ends, alt_amsl_m=-500.0),
+    ]
     write_telemetry(path, rows)
     assert read_telemetry(path) == rows
 
@@ -192,19 +166,6 @@ def test_missing_telemetry_and_a_folder_in_its_place_are_refused(tmp_path):
     assert refusal(read_telemetry, tmp_path / "none.csv").endswith("none.csv: no such file")
     assert "cannot be read" in refusal(read_telemetry, tmp_path)
     assert "cannot be written" in refusal(write_telemetry, tmp_path / "none" / "t.csv", [])
-
-
-@given(st.binary(max_size=200))
-@settings(max_examples=150, deadline=None)
-def test_garbage_never_raises_anything_but_the_engines_error(tmp_path_factory, content):
-    path = tmp_path_factory.getbasetemp() / "garbage.csv"
-    for start in (b"", HEADER.encode(), HEADER.encode() + b"1,a,"):
-        path.write_bytes(start + content)
-        for read in (read_telemetry, read_truth, read_track):
-            try:
-                read(path)
-            except EngineError as error:
-                assert "\n" not in str(error)  # noqa: PT017
 
 
 def test_ground_is_the_median_difference_of_the_two_heights():
@@ -411,10 +372,9 @@ def test_metadata_in_a_video_is_refused_with_the_way_out(folder, tmp_path, name)
     """The first bytes are those of a transport stream and of a UAS data link's packet (MISB ST 0601)."""
     path = tmp_path / name
     path.write_bytes(b"\x47\x40\x11" + bytes.fromhex("060e2b34020b01010e01030101000000"))
-    with pytest.raises(TelemetryError) as caught:
-        open_flight(folder, path)
-    assert str(caught.value).startswith(f"{path}: expected a table or a flight log, got a video's metadata")
-    assert "convert it to a .SRT" in str(caught.value)
+    message = refusal(open_flight, folder, path)
+    assert message.startswith(f"{path}: expected a table or a flight log, got a video's metadata")
+    assert "convert it to a .SRT" in message
 
 
 def test_without_telemetry_frames_come_bare(folder, video):
