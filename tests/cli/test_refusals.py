@@ -43,7 +43,8 @@ LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
         *((command, "--device", "gpu") for command in (PLAYED, ROS, TRACK, LOCATE)),
         (PLAYED, "--firmware", "x"),
-        (PLAYED, "mavlink.message", "x"),
+        *((PLAYED, "--connect", value) for value in ("nonsense", "udpin:0.0.0.0:14550")),
+        *((PLAYED, "mavlink.message", value) for value in ("x", "global_position_sensor")),  # which is PX4's
         (PLAYED, "mavlink.max_sigma_m", "1e308"),
         *((PLAYED, "mavlink.component_id", value) for value in ("1", "0", "256")),  # an autopilot, a broadcast
         (ROS, "--firmware", "x"),
