@@ -25,16 +25,6 @@ NAMES = {
 PLACE = "[telemetry_columns] of the settings names those that are ours"
 
 
-@pytest.fixture
-def save(tmp_path):
-    def write(text):
-        path = tmp_path / "telemetry.csv"
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return write
-
-
 def test_named_columns_are_read_and_the_others_told_in_one_line(save):
     names = {ours: theirs for ours, theirs in NAMES.items() if theirs != "Yaw"}
     found = open_telemetry(save(OTHERS + MORE), names=names)

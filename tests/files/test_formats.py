@@ -32,11 +32,8 @@ from scenematch.files.telemetry import (
 from scenematch.files.track import COLUMNS, TrackRow, TrackWriter, read_track, track_row, write_track
 from scenematch.files.truth import interpolate_truth, read_truth, write_truth
 from tests.support.fixes import a_fix
-from tests.support.paths import SHARED
 from tests.support.refusals import refusal
 from tests.support.videos import write_video
-
-FLIGHTS = {"gazebo-a1": (627, 0), "gazebo-a2": (591, 0), "caliterra": (37, 0), "nust": (271, 1081)}
 
 HEADER = "timestamp_ns,frame,height_agl_m,heading_deg,lat_deg,lon_deg\n"
 
@@ -421,24 +418,6 @@ def test_a_frame_without_a_stamp_cannot_be_written(tmp_path):
     inputs = {"frames": [("a.png", Frame(picture(1)))], "truth": [], "camera": Camera.from_fov(8, 6, 60.0)}
     message = refusal(write_flight_folder, tmp_path, **inputs, **WORLD)
     assert "a.png: timestamp_ns: expected a stamp" in message
-
-
-@pytest.mark.parametrize("name", FLIGHTS)
-def test_reads_the_shared_flights(name):
-    directory = SHARED / name
-    if not directory.is_dir():
-        pytest.skip(f"no flight {name} under {SHARED}")
-    frames = directory / "flight.mp4" if name == "nust" else directory / "frames"
-    camera = Camera.load(directory / "camera.yaml")
-    flight = open_flight(frames, directory / "telemetry.csv", camera)
-    truth = read_truth(directory / "truth.csv")
-    assert (len(flight), flight.unused) == FLIGHTS[name]
-    iterator = iter(flight)
-    for item in (next(iterator), next(iterator)):
-        camera.check_size(item.frame.image.shape)
-        assert item.frame.height_agl_m > 20.0
-        assert interpolate_truth(truth, item.frame.timestamp_ns) is not None
-        assert (item.prior is not None) == (name == "caliterra")
 
 
 # -------------------------------------------------------------------------------------------------- GeoTIFF
