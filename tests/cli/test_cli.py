@@ -378,41 +378,32 @@ def test_an_output_folder_that_cannot_be_made(flight, tmp_path, capsys, monkeypa
     assert f"{tmp_path / 'out'}: Permission denied" in line
 
 
-def test_an_error_in_the_middle_of_a_flight_names_the_frame_and_keeps_the_rows(
-    flight, tmp_path, capsys, monkeypatch
-):
-    def failing(self, frame, prior=None):
-        if frame.timestamp_ns == int(cells(flight / "telemetry.csv")[2]["timestamp_ns"]):
-            raise OptionError("sigma_m: expected 0 m or more, got nan")
-        return original(self, frame, prior)
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (OptionError("sigma_m: expected 0 m or more, got nan"), 1, ["000002.jpg", "sigma_m"]),
+        (KeyboardInterrupt(), 130, ["interrupted"]),
+    ],
+    ids=["error", "Ctrl-C"],
+)
+def test_a_run_that_ends_in_the_middle_keeps_its_rows(error, code, words, flight, tmp_path, capsys, monkeypatch):
+    update, third = track_module.Navigator.update, int(cells(flight / "telemetry.csv")[2]["timestamp_ns"])
 
-    original = track_module.Navigator.update
+    def failing(self, frame, prior=None):
+        if frame.timestamp_ns == third:
+            raise error
+        return update(self, frame, prior)
+
     monkeypatch.setattr(track_module.Navigator, "update", failing)
     out = tmp_path / "out"
-    line = refusal(capsys, track(flight, out), 1)
-    assert "000002.jpg" in line
-    assert "sigma_m" in line
+    line = refusal(capsys, track(flight, out), code)
+    assert all(word in line for word in words)
     assert len(cells(out / "track.csv")) == 2
+    assert not (out / "summary.json").exists()
+    assert "summary.json" in refusal(capsys, ["evaluate", out], 1)
 
 
 # ------------------------------------------------------------------------------------------- interruption
-
-
-def test_an_interrupted_run_keeps_its_rows(flight, tmp_path, capsys, monkeypatch):
-    out, seen = tmp_path / "out", []
-
-    def interrupting(*args, **kwargs):
-        seen.append(args)
-        if len(seen) == 4:
-            raise KeyboardInterrupt
-        return original(*args, **kwargs)
-
-    original = track_module.track_row
-    monkeypatch.setattr(track_module, "track_row", interrupting)
-    assert "interrupted" in refusal(capsys, track(flight, out), 130)
-    assert len(cells(out / "track.csv")) == 3
-    assert not (out / "summary.json").exists()
-    assert "summary.json" in refusal(capsys, ["evaluate", out], 1)
 
 
 def test_the_learned_method_says_what_is_wrong_with_its_weights(flight, tmp_path, capsys):

@@ -16,15 +16,14 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.serde import utils as serde_utils
 from rosbags.typesys import Stores, get_typestore
 
-from bench.inputs.bags import BAG_KINDS, BagMessages, flight_bag, write_bag
+from bench.inputs.bags import BAG_KINDS, BagMessages, write_bag
 from engine.camera import Camera
 from engine.errors import MissingExtraError, OptionError, TelemetryError
 from engine.values import Frame, Prior, Truth
 from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import open_truth
 from scenematch.files.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, read_bag, read_bag_camera
-from scenematch.runs.inputs import FlightFiles, open_inputs
-from scenematch.runs.settings import TrackSettings
+from scenematch.runs.inputs import FlightFiles
 from tests.support.odometries import odometry_message, twist_message
 from tests.support.refusals import refusal
 
@@ -69,6 +68,9 @@ def a_flight(count=5):
     return frames, truth
 
 
+COMPARED = "height_agl_m", "roll_deg", "pitch_deg", "heading_deg", "east_velocity_mps", "north_velocity_mps"
+
+
 def a_bag(folder, kind, count=5):
     path = folder / ("flight.bag" if kind == "ros1" else kind)
     frames, truth = a_flight(count)
@@ -93,27 +95,30 @@ def test_pictures_come_back_byte_for_byte(bag):
 
 def test_a_flight_comes_back(bag):
     path, frames, truth = bag
-    flight = open_flight(path, camera=read_bag_camera(path))
-    assert len(flight) == len(frames)
-    for k, (item, frame) in enumerate(zip(flight, frames, strict=True)):
-        assert item.frame.timestamp_ns == frame.timestamp_ns
-        for name in ("height_agl_m", "roll_deg", "pitch_deg", "east_velocity_mps", "north_velocity_mps"):
-            assert getattr(item.frame, name) == pytest.approx(getattr(frame, name), abs=1e-9)
-        assert item.frame.heading_deg == pytest.approx(frame.heading_deg, abs=1e-9)
-        assert (item.prior is not None) == (k <= 1)  # a position holds for a tenth of a second
-    prior = next(iter(flight)).prior
-    assert (prior.lat_deg, prior.lon_deg) == pytest.approx((48.2001, 15.1001), abs=1e-12)
-    assert prior.sigma_m == pytest.approx(12.0)
-    for row, true in zip(open_truth(path, frames[0].timestamp_ns), truth, strict=True):
-        for name in Truth.__slots__:
-            assert getattr(row, name) == pytest.approx(getattr(true, name), abs=1e-9)
-
-
-def test_the_calibration_comes_back_but_its_mount(bag):
-    camera = read_bag_camera(bag[0])
+    files = FlightFiles(map="m.tif", frames=path, truth=path)
+    flight = files.open_flight()
+    camera = files.load_camera(flight)
     assert (camera.width_px, camera.height_px, camera.distortion_model) == (31, 23, "plumb_bob")
     assert np.array_equal(camera.matrix, CAMERA.matrix)
     assert np.array_equal(camera.distortion, CAMERA.distortion)
+    assert len(flight) == len(frames)
+    for k, (item, frame) in enumerate(zip(flight, frames, strict=True)):
+        assert item.frame.timestamp_ns == frame.timestamp_ns
+        for name in (
+            "height_agl_m",
+            "roll_deg",
+            "pitch_deg",
+            "heading_deg",
+            "east_velocity_mps",
+            "north_velocity_mps",
+        ):
+            assert getattr(item.frame, name) == pytest.approx(getattr(frame, name), abs=1e-9)
+        assert (item.prior is not None) == (k <= 1)  # a position holds for a tenth of a second
+    prior = next(iter(flight)).prior
+    assert (prior.lat_deg, prior.lon_deg, prior.sigma_m) == pytest.approx((48.2001, 15.1001, 12.0), abs=1e-12)
+    for row, true in zip(open_truth(path, frames[0].timestamp_ns), truth, strict=True):
+        for name in Truth.__slots__:
+            assert getattr(row, name) == pytest.approx(getattr(true, name), abs=1e-9)
 
 
 def test_others_read_what_is_written(bag):
@@ -316,22 +321,6 @@ def test_a_folder_whose_description_is_damaged_is_one_line(tmp_path):
 
 
 # ------------------------------------------------------------------------------------------------- of a run
-
-
-def test_a_folder_that_becomes_a_bag_gives_a_run_the_same_inputs(flight_in, tmp_path):
-    """Angles that went through a quaternion differ in the last bits."""
-    folder = flight_in(tmp_path / "flight", frames=3)
-    flight_bag(tmp_path / "flight", tmp_path / "flight.bag")
-    of_bag = FlightFiles(map=folder.map, frames=tmp_path / "flight.bag", truth=tmp_path / "flight.bag")
-    one, other = (open_inputs(files, [TrackSettings()]) for files in (folder, of_bag))
-    for mine, theirs in zip(one.flight, other.flight, strict=True):
-        assert mine.frame.timestamp_ns == theirs.frame.timestamp_ns
-        assert np.array_equal(mine.frame.image, theirs.frame.image)
-        for name in ("height_agl_m", "roll_deg", "pitch_deg", "heading_deg", "east_velocity_mps"):
-            assert getattr(theirs.frame, name) == pytest.approx(getattr(mine.frame, name), abs=1e-9), name
-    for name in ("matrix", "distortion", "mount"):
-        assert np.array_equal(getattr(one.camera, name), getattr(other.camera, name)), name
-    assert [row.lat_deg for row in other.truth] == pytest.approx([row.lat_deg for row in one.truth], abs=1e-12)
 
 
 def test_topics_of_the_calibration(tmp_path, maker):

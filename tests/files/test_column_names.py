@@ -56,21 +56,16 @@ def test_the_settings_name_them(tmp_path):
     assert options_from_mapping(TrackSettings, nested(recorded)) == settings
 
 
-def test_a_run_reads_them_by_its_settings(tmp_path):
+def test_a_run_reads_them_by_its_settings(tmp_path, save):
     (tmp_path / "frames").mkdir()
     for k in range(2):
         Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "frames" / f"{k}.png")
-    table = tmp_path / "export.csv"  # as a database's shell writes it
-    rows = "2026-05-01 12:00:00.000;0.png;120.5\n2026-05-01 12:00:00.500;1.png;121.5\n"
-    table.write_text("time;image;agl\n" + rows, encoding="utf-8")
-    files = FlightFiles.from_flat(map="none.tif", frames=tmp_path / "frames", telemetry=table, hfov_deg=60.0)
-    flight = files.open_flight({"timestamp_utc": "time", "frame": "image", "height_agl_m": "agl"})
-    assert [row.timestamp_ns for row in flight.rows] == [1_777_636_800_000_000_000, 1_777_636_800_500_000_000]
+    given = {"map": "none.tif", "frames": tmp_path / "frames", "hfov_deg": 60.0}
+    flight = FlightFiles.from_flat(**given, telemetry=save(OTHERS + MORE)).open_flight(NAMES)
     assert [row.height_agl_m for row in flight.rows] == [120.5, 121.5]
-    assert flight.remarks == []
-    bare = FlightFiles.from_flat(map="none.tif", frames=tmp_path / "frames", hfov_deg=60.0)
+    assert len(flight.remarks) == 1
     with pytest.raises(OptionError, match="telemetry_columns: expected a table as telemetry, got None"):
-        bare.open_flight({"frame": "image"})
+        FlightFiles.from_flat(**given).open_flight({"frame": "image"})
 
 
 def test_runs_of_one_flight_name_the_same(tmp_path, monkeypatch):
