@@ -692,20 +692,25 @@ def test_an_empty_name_leaves_a_topic_out(maker, node, sim_site):
 # ---------------------------------------------------------------------------------- the nodes, on stand-ins
 
 
-@pytest.fixture
-def packages(monkeypatch):
-    """ROS' message packages, with rosbags' classes in them."""
+def stand_in(patch, name, **holds):
+    """A module with these names in it, in place of one that is not installed."""
+    module = ModuleType(name)
+    vars(module).update(holds)
+    patch.setitem(sys.modules, name, module)
+
+
+def packages_of(patch, ros):
+    """ROS' message packages, with rosbags' classes in them, and no settings of ROS in the environment."""
     made = {}
-    for name, kind in STORES["ros2"].types.items():
+    for name, kind in STORES[ros].types.items():
         package, _, short = name.split("/")
-        if f"{package}.msg" not in made:
-            made[package], made[f"{package}.msg"] = ModuleType(package), ModuleType(f"{package}.msg")
-        setattr(made[f"{package}.msg"], short, kind)
-    for name, module in made.items():
-        monkeypatch.setitem(sys.modules, name, module)
+        made.setdefault(package, {})[short] = kind
+    for package, kinds in made.items():
+        stand_in(patch, package)
+        stand_in(patch, f"{package}.msg", **kinds)
     for variable in ("ROS_IP", "ROS_HOSTNAME", "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
-        monkeypatch.setenv(variable, "")
-        monkeypatch.delenv(variable)
+        patch.setenv(variable, "")
+        patch.delenv(variable)
 
 
 class ShutdownError(Exception):
@@ -769,20 +774,17 @@ class Rclpy(ModuleType):
 
 
 @pytest.fixture
-def rclpy_with(packages, monkeypatch):
+def rclpy_with(monkeypatch):
+    packages_of(monkeypatch, "ros2")
+
     def make(messages=(), **options):
         rclpy = Rclpy(dict(messages), **options)
         monkeypatch.setitem(sys.modules, "rclpy", rclpy)
-        for name, holds in {
-            "rclpy.qos": {"qos_profile_sensor_data": "best effort"},
-            "rclpy.exceptions": {"NameValidationException": NameValidationError},
-            "rclpy.executors": {"ExternalShutdownException": ShutdownError},
-            "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO="none")},
-            "rcl_interfaces.msg": {"ParameterDescriptor": SimpleNamespace},
-        }.items():
-            module = ModuleType(name)
-            vars(module).update(holds)
-            monkeypatch.setitem(sys.modules, name, module)
+        stand_in(monkeypatch, "rclpy.qos", qos_profile_sensor_data="best effort")
+        stand_in(monkeypatch, "rclpy.exceptions", NameValidationException=NameValidationError)
+        stand_in(monkeypatch, "rclpy.executors", ExternalShutdownException=ShutdownError)
+        stand_in(monkeypatch, "rclpy.signals", SignalHandlerOptions=SimpleNamespace(NO="none"))
+        stand_in(monkeypatch, "rcl_interfaces.msg", ParameterDescriptor=SimpleNamespace)
         return rclpy
 
     return make
@@ -898,18 +900,14 @@ class Rospy(ModuleType):
         return self.messages[topic]
 
 
-def test_the_ros1_node_hears_and_publishes(packages, monkeypatch, sim_site):
+def test_the_ros1_node_hears_and_publishes(monkeypatch, sim_site):
     maker = maker_of("ros1")
-    for name, kind in STORES["ros1"].types.items():
-        package, _, short = name.split("/")
-        if f"{package}.msg" in sys.modules:
-            setattr(sys.modules[f"{package}.msg"], short, kind)
+    packages_of(monkeypatch, "ros1")
     rospy = Rospy({RosTopics().image: an_image(maker, NOW_NS)})
-    genpy, rosgraph = ModuleType("genpy"), ModuleType("rosgraph")
-    genpy.Time = lambda secs, nsecs: SimpleNamespace(secs=secs, nsecs=nsecs)
-    rosgraph.is_master_online, rosgraph.get_master_uri = (lambda: rospy.named is None), (lambda: "http://here")
-    for module in (rospy, genpy, rosgraph):
-        monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(sys.modules, "rospy", rospy)
+    stand_in(monkeypatch, "genpy", Time=lambda secs, nsecs: SimpleNamespace(secs=secs, nsecs=nsecs))
+    online = {"is_master_online": lambda: rospy.named is None, "get_master_uri": lambda: "http://here"}
+    stand_in(monkeypatch, "rosgraph", **online)
     from scenematch.bridges import ros1
 
     node = ros1.Node("scenematch", ["/a:=/b"])
