@@ -11,6 +11,7 @@ import threading
 import time
 from functools import partial
 from types import ModuleType, SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -928,27 +929,15 @@ def test_the_ros1_node_hears_and_publishes(monkeypatch, sim_site):
 
 def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, node, flight, monkeypatch):
     """Of its field of view; nothing but the picture's topic is waited for."""
-
-    asked, pictures = [], [an_image(maker, NOW_NS, (30, 40, 3)), None]
-
-    def wait_for(*topic_type_timeout):
-        asked.append(topic_type_timeout[:2])
-        return pictures.pop(0)
-
-    class LoadedError(Exception):
-        """Ends the run where the camera is known."""
-
-    def matcher(site, camera, *_):
-        raise LoadedError(camera)
-
+    node.wait_for = Mock(side_effect=[an_image(maker, NOW_NS, (30, 40, 3)), None])
+    matcher = Mock(side_effect=LookupError)  # ends the run where the camera is known
     monkeypatch.setattr("scenematch.runs.ros_bridge.SceneMatcher", matcher)
-    monkeypatch.setattr(node, "wait_for", wait_for)
     camera, topics = CameraInput(hfov_deg=90.0), RosTopics(image="/down")
     settings = RosSettings(map=MapInput(flight / "map.tif"), camera=camera, topics=topics)
-    with pytest.raises(LoadedError) as ended:
+    with pytest.raises(LookupError):
         run_ros_bridge(settings, node=node)
-    (camera,) = ended.value.args
-    assert asked == [("/down", "sensor_msgs/msg/Image")]
+    _, camera, *_ = matcher.call_args.args
+    assert [asked.args[:2] for asked in node.wait_for.call_args_list] == [("/down", "sensor_msgs/msg/Image")]
     assert (camera.width_px, camera.height_px, camera.matrix[0, 0]) == (40, 30, pytest.approx(20.0))
     with pytest.raises(BackendError, match=r"image_topic: expected a picture on /down within 30 s, got none"):
         run_ros_bridge(settings, node=node)

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bench.inputs.bags import BAG_KINDS, BagMessages, write_bag
 from engine.camera import Camera
-from engine.errors import MissingExtraError, OptionError, TelemetryError
+from engine.errors import MissingExtraError, TelemetryError
 from engine.values import Frame, Prior, Truth
 from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import open_truth
@@ -255,32 +255,24 @@ def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, ro
         assert item.frame.velocity_sigma_mps == stated
 
 
-def test_a_twist_along_other_axes_is_refused(tmp_path, maker):
-    path = a_bag_with_odometry(tmp_path / "x.bag", maker, by=partial(twist_message, frame="odom"))
-    message = r"x\.bag: /vio/odometry: frame_id: expected a velocity along base_link .*, got one along 'odom'"
-    with pytest.raises(TelemetryError, match=message):
-        read_bag(path, odometry_topic="/vio/odometry")
-    with pytest.raises(TelemetryError, match=r"/uav/velocity_local: .*, got one along 'map'"):
-        read_bag(path, odometry_topic="/uav/velocity_local")
-
-
-def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker):
-    path = a_bag_with_odometry(tmp_path / "x.bag", maker)
-    for other in ("/odom", "/imu/data"):
-        message = f"nav_msgs/msg/Odometry or .* on {other}, got /uav/velocity_local, /vio/odometry"
-        with pytest.raises(TelemetryError, match=message):
-            read_bag(path, odometry_topic=other)
-    path = a_bag_with_odometry(tmp_path / "blind.bag", maker, without=("/imu/data",))
-    with pytest.raises(TelemetryError, match="expected a heading at the times of /vio/odometry, got none"):
-        read_bag(path, odometry_topic="/vio/odometry")
-    path = a_bag_with_odometry(tmp_path / "lost.bag", maker, variances=(100.0,) * 3)
-    with pytest.raises(TelemetryError, match="expected a velocity that can be used on /vio/odometry, got none"):
-        read_bag(path, odometry_topic="/vio/odometry")
-
-
-def test_an_odometrys_topic_needs_a_bag():
-    with pytest.raises(OptionError, match=r"^odometry_topic: expected a bag as telemetry, got t\.csv"):
-        FlightFiles(map="m.tif", frames="f", telemetry="t.csv", odometry_topic="/vio")
+@pytest.mark.parametrize(
+    ("options", "topic", "said"),
+    [
+        ({}, "/odom", "nav_msgs/msg/Odometry or .* on /odom, got /uav/velocity_local, /vio/odometry"),
+        ({}, "/imu/data", "nav_msgs/msg/Odometry or .* on /imu/data, got /uav/velocity_local, /vio/odometry"),
+        ({}, "/uav/velocity_local", r"/uav/velocity_local: .*, got one along 'map'"),
+        ({"by": partial(twist_message, frame="odom")}, "/vio/odometry",
+         r"x\.bag: /vio/odometry: frame_id: expected a velocity along base_link .*, got one along 'odom'"),
+        ({"without": ("/imu/data",)}, "/vio/odometry",
+         "expected a heading at the times of /vio/odometry, got none"),
+        ({"variances": (100.0,) * 3}, "/vio/odometry",
+         "expected a velocity that can be used on /vio/odometry, got none"),
+    ],
+)  # fmt: skip
+def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker, options, topic, said):
+    path = a_bag_with_odometry(tmp_path / "x.bag", maker, **options)
+    with pytest.raises(TelemetryError, match=said):
+        read_bag(path, odometry_topic=topic)
 
 
 def test_a_bag_without_telemetry_or_calibration_says_so(tmp_path, maker):

@@ -2,9 +2,7 @@
 
 import json
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from engine.errors import OptionError
 from scenematch.files.settings import changed, nested, options_from_mapping
@@ -12,6 +10,7 @@ from scenematch.files.telemetry import open_telemetry
 from scenematch.runs.inputs import FlightFiles, open_inputs
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.settings import TrackSettings, load_settings
+from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
 
 OTHERS = "time_us,Image Name,altitude_agl [m],Yaw,Latitude,Longitude,battery\n0,0.png,120.5,-90,48.5,16.5,99\n"
@@ -57,10 +56,8 @@ def test_the_settings_name_them(tmp_path):
 
 
 def test_a_run_reads_them_by_its_settings(tmp_path, save):
-    (tmp_path / "frames").mkdir()
-    for k in range(2):
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "frames" / f"{k}.png")
-    given = {"map": "none.tif", "frames": tmp_path / "frames", "hfov_deg": 60.0}
+    frames = write_pictures(tmp_path / "frames", {"0.png": 0, "1.png": 0})
+    given = {"map": "none.tif", "frames": frames, "hfov_deg": 60.0}
     flight = FlightFiles.from_flat(**given, telemetry=save(OTHERS + MORE)).open_flight(NAMES)
     assert [row.height_agl_m for row in flight.rows] == [120.5, 121.5]
     assert len(flight.remarks) == 1

@@ -31,6 +31,7 @@ from scenematch.files.telemetry import (
 from scenematch.files.track import COLUMNS, TrackRow, TrackWriter, read_track, track_row, write_track
 from scenematch.files.truth import interpolate_truth, read_truth, write_truth
 from tests.support.fixes import a_fix
+from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
 from tests.support.videos import write_video
 
@@ -44,10 +45,7 @@ def picture(value, size=(8, 6)):
 @pytest.fixture
 def folder(tmp_path):
     """Three pictures whose names sort one way as text and another as numbers."""
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    for name, value in (("1.png", 10), ("2.png", 20), ("10.png", 100)):
-        Image.fromarray(picture(value)).save(frames / name)
+    frames = write_pictures(tmp_path / "frames", {"1.png": 10, "2.png": 20, "10.png": 100})
     (frames / "notes.txt").write_text("no picture")
     (frames / "._1.png").write_text("what some systems leave behind")
     return frames

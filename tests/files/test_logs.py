@@ -6,10 +6,8 @@ import struct
 from collections import Counter
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from bench.inputs.log_files import (
     ELSE,
@@ -30,6 +28,7 @@ from scenematch.files.resampling import MAX_SAMPLE_GAP_NS, interpolate, make_ser
 from scenematch.files.telemetry import read_telemetry, take_off_sigma_m
 from scenematch.files.truth import interpolate_truth, read_truth
 from tests.support.commands import file_options
+from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
 from tests.support.videos import write_video
 
@@ -208,11 +207,7 @@ def test_a_gimbal_before_the_vertical_is_a_body_with_its_nose_up(tmp_path):
 
 @pytest.fixture
 def pictures(tmp_path):
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    for k in (1, 2, 10):
-        Image.new("RGB", (8, 6), (k, k, k)).save(folder / f"{k}.png")
-    return folder
+    return write_pictures(tmp_path / "frames", {"1.png": 1, "2.png": 2, "10.png": 10})
 
 
 def cams(*seconds):
@@ -262,10 +257,7 @@ def subtitles(path, frames=60, count="FrameCnt: {n}, DiffTime: 33ms\n", gimbal="
 
 
 def extracted(folder, names):
-    folder.mkdir()
-    for name in names:
-        cv2.imwrite(str(folder / name), np.zeros((4, 4, 3), np.uint8))
-    return folder
+    return write_pictures(folder, dict.fromkeys(names, 0))
 
 
 @pytest.mark.parametrize("ending", ["SRT", "srt"])

@@ -3,13 +3,12 @@
 import csv
 import datetime
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from scenematch.files.flight import open_flight
 from scenematch.files.telemetry import open_telemetry, read_telemetry
 from scenematch.files.truth import read_truth
+from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
 
 NS = [k * 500_000_000 for k in range(60)]
@@ -139,9 +138,7 @@ def test_the_truth_is_on_the_same_clock(tmp_path):
 
 
 def test_a_flight_says_how_it_was_read(tmp_path):
-    (tmp_path / "frames").mkdir()
-    for k in range(3):
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "frames" / f"{k}.jpg")
-    flight = open_flight(tmp_path / "frames", table(tmp_path / "telemetry.csv", [0, 33, 67]))
+    frames = write_pictures(tmp_path / "frames", {f"{k}.jpg": 0 for k in range(3)})
+    flight = open_flight(frames, table(tmp_path / "telemetry.csv", [0, 33, 67]))
     assert list(flight.remarks) == ["telemetry.csv: timestamp_ns is taken as milliseconds: rows are 33.5 apart"]
     assert [row.timestamp_ns for row in flight.rows] == [0, 33_000_000, 67_000_000]
