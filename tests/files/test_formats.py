@@ -189,15 +189,11 @@ def test_truth_is_linear_between_neighbours_and_turns_the_short_way():
         Truth(timestamp_ns=0, lat_deg=10.0, lon_deg=179.99, alt_amsl_m=100.0, heading_deg=350.0, roll_deg=2.0),
         Truth(timestamp_ns=4_000_000_000, lat_deg=11.0, lon_deg=-179.99, alt_amsl_m=104.0, heading_deg=20.0),
     ]
-    middle = interpolate_truth(rows, 1_000_000_000)
-    assert middle.timestamp_ns == 1_000_000_000
-    assert middle.lat_deg == pytest.approx(10.25)
-    assert middle.lon_deg == pytest.approx(179.995)
-    assert middle.alt_amsl_m == pytest.approx(101.0)
-    assert middle.heading_deg == pytest.approx(357.5)
+    assert interpolate_truth(rows, 1_000_000_000) == Truth(
+        timestamp_ns=1_000_000_000, lat_deg=pytest.approx(10.25), lon_deg=pytest.approx(179.995),
+        alt_amsl_m=pytest.approx(101.0), heading_deg=pytest.approx(357.5),
+    )  # fmt: skip
     assert interpolate_truth(rows, 2_000_000_000).heading_deg == pytest.approx(5.0)
-    assert middle.roll_deg is None
-    assert middle.height_agl_m is None
 
 
 def test_truth_is_unknown_outside_and_in_gaps():

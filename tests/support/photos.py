@@ -5,16 +5,15 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+TAKEN = "2024:05:06 07:08:09"
 
-def write_pictures(folder: Path, grays: dict[str, int], size_px: tuple[int, int] = (8, 6)) -> Path:
-    """Write pictures of one grey level each, by name, to a folder that is made; the folder."""
+
+def write_pictures(folder: Path, grays: dict[str, int]) -> Path:
+    """Write pictures of 8 x 6 px and one grey level each, by name, to a folder that is made; the folder."""
     folder.mkdir()
     for name, gray in grays.items():
-        Image.new("RGB", size_px, (gray, gray, gray)).save(folder / name)
+        Image.new("RGB", (8, 6), (gray, gray, gray)).save(folder / name)
     return folder
-
-
-TAKEN = "2024:05:06 07:08:09"
 
 
 def photograph(
