@@ -2,9 +2,7 @@
 
 import pytest
 
-from engine.errors import OptionError, TelemetryError
-from engine.options import AssumedErrors
-from scenematch.files.telemetry import read_telemetry
+from engine.errors import TelemetryError
 from tests.support.commands import refusal
 
 BRIDGE = ["bridge", "mavlink", "--map=m.tif", "--camera=c.yaml", "--connect=udpout:127.0.0.1:14999"]
@@ -109,18 +107,3 @@ def test_a_host_that_cannot_be_one_is_told(link):
 
     with pytest.raises(OSError, match="is not a valid host name"):
         parse_connection(link).open()
-
-
-# ----------------------------------------------------------------------------------------- as wide as no map
-
-
-def test_a_sigma_wider_than_any_map_is_refused_in_the_telemetry(tmp_path):
-    table = tmp_path / "telemetry.csv"
-    table.write_text("timestamp_ns,frame,lat_deg,lon_deg,sigma_m\n1,a.jpg,48,16,1e200\n", encoding="utf-8")
-    with pytest.raises(TelemetryError, match=r"line 2, sigma_m: expected a number from 0 to 1e\+06, got '1e200'"):
-        read_telemetry(table)
-
-
-def test_an_assumed_error_wider_than_any_map_is_refused():
-    with pytest.raises(OptionError, match=r"map_m: expected at most 1e\+06, got 1e\+200"):
-        AssumedErrors(map_m=1e200)

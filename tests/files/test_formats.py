@@ -141,6 +141,8 @@ BAD_TELEMETRY = {
     "centidegrees": (HEADER + "1,a,5,21790,,\n", "heading_deg: expected degrees from -360 to 360, got '21790'"),
     "latitude": (HEADER + "1,a,5,,91,3\n", "lat_deg: expected degrees from -90 to 90, got '91'"),
     "longitude": (HEADER + "1,a,5,,9,361\n", "lon_deg: expected degrees from -180 to 360, got '361'"),
+    "a sigma as wide as no map": ("timestamp_ns,frame,sigma_m\n1,a,1e200\n",
+     "line 2, sigma_m: expected a number from 0 to 1e+06, got '1e200'"),
     "half a position": (HEADER + "1,a,5,,9,\n", "lon_deg: expected a value, as lat_deg has one, got ''"),
     "not UTF-8": (b"timestamp_ns,frame\n1,\xe9.jpg\n", "expected UTF-8 text, got the byte 0xe9"),
     "line in a cell": (HEADER + '1,a,"5\nx",,,\n', r"height_agl_m: expected a finite number above 0, got '5\nx'"),

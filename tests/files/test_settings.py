@@ -66,6 +66,7 @@ def test_values_arrive(path):
         ("[ncc]\nrefine = 1", "ncc.refine: expected true or false, got 1"),
         ("[ncc]\nerrors = 3", "ncc.errors: expected a table, got 3"),
         ("[ncc.errors]\nmap_m = -1", "ncc.errors.map_m: expected a number above 0, got -1.0"),
+        ("[ncc.errors]\nmap_m = 1e200", "ncc.errors.map_m: expected at most 1e+06, got 1e+200"),
         ('[telemetry_columns]\naltitude = "alt"', "telemetry_columns: expected one of timestamp_ns, "),
         (
             '[telemetry_columns]\nframe = " "',
