@@ -44,11 +44,6 @@ def places(ks):
     return np.array([[ROWS[k].lon_deg, ROWS[k].lat_deg] for k in ks])
 
 
-def test_a_refusal_ends_a_segment():
-    assert export.segments(ROWS) == [[ROWS[k] for k in run] for run in RUNS]
-    assert export.segments([refusal(0)]) == []
-
-
 def test_the_180th_meridian_ends_a_segment_and_longitudes_stay_on_their_circle():
     rows = [fix(0, lon_deg=179.9999), fix(0, lon_deg=180.0001), fix(0, lon_deg=-179.9998)]
     assert [len(run) for run in export.segments(rows)] == [1, 2]
@@ -132,13 +127,6 @@ def test_tum_has_whole_poses_and_leaves_out_what_is_none():
         assert turn == pytest.approx(enu_from_body(*roll_pitch_heading), abs=1e-8)
     # Without any attitude a height is still a reason to leave the others out, never a z of 0 among 150.
     assert np.loadtxt(io.StringIO(export.to_tum([flat, level])), ndmin=2)[:, 3].tolist() == [150.0]
-
-
-def test_heights_above_the_sea_are_only_those_that_are():
-    rows = [fix(0, up_m=150.0)]
-    assert "<ele>" not in export.to_gpx(rows)
-    row = export.pose_rows(rows, is_amsl=True)[0]
-    assert "<ele>150.000</ele>" in export.to_gpx([row])
 
 
 def test_notes_complete_the_pose_of_a_fix_and_of_no_refusal():
