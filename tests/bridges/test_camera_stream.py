@@ -103,8 +103,3 @@ def test_a_video_is_read_and_begins_again(tmp_path):
 def test_a_command_that_cannot_be_run_is_told(source):
     with pytest.raises(TelemetryError, match=r"^camera_source: "):
         next(capture(source))
-
-
-def test_a_command_that_ends_before_its_first_picture_is_told(command):
-    with pytest.raises(TelemetryError, match=r"^camera_source: expected pictures, got none: .* ended"):
-        taken(command(count=0), lambda _: False)

@@ -6,11 +6,9 @@ import re
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from scenematch.cli.app import run
-from scenematch.files.geotiff import write_geotiff
 from tests.support.commands import COMMANDS
 from tests.support.paths import ROOT
 
@@ -64,9 +62,7 @@ def test_completion_loads_nothing_that_only_work_needs():
 
 
 @pytest.mark.slow
-def test_commands_that_match_nothing_load_no_torch(tmp_path):
-    site, affine = tmp_path / "m.tif", [[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_000_000.0]]
-    write_geotiff(site, np.full((500, 500), 9, np.uint8), affine, 32633)
-    printed, loaded = loaded_after([["evaluate", "--help"], ["map", "info", str(site)]])
+def test_commands_that_match_nothing_load_no_torch(flight):
+    printed, loaded = loaded_after([["evaluate", "--help"], ["map", "info", str(flight / "map.tif")]])
     assert "gsd_m_per_px" in printed
     assert not loaded.intersection(MATCHING)

@@ -67,11 +67,10 @@ def test_a_url_is_repeated_as_it_was_typed(url, capsys):
 def test_files_that_commands_write_are_named(tmp_path, capsys):
     pytest.importorskip("pymavlink", reason="pymavlink is not installed")
     parameters = tmp_path / "p.param"
-    assert (
-        run(["bridge", "mavlink", f"--write-params={parameters}", "--settings=parameters.delay_ms=90", "--json"])
-        == 0
-    )
+    command = ["bridge", "mavlink", "--firmware=px4", f"--write-params={parameters}"]
+    assert run([*command, "--settings=parameters.delay_ms=90", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {
         "parameters": str(parameters), "delay_ms": 90, "delay_source": "given"
     }  # fmt: skip
-    assert spoken(capsys, ["bridge", "mavlink", f"--write-params={parameters}"], 2)["argument"] == "--write-params"
+    assert "EKF2_AGP0_DELAY\t90" in parameters.read_text(encoding="utf-8")
+    assert spoken(capsys, command, 2)["argument"] == "--write-params"

@@ -2,9 +2,7 @@
 
 import pytest
 
-from engine.errors import OptionError, TelemetryError
-from engine.options import AssumedErrors
-from scenematch.files.telemetry import read_telemetry
+from engine.errors import TelemetryError
 from tests.support.commands import refusal
 
 BRIDGE = ["bridge", "mavlink", "--map=m.tif", "--camera=c.yaml", "--connect=udpout:127.0.0.1:14999"]
@@ -43,7 +41,8 @@ LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
         *((command, "--device", "gpu") for command in (PLAYED, ROS, TRACK, LOCATE)),
         (PLAYED, "--firmware", "x"),
-        (PLAYED, "mavlink.message", "x"),
+        *((PLAYED, "--connect", value) for value in ("nonsense", "udpin:0.0.0.0:14550")),
+        *((PLAYED, "mavlink.message", value) for value in ("x", "global_position_sensor")),  # which is PX4's
         (PLAYED, "mavlink.max_sigma_m", "1e308"),
         *((PLAYED, "mavlink.component_id", value) for value in ("1", "0", "256")),  # an autopilot, a broadcast
         (ROS, "--firmware", "x"),
@@ -81,6 +80,8 @@ def test_an_option_that_would_say_nothing_is_refused(command, option, wanted, ca
 def test_a_topic_is_of_a_bag_an_odometry_of_known_type_and_a_start_on_the_earth(capsys):
     line = refusal(capsys, [*TRACK, "--settings=input.image_topic=/down"])
     assert line == "--settings input.image_topic: expected a bag as frames, got f\n"
+    line = refusal(capsys, [*TRACK, "--telemetry=t.csv", "--settings=input.odometry_topic=/vio"])
+    assert line == "--settings input.odometry_topic: expected a bag as telemetry, got t.csv\n"
     given = [*ROS, "--settings=ros.topics.odometry=/vio", "--settings=ros.topics.odometry_type=PoseStamped"]
     assert refusal(capsys, given).startswith("ros.topics.odometry_type: expected one of Odometry, Twist")
     for start in ("95,35", "33,35,-1"):
@@ -106,18 +107,3 @@ def test_a_host_that_cannot_be_one_is_told(link):
 
     with pytest.raises(OSError, match="is not a valid host name"):
         parse_connection(link).open()
-
-
-# ----------------------------------------------------------------------------------------- as wide as no map
-
-
-def test_a_sigma_wider_than_any_map_is_refused_in_the_telemetry(tmp_path):
-    table = tmp_path / "telemetry.csv"
-    table.write_text("timestamp_ns,frame,lat_deg,lon_deg,sigma_m\n1,a.jpg,48,16,1e200\n", encoding="utf-8")
-    with pytest.raises(TelemetryError, match=r"line 2, sigma_m: expected a number from 0 to 1e\+06, got '1e200'"):
-        read_telemetry(table)
-
-
-def test_an_assumed_error_wider_than_any_map_is_refused():
-    with pytest.raises(OptionError, match=r"map_m: expected at most 1e\+06, got 1e\+200"):
-        AssumedErrors(map_m=1e200)

@@ -2,9 +2,7 @@
 
 import json
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from engine.errors import OptionError
 from scenematch.files.settings import changed, nested, options_from_mapping
@@ -12,6 +10,7 @@ from scenematch.files.telemetry import open_telemetry
 from scenematch.runs.inputs import FlightFiles, open_inputs
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.settings import TrackSettings, load_settings
+from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
 
 OTHERS = "time_us,Image Name,altitude_agl [m],Yaw,Latitude,Longitude,battery\n0,0.png,120.5,-90,48.5,16.5,99\n"
@@ -23,16 +22,6 @@ NAMES = {
 
 
 PLACE = "[telemetry_columns] of the settings names those that are ours"
-
-
-@pytest.fixture
-def save(tmp_path):
-    def write(text):
-        path = tmp_path / "telemetry.csv"
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return write
 
 
 def test_named_columns_are_read_and_the_others_told_in_one_line(save):
@@ -66,21 +55,14 @@ def test_the_settings_name_them(tmp_path):
     assert options_from_mapping(TrackSettings, nested(recorded)) == settings
 
 
-def test_a_run_reads_them_by_its_settings(tmp_path):
-    (tmp_path / "frames").mkdir()
-    for k in range(2):
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "frames" / f"{k}.png")
-    table = tmp_path / "export.csv"  # as a database's shell writes it
-    rows = "2026-05-01 12:00:00.000;0.png;120.5\n2026-05-01 12:00:00.500;1.png;121.5\n"
-    table.write_text("time;image;agl\n" + rows, encoding="utf-8")
-    files = FlightFiles.from_flat(map="none.tif", frames=tmp_path / "frames", telemetry=table, hfov_deg=60.0)
-    flight = files.open_flight({"timestamp_utc": "time", "frame": "image", "height_agl_m": "agl"})
-    assert [row.timestamp_ns for row in flight.rows] == [1_777_636_800_000_000_000, 1_777_636_800_500_000_000]
+def test_a_run_reads_them_by_its_settings(tmp_path, save):
+    frames = write_pictures(tmp_path / "frames", {"0.png": 0, "1.png": 0})
+    given = {"map": "none.tif", "frames": frames, "hfov_deg": 60.0}
+    flight = FlightFiles.from_flat(**given, telemetry=save(OTHERS + MORE)).open_flight(NAMES)
     assert [row.height_agl_m for row in flight.rows] == [120.5, 121.5]
-    assert flight.remarks == []
-    bare = FlightFiles.from_flat(map="none.tif", frames=tmp_path / "frames", hfov_deg=60.0)
+    assert len(flight.remarks) == 1
     with pytest.raises(OptionError, match="telemetry_columns: expected a table as telemetry, got None"):
-        bare.open_flight({"frame": "image"})
+        FlightFiles.from_flat(**given).open_flight({"frame": "image"})
 
 
 def test_runs_of_one_flight_name_the_same(tmp_path, monkeypatch):

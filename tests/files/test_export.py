@@ -17,6 +17,7 @@ from scenematch.cli.app import run
 from scenematch.files import export
 from scenematch.files.notes import FrameNote
 from scenematch.files.track import write_track
+from tests.support.commands import refusal as refusal_of
 
 T0 = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
 GPX = "{http://www.topografix.com/GPX/1/1}"
@@ -41,11 +42,6 @@ ROWS = [fix(0), fix(1), refusal(2), fix(3), refusal(4), refusal(5), fix(6), fix(
 def places(ks):
     """(N, 2) longitude and latitude of fixes."""
     return np.array([[ROWS[k].lon_deg, ROWS[k].lat_deg] for k in ks])
-
-
-def test_a_refusal_ends_a_segment():
-    assert export.segments(ROWS) == [[ROWS[k] for k in run] for run in RUNS]
-    assert export.segments([refusal(0)]) == []
 
 
 def test_the_180th_meridian_ends_a_segment_and_longitudes_stay_on_their_circle():
@@ -133,13 +129,6 @@ def test_tum_has_whole_poses_and_leaves_out_what_is_none():
     assert np.loadtxt(io.StringIO(export.to_tum([flat, level])), ndmin=2)[:, 3].tolist() == [150.0]
 
 
-def test_heights_above_the_sea_are_only_those_that_are():
-    rows = [fix(0, up_m=150.0)]
-    assert "<ele>" not in export.to_gpx(rows)
-    row = export.pose_rows(rows, is_amsl=True)[0]
-    assert "<ele>150.000</ele>" in export.to_gpx([row])
-
-
 def test_notes_complete_the_pose_of_a_fix_and_of_no_refusal():
     known = {"heading_deg": 12.5, "roll_deg": -1.0, "pitch_deg": 2.0, "sigma_up_m": 0.3}
     notes = [FrameNote(frame=row.frame, state="tracking", **known) for row in ROWS[:3]]
@@ -158,64 +147,47 @@ def test_times_of_day_are_left_out_without_utc():
 @pytest.mark.parametrize("kind", export.WRITERS)
 def test_the_command_writes_each_format_and_replaces_only_when_told(kind, tmp_path, capfd):
     write_track(tmp_path / "track.csv", ROWS)
-    arguments = ["export", str(tmp_path), "--format", kind, "--json"]
-    assert run(arguments) == 0
+    arguments, written = ["export", str(tmp_path), "--format", kind], tmp_path / f"track.{kind}"
+    assert run([*arguments, "--json"]) == 0
     stated = json.loads(capfd.readouterr().out)
     assert (stated["fixes"], stated["segments"]) == (6, 3)
-    written = tmp_path / f"track.{kind}"
-    assert written.stat().st_size > 100
     written.write_text("mine")
-    assert run(arguments) == 2
-    assert "exists; choose another file, or add --force" in capfd.readouterr().err
+    assert "exists; choose another file, or add --force" in refusal_of(capfd, arguments)
     assert written.read_text() == "mine"
     assert run([*arguments, "--force"]) == 0
     assert written.stat().st_size > 100
 
 
-def test_the_truth_comes_at_the_moments_of_the_fixes_about_the_same_origin(tmp_path, capfd):
+def test_the_truth_comes_at_the_moments_of_the_fixes_that_it_covers(tmp_path, capfd):
     write_track(tmp_path / "track.csv", ROWS)
     settings = {
         "map": "m.tif", "surface": None, "truth": None, "method": "ncc", "profile": "engine", "ground_m": 5.0,
         "ground_amsl_m": 20.0, "origin": {"lat_deg": 32.5, "lon_deg": 35.25},
     }  # fmt: skip
     (tmp_path / "summary.json").write_text(json.dumps({"settings": settings}))
-    # 100 m north of the origin at T0, another 4 m in each second; it ends before the last two fixes.
-    degrees_a_metre = 1.0 / 110_888.0  # of latitude at 32.5 degrees
-    rows = [
-        f"{T0 + k * 10**9},{32.5 + (100 + 4 * k) * degrees_a_metre:.9f},35.25,{170 + k},0,0,90" for k in (0, 1)
-    ]
-    rows.append(f"{T0 + 1_600_000_000},{32.5 + 106.4 * degrees_a_metre:.9f},35.25,171.6,0,0,90")
+    truth = tmp_path / "t.csv"
+    begin, end = (f"{T0 + ms * 10**6},32.5,35.25,{170 + ms / 1000},0,0,90" for ms in (0, 1600))
     header = "timestamp_ns,lat_deg,lon_deg,alt_amsl_m,roll_deg,pitch_deg,heading_deg"
-    (tmp_path / "t.csv").write_text(header + "\n" + "\n".join(rows) + "\n")
-    arguments = ["export", str(tmp_path), "--format", "tum", "--truth", str(tmp_path / "t.csv"), "--json"]
+    truth.write_text("\n".join([header, begin, end, ""]))
+    arguments = ["export", str(tmp_path), "--format", "tum", "--truth", str(truth)]
     assert run(arguments) == 0
-    assert json.loads(capfd.readouterr().out)["fixes"] == 4
-    lines = (tmp_path / "truth.tum").read_text().splitlines()[1:]
-    values = [[float(value) for value in line.split()[1:4]] for line in lines]
-    assert all(line.endswith(" 0 0 0 1") for line in lines)  # heading east is the identity of forward, left, up
-    moments_s = [0.0, 0.25, 0.75, 1.5]
-    assert [line.split()[0][-11:] for line in lines] == [f"{t:.9f}" for t in moments_s]
-    expected = [[0.0, 100.0 + 4.0 * t, 155.0 + t] for t in moments_s]
-    assert np.array(values) == pytest.approx(np.array(expected), abs=0.02)
-    assert run(arguments) == 2
-    (tmp_path / "t.csv").write_text("timestamp_ns,lat_deg,lon_deg\n1,32.5,35.25\n2,32.5,35.25\n")
-    assert run([*arguments, "--force"]) == 1
-    assert "expected the truth at the moment of a fix, got none" in capfd.readouterr().err
+    # Above the ground of 20 - 5 m, and heading east is the identity of forward, left, up.
+    lines = [f"{T0 // 10**9 + t:.9f} 0.0000 0.0000 {155 + t:.4f} 0 0 0 1" for t in (0.0, 0.25, 0.75, 1.5)]
+    assert [line.replace("-0.0", "0.0") for line in (tmp_path / "truth.tum").read_text().splitlines()[1:]] == lines
+    capfd.readouterr()
+    assert "truth.tum exists" in refusal_of(capfd, arguments)
+    truth.write_text("timestamp_ns,lat_deg,lon_deg\n1,32.5,35.25\n2,32.5,35.25\n")
+    assert "expected the truth at the moment of a fix, got none" in refusal_of(capfd, [*arguments, "--force"], 1)
 
 
 def test_the_command_refuses_in_one_line(tmp_path, capfd):
-    def refused(*arguments):
-        code, error = run(["export", str(tmp_path), *arguments]), capfd.readouterr().err
-        assert len(error.splitlines()) == 1
-        return code, error
-
-    code, error = refused("--format", "gpx")
-    assert (code, "no such file" in error) == (1, True)
+    export_gpx = ["export", tmp_path, "--format=gpx"]
+    assert "no such file" in refusal_of(capfd, export_gpx, 1)
     write_track(tmp_path / "track.csv", [refusal(0)])
-    code, error = refused("--format", "gpx")
-    assert (code, "expected a track with a fix, got 1 rows without" in error) == (1, True)
-    code, error = refused("--format", "shp")
-    assert (code, "--format: expected one of gpx, geojson, tum, got 'shp'" in error) == (2, True)
+    assert "expected a track with a fix, got 1 rows without" in refusal_of(capfd, export_gpx, 1)
+    assert refusal_of(capfd, [*export_gpx, "--format=shp"]).startswith(
+        "--format: expected one of gpx, geojson, tum"
+    )
     write_track(tmp_path / "track.csv", ROWS)
-    code, error = refused("--format", "gpx", "--out", str(tmp_path / "none" / "x.gpx"))
-    assert (code, "cannot be written" in error) == (1, True)
+    out = tmp_path / "none" / "x.gpx"
+    assert "cannot be written" in refusal_of(capfd, [*export_gpx, f"--out={out}"], 1)

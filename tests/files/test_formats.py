@@ -1,31 +1,27 @@
 """Telemetry, truth, frames, flights, tracks and GeoTIFF: what is read, what is written, what is refused."""
 
 import dataclasses
-import re
 
 import cv2
 import numpy as np
 import pytest
 import rasterio
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from engine.camera import Camera
 from engine.errors import (
     CalibrationError,
     DtypeError,
-    EngineError,
     MapError,
     OptionError,
     ShapeError,
-    TelemetryError,
 )
 from engine.values import Frame, NoFix, Prior, Reason, Truth, Window
 from scenematch.files.flight import open_flight, write_flight_folder
 from scenematch.files.frames import open_frames, read_image
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.telemetry import (
+    BOUNDS,
     DEFAULT_PRIOR_SIGMA_M,
     TelemetryRow,
     ground_amsl_m,
@@ -35,23 +31,11 @@ from scenematch.files.telemetry import (
 from scenematch.files.track import COLUMNS, TrackRow, TrackWriter, read_track, track_row, write_track
 from scenematch.files.truth import interpolate_truth, read_truth, write_truth
 from tests.support.fixes import a_fix
-from tests.support.paths import SHARED
+from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
 from tests.support.videos import write_video
 
-FLIGHTS = {"gazebo-a1": (627, 0), "gazebo-a2": (591, 0), "caliterra": (37, 0), "nust": (271, 1081)}
-
 HEADER = "timestamp_ns,frame,height_agl_m,heading_deg,lat_deg,lon_deg\n"
-
-
-@pytest.fixture
-def save(tmp_path):
-    def write(text, name="telemetry.csv"):
-        path = tmp_path / name
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return path
-
-    return write
 
 
 def picture(value, size=(8, 6)):
@@ -61,10 +45,7 @@ def picture(value, size=(8, 6)):
 @pytest.fixture
 def folder(tmp_path):
     """Three pictures whose names sort one way as text and another as numbers."""
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    for name, value in (("1.png", 10), ("2.png", 20), ("10.png", 100)):
-        Image.fromarray(picture(value)).save(frames / name)
+    frames = write_pictures(tmp_path / "frames", {"1.png": 10, "2.png": 20, "10.png": 100})
     (frames / "notes.txt").write_text("no picture")
     (frames / "._1.png").write_text("what some systems leave behind")
     return frames
@@ -105,35 +86,22 @@ def test_a_prior_without_sigma_takes_the_default(save):
     assert rows[1].prior == Prior(lat_deg=32.5, lon_deg=35.25, sigma_m=4.0)
 
 
-def cells(number, low=-180.0, high=180.0):
-    return st.none() | st.integers(int(low * 10**number), int(high * 10**number)).map(lambda v: v / 10**number)
-
-
-@given(
-    st.lists(
-        st.builds(
-            TelemetryRow,
-            timestamp_ns=st.integers(-(2**63) // 10**8 + 1, 2**63 // 10**8).map(lambda v: v * 10**8),
-            frame=st.from_regex(r"[a-z0-9,\"]{1,6}\.jpg", fullmatch=True),
-            height_agl_m=cells(3, 0.001, 9000),
-            alt_amsl_m=cells(3, -500, 9000),
-            heading_deg=cells(4, 0, 359.9),
-            roll_deg=cells(4),
-            pitch_deg=cells(4, -90, 90),
-            east_velocity_mps=cells(4),
-            sigma_m=cells(3, 0, 500),
-        ),
-        min_size=1,
-        max_size=6,
-        unique_by=(lambda row: row.timestamp_ns, lambda row: row.frame),
-    ),
-    st.tuples(cells(9, -90, 90).filter(lambda v: v is not None), cells(9).filter(lambda v: v is not None)),
-)
-@settings(max_examples=25, deadline=None)
-def test_telemetry_round_trip(tmp_path_factory, rows, place):
-    path = tmp_path_factory.mktemp("t") / "telemetry.csv"
-    rows.sort(key=lambda row: row.timestamp_ns)
-    rows[0] = dataclasses.replace(rows[0], lat_deg=place[0], lon_deg=place[1])
+def test_telemetry_round_trip(tmp_path):
+    """With values at the ends of their ranges, unknown cells, stamps before 1970 and a name that needs quotes."""
+    path, second = tmp_path / "telemetry.csv", 10**9
+    known = {name: 1.25 + k for k, name in enumerate(BOUNDS)}
+    ends = {
+        "heading_deg": 359.9,
+        "roll_deg": -180.0,
+        "pitch_deg": 90.0,
+        "lat_deg": -90.0,
+        "lon_deg": 179.123456789,
+    }
+    rows = [
+        TelemetryRow(timestamp_ns=-(2**62) // second * second, frame='a,"b".jpg', **known),
+        TelemetryRow(timestamp_ns=-second, frame="b.jpg"),
+        TelemetryRow(timestamp_ns=2**62 // second * second, frame="c.jpg", **ends, alt_amsl_m=-500.0),
+    ]
     write_telemetry(path, rows)
     assert read_telemetry(path) == rows
 
@@ -173,6 +141,8 @@ BAD_TELEMETRY = {
     "centidegrees": (HEADER + "1,a,5,21790,,\n", "heading_deg: expected degrees from -360 to 360, got '21790'"),
     "latitude": (HEADER + "1,a,5,,91,3\n", "lat_deg: expected degrees from -90 to 90, got '91'"),
     "longitude": (HEADER + "1,a,5,,9,361\n", "lon_deg: expected degrees from -180 to 360, got '361'"),
+    "a sigma as wide as no map": ("timestamp_ns,frame,sigma_m\n1,a,1e200\n",
+     "line 2, sigma_m: expected a number from 0 to 1e+06, got '1e200'"),
     "half a position": (HEADER + "1,a,5,,9,\n", "lon_deg: expected a value, as lat_deg has one, got ''"),
     "not UTF-8": (b"timestamp_ns,frame\n1,\xe9.jpg\n", "expected UTF-8 text, got the byte 0xe9"),
     "line in a cell": (HEADER + '1,a,"5\nx",,,\n', r"height_agl_m: expected a finite number above 0, got '5\nx'"),
@@ -192,19 +162,6 @@ def test_missing_telemetry_and_a_folder_in_its_place_are_refused(tmp_path):
     assert refusal(read_telemetry, tmp_path / "none.csv").endswith("none.csv: no such file")
     assert "cannot be read" in refusal(read_telemetry, tmp_path)
     assert "cannot be written" in refusal(write_telemetry, tmp_path / "none" / "t.csv", [])
-
-
-@given(st.binary(max_size=200))
-@settings(max_examples=150, deadline=None)
-def test_garbage_never_raises_anything_but_the_engines_error(tmp_path_factory, content):
-    path = tmp_path_factory.getbasetemp() / "garbage.csv"
-    for start in (b"", HEADER.encode(), HEADER.encode() + b"1,a,"):
-        path.write_bytes(start + content)
-        for read in (read_telemetry, read_truth, read_track):
-            try:
-                read(path)
-            except EngineError as error:
-                assert "\n" not in str(error)  # noqa: PT017
 
 
 def test_ground_is_the_median_difference_of_the_two_heights():
@@ -234,15 +191,11 @@ def test_truth_is_linear_between_neighbours_and_turns_the_short_way():
         Truth(timestamp_ns=0, lat_deg=10.0, lon_deg=179.99, alt_amsl_m=100.0, heading_deg=350.0, roll_deg=2.0),
         Truth(timestamp_ns=4_000_000_000, lat_deg=11.0, lon_deg=-179.99, alt_amsl_m=104.0, heading_deg=20.0),
     ]
-    middle = interpolate_truth(rows, 1_000_000_000)
-    assert middle.timestamp_ns == 1_000_000_000
-    assert middle.lat_deg == pytest.approx(10.25)
-    assert middle.lon_deg == pytest.approx(179.995)
-    assert middle.alt_amsl_m == pytest.approx(101.0)
-    assert middle.heading_deg == pytest.approx(357.5)
+    assert interpolate_truth(rows, 1_000_000_000) == Truth(
+        timestamp_ns=1_000_000_000, lat_deg=pytest.approx(10.25), lon_deg=pytest.approx(179.995),
+        alt_amsl_m=pytest.approx(101.0), heading_deg=pytest.approx(357.5),
+    )  # fmt: skip
     assert interpolate_truth(rows, 2_000_000_000).heading_deg == pytest.approx(5.0)
-    assert middle.roll_deg is None
-    assert middle.height_agl_m is None
 
 
 def test_truth_is_unknown_outside_and_in_gaps():
@@ -411,10 +364,9 @@ def test_metadata_in_a_video_is_refused_with_the_way_out(folder, tmp_path, name)
     """The first bytes are those of a transport stream and of a UAS data link's packet (MISB ST 0601)."""
     path = tmp_path / name
     path.write_bytes(b"\x47\x40\x11" + bytes.fromhex("060e2b34020b01010e01030101000000"))
-    with pytest.raises(TelemetryError) as caught:
-        open_flight(folder, path)
-    assert str(caught.value).startswith(f"{path}: expected a table or a flight log, got a video's metadata")
-    assert "convert it to a .SRT" in str(caught.value)
+    message = refusal(open_flight, folder, path)
+    assert message.startswith(f"{path}: expected a table or a flight log, got a video's metadata")
+    assert "convert it to a .SRT" in message
 
 
 def test_without_telemetry_frames_come_bare(folder, video):
@@ -461,24 +413,6 @@ def test_a_frame_without_a_stamp_cannot_be_written(tmp_path):
     inputs = {"frames": [("a.png", Frame(picture(1)))], "truth": [], "camera": Camera.from_fov(8, 6, 60.0)}
     message = refusal(write_flight_folder, tmp_path, **inputs, **WORLD)
     assert "a.png: timestamp_ns: expected a stamp" in message
-
-
-@pytest.mark.parametrize("name", FLIGHTS)
-def test_reads_the_shared_flights(name):
-    directory = SHARED / name
-    if not directory.is_dir():
-        pytest.skip(f"no flight {name} under {SHARED}")
-    frames = directory / "flight.mp4" if name == "nust" else directory / "frames"
-    camera = Camera.load(directory / "camera.yaml")
-    flight = open_flight(frames, directory / "telemetry.csv", camera)
-    truth = read_truth(directory / "truth.csv")
-    assert (len(flight), flight.unused) == FLIGHTS[name]
-    iterator = iter(flight)
-    for item in (next(iterator), next(iterator)):
-        camera.check_size(item.frame.image.shape)
-        assert item.frame.height_agl_m > 20.0
-        assert interpolate_truth(truth, item.frame.timestamp_ns) is not None
-        assert (item.prior is not None) == (name == "caliterra")
 
 
 # -------------------------------------------------------------------------------------------------- GeoTIFF
@@ -593,14 +527,6 @@ def test_a_bad_track_is_refused_with_its_place(tmp_path, change, expected):
     values = dict(zip(COLUMNS, line.split(","), strict=True)) | change
     path.write_text(f"{header}\n{','.join(values.values())}\n")
     assert expected in refusal(read_track, path)
-
-
-def test_a_track_lacking_a_column_or_cut_in_a_row_is_refused(tmp_path, save):
-    assert "lacks the column frame" in refusal(read_track, save("timestamp_ns,status\n1,fix\n"))
-    write_track(tmp_path / "track.csv", [track_row("a", FIX, latency_ms=1.0, deadline_met=True)])
-    text = (tmp_path / "track.csv").read_text()
-    message = refusal(read_track, save(text[:-60]))
-    assert re.search(r"line 2: expected 18 cells as in the header, got \d+", message)
 
 
 def test_a_track_cannot_be_written_where_there_is_no_folder(tmp_path):

@@ -44,12 +44,8 @@ def test_exif_without_a_fix_or_below_the_sea(tmp_path):
 
 
 def test_xmp_gives_height_and_the_attitude_of_the_gimbal(tmp_path):
-    xmp = (
-        'drone-dji:RelativeAltitude="+36.10" drone-dji:FlightYawDegree="+10.0" drone-dji:GimbalRollDegree="{}" '
-        'drone-dji:GimbalPitchDegree="{}" drone-dji:GimbalYawDegree="{}"'
-    )
-    photograph(tmp_path / "a.jpg", xmp=xmp.format("+0.00", "-80.00", "-170.00"))
-    photograph(tmp_path / "b.jpg", xmp=xmp.format("+180.00", "-80.00", "+10.00"), taken="2024:05:06 07:08:10")
+    photograph(tmp_path / "a.jpg", xmp=gimbal("+0.00", "-80.00", "-170.00", height="+36.10"))
+    photograph(tmp_path / "b.jpg", xmp=gimbal("+180.00", "-80.00", "+10.00"), taken="2024:05:06 07:08:10")
     photograph(tmp_path / "c.jpg", xmp='drone-dji:FlightYawDegree="-20.5"', taken="2024:05:06 07:08:11")
     level, flipped, body = exif_telemetry(tmp_path)
     assert level.height_agl_m == 36.1

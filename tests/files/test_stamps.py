@@ -3,13 +3,12 @@
 import csv
 import datetime
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from scenematch.files.flight import open_flight
 from scenematch.files.telemetry import open_telemetry, read_telemetry
 from scenematch.files.truth import read_truth
+from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
 
 NS = [k * 500_000_000 for k in range(60)]
@@ -101,18 +100,17 @@ REFUSED = {
     "mixed": (["2026-02-03T00:00:00Z", 5], "line 3, timestamp_ns: expected a date in UTC"),
     "back": ([1.0, 0.5], "line 3, timestamp_ns: expected a stamp later than the row before (1.0), got '0.5'"),
     "a fraction of a nanosecond": ([0.5, 1e9, 2e9], "expected a whole number, got '0.5'"),
+    "a name that states a wrong unit": ([0.0, 0.5, 1.0, 1.5],
+     "timestamp_ms: expected milliseconds, got rows 0.5 apart, which may be", {"column": "timestamp_ms"}),
+    "two decimal marks": ([0, 10**9], "line 2: expected one decimal mark, got '12,5' and '1.234'",
+     {"delimiter": ";", "more": [("height_agl_m", "1.234"), ("alt_amsl_m", "12,5")]}),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
 def test_what_cannot_be_told_is_refused(tmp_path, case):
-    given, words = REFUSED[case]
-    assert words in refusal(read_telemetry, table(tmp_path / "t.csv", given))
-
-
-def test_a_name_that_states_a_wrong_unit_is_refused(tmp_path):
-    message = refusal(read_telemetry, table(tmp_path / "t.csv", [0.0, 0.5, 1.0, 1.5], "timestamp_ms"))
-    assert "timestamp_ms: expected milliseconds, got rows 0.5 apart, which may be" in message
+    given, words, *more = REFUSED[case]
+    assert words in refusal(read_telemetry, table(tmp_path / "t.csv", given, **dict(*more)))
 
 
 @pytest.mark.parametrize("delimiter", [";", "\t"])
@@ -125,12 +123,6 @@ def test_semicolons_and_decimal_commas(tmp_path, delimiter, mark):
     assert rows[1].frame == "1.jpg"
 
 
-def test_two_decimal_marks_are_refused(tmp_path):
-    more = [("height_agl_m", "1.234"), ("alt_amsl_m", "12,5")]
-    message = refusal(read_telemetry, table(tmp_path / "t.csv", [0, 10**9], delimiter=";", more=more))
-    assert "line 2: expected one decimal mark, got '12,5' and '1.234'" in message
-
-
 def test_the_truth_is_on_the_same_clock(tmp_path):
     path = tmp_path / "truth.csv"
     path.write_text("timestamp_ns;lat_deg;lon_deg\n0;48,5;16,5\n500;48,5;16,5\n", encoding="utf-8")
@@ -139,9 +131,7 @@ def test_the_truth_is_on_the_same_clock(tmp_path):
 
 
 def test_a_flight_says_how_it_was_read(tmp_path):
-    (tmp_path / "frames").mkdir()
-    for k in range(3):
-        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "frames" / f"{k}.jpg")
-    flight = open_flight(tmp_path / "frames", table(tmp_path / "telemetry.csv", [0, 33, 67]))
+    frames = write_pictures(tmp_path / "frames", {f"{k}.jpg": 0 for k in range(3)})
+    flight = open_flight(frames, table(tmp_path / "telemetry.csv", [0, 33, 67]))
     assert list(flight.remarks) == ["telemetry.csv: timestamp_ns is taken as milliseconds: rows are 33.5 apart"]
     assert [row.timestamp_ns for row in flight.rows] == [0, 33_000_000, 67_000_000]

@@ -8,6 +8,14 @@ from PIL import Image
 TAKEN = "2024:05:06 07:08:09"
 
 
+def write_pictures(folder: Path, grays: dict[str, int]) -> Path:
+    """Write pictures of 8 x 6 px and one grey level each, by name, to a folder that is made; the folder."""
+    folder.mkdir()
+    for name, gray in grays.items():
+        Image.new("RGB", (8, 6), (gray, gray, gray)).save(folder / name)
+    return folder
+
+
 def photograph(
     path: Path, taken=TAKEN, gps=(), subsec=None, offset=None, xmp="", *, tags=(), software=None, size_px=(32, 24)
 ) -> Path:

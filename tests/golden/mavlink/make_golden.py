@@ -1,4 +1,4 @@
-"""Makes the golden packets of tests/adapters/test_mavlink.py by pymavlink alone, every field spelled out.
+"""Makes the golden packets of tests/bridges/test_mavlink.py by pymavlink alone, every field spelled out.
 
 One fix: 33.641 N 72.992 E, sigma 0.5 m east and 0.4 m north, captured at 12.345678 s, sent 80 ms later, by a
 vehicle 120 m above an origin at 33.640 N 72.990 E, rolled by 2, pitched by -3 and headed for 270 degrees.
