@@ -11,7 +11,7 @@ import pytest
 
 from engine.errors import StateError
 from engine.geo import enu_from_body
-from engine.values import Attitude, Fix
+from engine.values import Attitude
 from scenematch.simulator.ekf import (
     ACCEL,
     COMPASS,
@@ -76,21 +76,19 @@ def apart(truth: FilterState, estimate: FilterState) -> np.ndarray:
     return error
 
 
-def fix_at(east_m, north_m, up_m=None, sigma_m=0.5) -> Fix:
-    return a_fix(east_m, north_m, sigma_m, up_m=up_m)
+def derivatives(function, estimate: FilterState, step: float) -> np.ndarray:
+    """Columns of differences by each of the 17 errors."""
+    errors = step * np.eye(STATES)
+    return np.stack([(function(moved(estimate, e)) - function(estimate)) / step for e in errors], axis=-1)
 
 
 # ------------------------------------------------------------------------------------- derivatives and algebra
 
 
 def test_prediction_carries_errors_as_differences_say():
-    estimate, step = some_belief(), 1e-5
+    estimate = some_belief()
     expected = predict(estimate, SAMPLE, SUITE)
-    F = np.empty((STATES, STATES))
-    for k in range(STATES):
-        error = np.zeros(STATES)
-        error[k] = step
-        F[:, k] = apart(predict(moved(estimate, error), SAMPLE, SUITE), expected) / step
+    F = derivatives(lambda belief: apart(predict(belief, SAMPLE, SUITE), expected), estimate, 1e-5)
     added = expected.covariance - F @ estimate.covariance @ F.T
     np.testing.assert_allclose(added - np.diag(np.diag(added)), 0.0, atol=2e-5)
     assert np.diag(added).min() > -2e-5  # noise is white: on the diagonal
@@ -110,12 +108,8 @@ def test_prediction_carries_errors_as_differences_say():
     ids=["barometer", "compass"],
 )  # fmt: skip
 def test_a_measurement_moves_the_belief_as_its_differences_say(fuse, measured, variance):
-    estimate, step = some_belief(), 1e-6
-    H = np.empty(STATES)
-    for k in range(STATES):
-        error = np.zeros(STATES)
-        error[k] = step
-        H[k] = (measured(moved(estimate, error)) - measured(estimate)) / step
+    estimate = some_belief()
+    H = derivatives(measured, estimate, 1e-6)
     gain = estimate.covariance @ H / (H @ estimate.covariance @ H + variance)
     np.testing.assert_allclose(apart(fuse(estimate, measured(estimate) + 0.01), estimate), 0.01 * gain, atol=2e-6)
 
@@ -139,13 +133,9 @@ def test_joseph_is_the_textbook_where_that_is_exact():
 
 def test_a_fix_pulls_by_its_covariance_and_without_height_leaves_the_height():
     estimate = replace(some_belief(), covariance=np.eye(STATES))
-    np.testing.assert_allclose(
-        fuse_fix(estimate, fix_at(12.0, -5.0, sigma_m=1.0)).position_m, [11.0, -5.0, 120.0], atol=1e-9
-    )
-    np.testing.assert_allclose(
-        fuse_fix(estimate, fix_at(10.0, -5.0, 122.0, sigma_m=1.0)).position_m, [10.0, -5.0, 121.0], atol=1e-9
-    )
-    assert fix_chi_square(estimate, fix_at(14.0, -2.0, sigma_m=1.0)) == pytest.approx(25.0 / 2.0)
+    assert fuse_fix(estimate, a_fix(12.0, -5.0)).position_m == pytest.approx([11.0, -5.0, 120.0])
+    assert fuse_fix(estimate, a_fix(10.0, -5.0, up_m=122.0)).position_m == pytest.approx([10.0, -5.0, 121.0])
+    assert fix_chi_square(estimate, a_fix(14.0, -2.0)) == pytest.approx(25.0 / 2.0)
 
 
 def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
@@ -187,9 +177,8 @@ def fly(seed, seconds, fixes_until_s=math.inf):
             heading_deg = carried.heading_deg(state)
             history.fuse(partial(fuse_heading, heading_deg=heading_deg, suite=SUITE), state.time_s)
         if k % 20 == 0 and state.time_s < fixes_until_s:
-            pending.append(
-                (state.time_s, fix_at(*(state.position_m + FIX_SIGMA_M * start.standard_normal(3)), FIX_SIGMA_M))
-            )
+            east_m, north_m, up_m = state.position_m + FIX_SIGMA_M * start.standard_normal(3)
+            pending.append((state.time_s, a_fix(east_m, north_m, FIX_SIGMA_M, up_m=up_m)))
         if pending and state.time_s >= pending[0][0] + FIX_LATENCY_S:
             time_s, fix = pending.pop(0)
             history.fuse(partial(fuse_fix, fix=fix), time_s)
@@ -246,7 +235,7 @@ def test_without_positions_the_sigma_grows_and_holds_the_error():
 def test_a_measurement_that_comes_late_does_what_it_would_have_done_in_time():
     rng = np.random.default_rng(6)
     samples = [IdealImu(SAMPLE.force_mps2 + 0.1 * rng.normal(size=3), 0.1 * rng.normal(size=3)) for _ in range(60)]
-    fix = partial(fuse_fix, fix=fix_at(11.0, -4.0))
+    fix = partial(fuse_fix, fix=a_fix(11.0, -4.0, 0.5))
     prompt, late = (History(replace(some_belief(), time_s=0.0), SUITE) for _ in range(2))
     for k, sample in enumerate(samples):
         for history in (prompt, late):
@@ -267,10 +256,10 @@ def test_the_start_can_be_corrected_too_and_no_other_moment():
     for _ in range(10):
         history.advance(SAMPLE)
     before = history.now.sigma_m
-    history.fuse(partial(fuse_fix, fix=fix_at(10.0, -5.0)), 0.0)
+    history.fuse(partial(fuse_fix, fix=a_fix(10.0, -5.0, 0.5)), 0.0)
     assert history.now.sigma_m < before
     for _ in range(20):
         history.advance(SAMPLE)
     for moment in (0.0, 0.31):
         with pytest.raises(StateError, match="time_s"):
-            history.fuse(partial(fuse_fix, fix=fix_at(10.0, -5.0)), moment)
+            history.fuse(partial(fuse_fix, fix=a_fix(10.0, -5.0, 0.5)), moment)

@@ -65,15 +65,6 @@ def test_the_attitude_gives_the_acceleration_that_is_asked_for(heading):
     assert attitude[:, 1] @ (sine, cosine, 0.0) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_it_noses_down_to_speed_up():
-    state = hovering(np.zeros(3), 0.0)
-    for _ in range(400):
-        state, _ = advance(state, np.array([0.0, 1.0, 0.0]), 0.0, FRAME, state.velocity_mps)  # air moves along
-    assert state.attitude.pitch_deg == pytest.approx(-math.degrees(math.atan(1.0 / GRAVITY_MPS2)), abs=0.1)
-    assert state.attitude.roll_deg == pytest.approx(0.0, abs=0.05)
-    assert state.velocity_mps[1] > 1.0
-
-
 def test_tilt_is_limited_and_thrust_never_pushes_down():
     for wanted in ([40.0, 0.0, 0.0], [3.0, 3.0, -30.0]):
         attitude, force = aim(np.array(wanted), 10.0, FRAME)

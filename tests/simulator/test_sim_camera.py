@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -88,11 +90,9 @@ def test_exposure_scales_light_and_noise(sim_town):
     one, half = (snap(sim_town.world, optics=Optics(gain=g), grid=where).astype(float) for g in (1.0, 0.5))
     np.testing.assert_allclose(half, 0.5 * one, atol=1.0)
     for level in (40.0, 90.0):
-        assert snap(sim_town.world, optics=Optics(target_level=level), grid=where).mean() == pytest.approx(
-            level, abs=3.0
-        )
-    noisy = Sensor(**{name: getattr(IDEAL, name) for name in IDEAL.__dataclass_fields__} | {"noise_sd": 2.0})
-    dark = patch_world(600, 600, 0.0)
+        exposed = snap(sim_town.world, optics=Optics(target_level=level), grid=where)
+        assert exposed.mean() == pytest.approx(level, abs=3.0)
+    noisy, dark = replace(IDEAL, noise_sd=2.0), patch_world(600, 600, 0.0)
     grain = [snap(dark, sensor=noisy, optics=Optics(gain=g))[:100].std() for g in (1.0, 4.0)]
     assert grain[1] == pytest.approx(4.0 * grain[0], rel=0.1)
 

@@ -26,7 +26,7 @@ from scenematch.simulator import (
     world_from_map,
 )
 from scenematch.simulator.canvas import ASPHALT, CANOPY, GRASS
-from scenematch.simulator.conditions import apply_season
+from scenematch.simulator.conditions import apply_season, condition_by_name
 from scenematch.simulator.light import LIGHTS, illuminate
 from scenematch.simulator.raster_world import bare_ground
 from scenematch.simulator.render import Atmosphere, Glint
@@ -48,15 +48,11 @@ def hilly():
 # ---------------------------------------------------------------------------------------------- conditions
 
 
-@pytest.mark.parametrize(
-    "light", [light if k == 0 else pytest.param(light, marks=pytest.mark.slow) for k, light in enumerate(LIGHTS)]
-)
-def test_a_condition_of_light_alone_is_that_light(light):
-    own = Condition(light=LIGHTS[light])
-    plain, named = build_town(5, **SMALL, condition=own), build_town(5, **SMALL, condition=light)
-    for name in ("rgb", "sides", "height_m"):
-        assert getattr(plain.world, name).tobytes() == getattr(named.world, name).tobytes()
-    assert plain.ortho.tobytes() == named.ortho.tobytes()
+@pytest.mark.parametrize("name", LIGHTS)
+def test_a_condition_of_light_alone_is_that_light(name):
+    own = Condition(light=LIGHTS[name])
+    assert condition_by_name(name) == own
+    assert condition_by_name(own) is own
 
 
 @pytest.mark.slow
