@@ -3,7 +3,6 @@
 import shlex
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 import rasterio
@@ -256,17 +255,10 @@ def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
 
 @pytest.fixture
 def calibration(tmp_path):
-    """As OpenCV writes it, for pictures of twice the photographs' size."""
-    path = tmp_path / "opencv.yml"
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in (
-        ("image_width", 640),
-        ("image_height", 480),
-        ("camera_matrix", np.array([[500.0, 0.0, 319.5], [0.0, 505.0, 239.5], [0.0, 0.0, 1.0]])),
-        ("distortion_coefficients", np.array([[-0.28, 0.09, 0.0007, -0.0004, -0.01]])),
-    ):
-        storage.write(name, value)
-    storage.release()
+    """For pictures of twice the photographs' size."""
+    matrix = np.array([[500.0, 0.0, 319.5], [0.0, 505.0, 239.5], [0.0, 0.0, 1.0]])
+    path = tmp_path / "640x480.yaml"
+    path.write_text(camera_info(Camera(640, 480, matrix, distortion=np.array([-0.28, 0.09, 7e-4, -4e-4, -0.01]))))
     return path
 
 
@@ -296,7 +288,9 @@ def test_without_the_request_another_size_is_refused_and_the_request_named(photo
 def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
     with pytest.raises(OptionError, match="scale_calibration: expected with `camera`"):
         FlightFiles.from_flat(map="m.tif", frames=photos, scale_calibration=True)
-    calibration.write_text(calibration.read_text().replace("480", "360"), encoding="utf-8")
+    calibration.write_text(
+        calibration.read_text().replace("image_height: 480", "image_height: 360"), encoding="utf-8"
+    )
     files = FlightFiles.from_flat(map="m.tif", frames=photos, camera=calibration, scale_calibration=True)
     with pytest.raises(CalibrationError, match="a part may have been cut off"):
         load(files)

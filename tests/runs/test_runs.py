@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -34,8 +35,10 @@ from scenematch.files.ros.bags import import_rosbags
 from scenematch.files.track import read_track
 from scenematch.files.truth import read_truth
 from scenematch.runs.inputs import FOLDER_LAYOUT
+from tests.support.refusals import refusal
 
 FRAMES = 3
+refused = partial(refusal, error=OptionError)
 pytestmark = pytest.mark.usefixtures("bare_runs")
 
 
@@ -113,13 +116,6 @@ def test_a_folder_gives_what_it_has(flight, tmp_path):
     bare = FlightFiles.in_folder(tmp_path)
     assert (bare.map.surface, bare.telemetry, bare.truth) == (None, None, None)
     assert bare.map.map == tmp_path / "map.tif"
-
-
-def refused(call, *arguments, **named):
-    """The message of an OptionError."""
-    with pytest.raises(OptionError) as caught:
-        call(*arguments, **named)
-    return str(caught.value)
 
 
 def test_errors_name_arguments(flight, tmp_path):
