@@ -9,7 +9,6 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
-from bench.accuracy.audit import Trial, auc, fit
 from engine import Camera, OrthoMap
 from engine.errors import OptionError, TelemetryError
 from scenematch.check.availability import Flag, audit_site, fix_probability, predict_route
@@ -18,7 +17,7 @@ from scenematch.check.self_match import measure_self_match
 from scenematch.cli.app import run
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.route import read_route
-from tests.support.audits import CAMERA, GRID, HEIGHT_M, SIDE, UTM, audit, lat_lon, town_gray
+from tests.support.audits import CAMERA, GRID, HEIGHT_M, SIDE, UTM, audit, lat_lon, town_gray, write_route
 from tests.support.commands import refusal
 
 NOISE = 3.0  # of the water, in grey levels
@@ -186,24 +185,19 @@ def test_a_route_without_a_way_is_refused(found):
         predict_route(found, [40.0, 40.0], [-100.0, -100.0])
 
 
+def simple(command, *place):
+    """A mission item; by default its place is where the vehicle then is."""
+    lat, lon = place or (None, None)
+    return {"type": "SimpleItem", "command": command, "params": [0, 0, 0, None, lat, lon, 50]}
+
+
 LINE = {"type": "LineString", "coordinates": [[8.0, 47.0, 500.0], [8.1, 47.2]]}
-SIMPLE = {"type": "SimpleItem", "command": 16, "params": [0, 0, 0, None, 47.0, 8.0, 50]}
-PLAN = {
-    "fileType": "Plan",
-    "mission": {
-        "plannedHomePosition": [46.9, 7.9, 400],
-        "items": [
-            {"type": "SimpleItem", "command": 22, "params": [0, 0, 0, None, None, None, 50]},
-            SIMPLE,
-            {"type": "SimpleItem", "command": 178, "params": [1, 5, -1, 0, 1, 1, 0]},
-            {
-                "type": "ComplexItem",
-                "TransectStyleComplexItem": {"Items": [{**SIMPLE, "params": [0, 0, 0, None, 47.2, 8.1, 50]}]},
-            },
-            {"type": "SimpleItem", "command": 20, "params": [0] * 7},
-        ],
-    },
-}
+FEATURE = {"type": "Feature", "properties": {}, "geometry": LINE}
+POINT = {"type": "Feature", "geometry": {"type": "Point", "coordinates": [1, 2]}}
+SURVEY = {"type": "ComplexItem", "TransectStyleComplexItem": {"Items": [simple(16, 47.2, 8.1)]}}
+SPEED = {"type": "SimpleItem", "command": 178, "params": [1, 5, -1, 0, 1, 1, 0]}
+ITEMS = [simple(22), simple(16, 47.0, 8.0), SPEED, SURVEY, simple(20)]  # from take-off to the return home
+PLAN = {"fileType": "Plan", "mission": {"plannedHomePosition": [46.9, 7.9, 400], "items": ITEMS}}
 
 
 def written(tmp_path, content):
@@ -212,20 +206,7 @@ def written(tmp_path, content):
     return path
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        LINE,
-        {"type": "Feature", "properties": {}, "geometry": LINE},
-        {
-            "type": "FeatureCollection",
-            "features": [
-                {"type": "Feature", "geometry": {"type": "Point", "coordinates": [1, 2]}},
-                {"type": "Feature", "geometry": LINE},
-            ],
-        },
-    ],
-)
+@pytest.mark.parametrize("content", [LINE, FEATURE, {"type": "FeatureCollection", "features": [POINT, FEATURE]}])
 def test_geojson_gives_latitude_before_longitude(tmp_path, content):
     assert read_route(written(tmp_path, content)).tolist() == [[47.0, 8.0], [47.2, 8.1]]
 
@@ -270,11 +251,7 @@ def map_file(patchwork, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def route_file(site, tmp_path_factory):
-    route = lat_lon(site, [[130, 225], [780, 225]])
-    path = tmp_path_factory.mktemp("route") / "route.geojson"
-    line = {"type": "LineString", "coordinates": route[:, ::-1].tolist()}
-    path.write_text(json.dumps(line), encoding="utf-8")
-    return path
+    return write_route(tmp_path_factory.mktemp("route"), site, [[130, 225], [780, 225]])
 
 
 @pytest.mark.slow
@@ -354,26 +331,3 @@ def test_a_route_elsewhere_is_refused(map_file, tmp_path, capsys):
     line = refusal(capsys, audit(map_file, tmp_path / "out", f"--route={written(tmp_path, LINE)}"))
     assert line.startswith("--route: expected a route over the map")
     assert not (tmp_path / "out").exists()
-
-
-# ---------------------------------------------------------------------------------------------- its benchmark
-
-
-def test_auc_is_the_share_of_pairs_in_the_right_order():
-    right = np.array([True, True, False, False, False])
-    assert auc(np.array([5.0, 4.0, 3.0, 2.0, 1.0]), right) == 1.0
-    assert auc(np.array([1.0, 2.0, 3.0, 4.0, 5.0]), right) == 0.0
-    assert auc(np.ones(5), right) == 0.5
-    assert auc(np.array([5.0, 1.5, 3.0, 2.0, 1.0]), right) == pytest.approx(4 / 6)
-    assert np.isnan(auc(np.ones(2), np.array([True, True])))
-
-
-def test_the_fit_finds_the_weights_that_drew_the_outcomes():
-    rng = np.random.default_rng(0)
-    weights, features = np.array([-1.0, 0.5, 0.0, 2.0]), rng.normal(size=(20_000, 3))
-    chance = 1.0 / (1.0 + np.exp(-weights[0] - features @ weights[1:]))
-    found = [
-        Trial(60.0, 0.5, row, bool(right), False)
-        for row, right in zip(features, rng.random(len(chance)) < chance, strict=True)
-    ]
-    assert fit(found) == pytest.approx(weights, abs=0.1)

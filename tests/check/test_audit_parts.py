@@ -17,7 +17,7 @@ from engine.errors import OptionError
 from scenematch.check.availability import Flag, audit_site, predict_route
 from scenematch.check.plan import AuditOptions, MapPart, plan_audit
 from scenematch.cli.app import run
-from tests.support.audits import CAMERA, GRID, HEIGHT_M, UTM, audit, lat_lon, town_gray
+from tests.support.audits import CAMERA, GRID, HEIGHT_M, UTM, audit, lat_lon, town_gray, write_route
 from tests.support.commands import refusal
 
 HUGE_SIDE = 24_000  # pixels of the huge map: more than are audited as a whole
@@ -147,11 +147,7 @@ def test_a_part_beside_the_map_is_refused(site):
 
 @pytest.fixture(scope="module")
 def route_file(huge, tmp_path_factory):
-    path = tmp_path_factory.mktemp("route") / "route.geojson"
-    corners = np.array([[200, 250], [640, 300]]) + CORNER
-    line = {"type": "LineString", "coordinates": lat_lon(huge, corners)[:, ::-1].tolist()}
-    path.write_text(json.dumps(line), encoding="utf-8")
-    return path
+    return write_route(tmp_path_factory.mktemp("route"), huge, np.array([[200, 250], [640, 300]]) + CORNER)
 
 
 def place_option(site, xy_px, radius_m):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,13 @@ def town_gray() -> Any:
 def lat_lon(site: Any, xy_px: Any) -> Any:
     """Latitudes and longitudes (N, 2) of pixels."""
     return np.stack(site.geodetic_from_pixel(np.asarray(xy_px, float)), axis=-1)
+
+
+def write_route(folder: Path, site: Any, xy_px: Any) -> Path:
+    """A route through pixels of a map, as GeoJSON."""
+    line = {"type": "LineString", "coordinates": lat_lon(site, xy_px)[:, ::-1].tolist()}
+    (folder / "route.geojson").write_text(json.dumps(line), encoding="utf-8")
+    return folder / "route.geojson"
 
 
 def audit(map_file: Path, out: Path, *more: Any) -> list[str]:
