@@ -6,7 +6,6 @@ import shutil
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
 from engine.options import MatcherOptions, NccOptions, SiftOptions
@@ -22,13 +21,7 @@ from scenematch.report.page import write_page
 from scenematch.report.verdict import MEANINGS, verdict_of
 from scenematch.runs.evaluation import evaluate
 from scenematch.runs.settings import TrackSettings
-from scenematch.runs.tracking import track
-from tests.support.runs import bare_runs
-
-FRAMES = 6
-DARK = 4  # a frame that shows nothing
-HOSTILE = "<img src=x onerror=hacked=1>"
-
+from tests.support.dark_flight import DARK, FRAMES, data_of
 
 # --------------------------------------------------------------------------------------------- the verdict
 
@@ -226,25 +219,6 @@ def test_nothing_is_made_up_where_the_telemetry_is_silent(sim_flight, sim_site):
 # --------------------------------------------------------------------------------------------- the page
 
 
-@pytest.fixture(scope="module")
-def flown(flight_in, tmp_path_factory):
-    """A finished run over a flight with a black frame."""
-    folder = tmp_path_factory.mktemp(HOSTILE.replace("/", "")) / "flight"
-    files = flight_in(folder, frames=FRAMES)
-    black = folder / "frames" / f"{DARK:06d}.jpg"
-    Image.fromarray(np.zeros((300, 300, 3), np.uint8)).save(black)
-    with bare_runs():
-        track(files, folder.parent / "out", TrackSettings(device="cpu", budget_ms=3_600_000.0))
-    return folder.parent / "out"
-
-
-def data_of(page):
-    """What the page's script is given."""
-    text = page.read_text(encoding="utf-8")
-    start = text.index('id="data">') + len('id="data">')
-    return json.loads(text[start : text.index("</script>", start)])
-
-
 def test_the_page_needs_nothing_but_itself(flown):
     text = (flown / "report.html").read_text(encoding="utf-8")
     assert set(re.findall(r"https?://[^\s\"'<]+", text)) == {"http://www.w3.org/2000/svg"}
@@ -292,64 +266,3 @@ def test_a_track_without_a_single_fix_has_a_page(page_of, count):
     text = page_of([TrackRow(frame=str(i), **refused) for i in range(count)])
     assert ("None of" in text, "has no frames" in text) == (count > 0, count == 0)
     assert "nan" not in re.sub(r'data:image[^"]*', "", text).lower()
-
-
-# --------------------------------------------------------------------------------------------- the browser
-
-
-PICTURES = "return [...document.querySelectorAll('#pictures image')].map(i => i.getAttribute('href'))"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("width_px", [1280, 420])
-def test_the_page_loads_without_complaint_or_network_and_fits(browser, flown, width_px):
-    page = flown / "report.html"
-    browser.open(page, width_px)
-    browser.run("window.scrollTo(0, document.body.scrollHeight)")
-    assert browser.complaints() == []
-    assert browser.requests() == [page.resolve().as_uri()]
-    assert browser.run("return document.documentElement.scrollWidth") == width_px
-    assert browser.run("return typeof hacked") == "undefined"
-    assert browser.run("return document.querySelectorAll('img').length") == 0
-    assert all(browser.run("return [...document.querySelectorAll('svg[role]')].map(s => !!s.ariaLabel)"))
-
-
-@pytest.mark.slow
-def test_keys_move_through_the_frames(browser, flown):
-    browser.open(flown / "report.html", 1280)
-    seen = [browser.run(PICTURES)]
-    for key in ("ArrowRight", "ArrowRight"):
-        browser.press(key)
-        seen.append(browser.run(PICTURES))
-    assert [len(pictures) for pictures in seen] == [4, 4, 4]
-    assert len({pictures[0] for pictures in seen}) == 3
-    assert browser.run("return document.querySelector('#facts h3').textContent") == "000002.jpg"
-    browser.press("ArrowLeft")
-    assert browser.run(PICTURES) == seen[1]
-    browser.run("document.getElementById('slider').focus()")
-    browser.press("End")  # the slider's own
-    assert browser.run("return document.querySelector('#facts h3').textContent") == f"{FRAMES - 1:06d}.jpg"
-    assert browser.complaints() == []
-
-
-@pytest.mark.slow
-def test_a_refusal_is_found_from_its_reason(browser, flown):
-    browser.open(flown / "report.html", 1280)
-    browser.run("document.querySelector('[data-goto]').click()")
-    assert browser.run("return document.querySelector('#facts h3').textContent") == f"{DARK:06d}.jpg"
-    assert browser.run("return document.querySelector('#facts .answer').textContent") == "Refused: no texture"
-
-
-@pytest.mark.slow
-def test_the_map_zooms_about_the_frame_shown(browser, flown):
-    browser.open(flown / "report.html", 1280)
-    box = "return document.getElementById('map').getAttribute('viewBox').split(' ').map(Number)"
-    whole = browser.run(box)
-    browser.run("document.getElementById('zoom-in').click()")
-    near = browser.run(box)
-    x, y = data_of(flown / "report.html")["frames"][0]["xy"]
-    assert near[2] == pytest.approx(0.6 * whole[2])
-    assert near[0] <= x <= near[0] + near[2]
-    assert near[1] <= y <= near[1] + near[3]
-    browser.run("document.getElementById('zoom-all').click()")
-    assert browser.run(box) == whole
