@@ -115,16 +115,6 @@ def test_a_false_fix_is_wrong_by_10_m_and_by_3_of_its_own_sigmas(error_en_m, sig
     assert (summary["wrong_over_10m"], summary["false_fixes"]) == (wrong, false)
 
 
-def test_nees_of_a_consistent_covariance_is_2():
-    rng = np.random.default_rng(8)
-    root = np.array([[2.0, 0.0], [0.9, 0.6]])
-    covariance = root @ root.T
-    sigma = np.sqrt(np.diag(covariance))
-    rows = [fix_at(*(root @ rng.normal(size=2)), t, sigma, covariance[0, 1]) for t in range(1500)]
-    truth = [truth_at(0, 0, t) for t in range(1500)]
-    assert summarise(rows, truth, frame=HERE)["nees_mean"] == pytest.approx(2.0, abs=0.15)
-
-
 def test_the_origin_of_the_frame_does_not_matter():
     rows = [fix_at(7.0 * t + 2.0, 3.0 * t - 1.0, t) for t in range(8)]
     here, elsewhere = (summarise(rows, straight(), frame=frame) for frame in (HERE, LocalFrame(32.80, 35.0)))
