@@ -1,8 +1,9 @@
-"""The report page: its words, what it shows of single matches, and how it behaves in a real browser."""
+"""The report page: its words, what it shows of single matches, and what is kept where it is drawn again."""
 
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
 from engine.options import MatcherOptions, NccOptions, SiftOptions
 from engine.values import Reason, Window
+from scenematch.cli.app import run
 from scenematch.files.notes import FrameNote, frame_note, read_notes, write_notes
 from scenematch.files.settings import changed, nested, options_from_mapping
 from scenematch.files.track import TrackRow, read_track
@@ -21,7 +23,10 @@ from scenematch.report.page import write_page
 from scenematch.report.verdict import MEANINGS, verdict_of
 from scenematch.runs.evaluation import evaluate
 from scenematch.runs.settings import TrackSettings
+from tests.support.commands import refusal
 from tests.support.dark_flight import DARK, FRAMES, data_of
+
+pytestmark = pytest.mark.usefixtures("bare_runs")
 
 # --------------------------------------------------------------------------------------------- the verdict
 
@@ -233,7 +238,6 @@ def test_every_frame_is_shown_with_its_match(flown):
     assert "deviate" in frames[DARK]["detail"]
 
 
-@pytest.mark.usefixtures("bare_runs")
 def test_a_run_that_left_no_notes_has_a_page_without_frames(flown, tmp_path):
     again = shutil.copytree(flown, tmp_path / "again")
     (again / "notes.csv").unlink()
@@ -266,3 +270,51 @@ def test_a_track_without_a_single_fix_has_a_page(page_of, count):
     text = page_of([TrackRow(frame=str(i), **refused) for i in range(count)])
     assert ("None of" in text, "has no frames" in text) == (count > 0, count == 0)
     assert "nan" not in re.sub(r'data:image[^"]*', "", text).lower()
+
+
+# --------------------------------------------------------------------------------------------- drawn again
+
+
+@pytest.fixture
+def moved(flown, tmp_path):
+    """A copy of the track whose frames are not where they were."""
+    out = Path(shutil.copytree(flown, tmp_path / "out"))
+    frames = flown.parent / "flight" / "frames"
+    frames.rename(frames.with_name("moved"))
+    yield out
+    frames.with_name("moved").rename(frames)
+
+
+def test_a_page_loses_frames_that_were_moved_only_where_it_may(moved, capsys):
+    before = (moved / "report.html").read_text(encoding="utf-8")
+    assert 'id="slider"' in before
+    told = r"DIR.*: .*report\.html shows frames, which redrawing would lose; add --force to do it anyway; .*frames"
+    assert re.match(told, refusal(capsys, ["evaluate", moved]))
+    assert (moved / "report.html").read_text(encoding="utf-8") == before
+    assert run(["evaluate", str(moved), "--force"]) == 0
+    assert "report.html loses the frames that it shows: " in capsys.readouterr().err
+    after = (moved / "report.html").read_text(encoding="utf-8")
+    assert ('id="slider"' in after, "No frames are shown: " in after) == (False, True)
+    assert run(["evaluate", str(moved)]) == 0  # there is nothing more to lose
+
+
+def test_seconds_and_numbers_of_frames_are_not_drawn_over_one_axis(flown, tmp_path):
+    other = Path(shutil.copytree(flown, tmp_path / "other"))
+    rows = (other / "track.csv").read_text(encoding="utf-8").splitlines()
+    blank = [line if k == 0 else "," + line.partition(",")[2] for k, line in enumerate(rows)]
+    (other / "track.csv").write_text("\n".join(blank) + "\n", encoding="utf-8")
+    third, alike, mixed = shutil.copytree(other, tmp_path / "c"), tmp_path / "alike.html", tmp_path / "mixed.html"
+    assert run(["evaluate", str(flown), str(third), f"--out={mixed}"]) == 0
+    assert run(["evaluate", str(other), str(third), f"--out={alike}"]) == 0
+    assert "Stated sigma (m)" in alike.read_text(encoding="utf-8")
+    assert "Stated sigma (m)" not in mixed.read_text(encoding="utf-8")
+
+
+def test_a_page_for_a_folder_that_is_not_there_is_refused_before_anything_is_drawn(
+    flown, tmp_path, monkeypatch, capsys
+):
+    other = shutil.copytree(flown, tmp_path / "other")
+    monkeypatch.setattr("scenematch.runs.reporting.draw_together", lambda *_, **__: pytest.fail("drawn"))
+    page = tmp_path / "nofolder" / "x.html"
+    line = refusal(capsys, ["evaluate", flown, other, f"--out={page}"])
+    assert line == f"--out: expected a file in a folder that exists, got {page}\n"
