@@ -11,11 +11,11 @@ from engine.camera import mount_rotation
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.values import Attitude, Prior
 from scenematch.check import Diagnosis, diagnose
-from scenematch.check.causes import findings, is_known
+from scenematch.check.causes import IN_CALIBRATION, findings, is_known
 from scenematch.check.contradictions import contradictions
-from scenematch.check.findings import TelemetrySeries
+from scenematch.check.findings import Finding, TelemetrySeries
 from scenematch.check.sightings import Sighting
-from scenematch.runs.checking import as_rows
+from scenematch.runs.checking import _that_can_be_set, as_rows
 from scenematch.simulator import plan_flight
 from tests.support.towns import drawn_town, site_of
 
@@ -302,3 +302,25 @@ def test_positions_of_what_the_middle_shows_are_no_shifted_map():
     telemetry = series(angles_deg=angles, reference_m=PLACES - (left_m, 0.0), reference_sigma_m=np.full(N, 1.0))
     assert causes(telemetry, tilted) == []
     assert causes(replace(telemetry, reference_m=PLACES - (left_m, -30.0)), tilted) == ["map"]
+
+
+# --------------------------------------------------------------------------------------------- what a user can set
+
+
+LINE = "mount: [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]"
+
+
+def cure(text, *, gimbal=False, calibration=True, cause="mount"):
+    return _that_can_be_set(Finding(cause, "it hangs off", text), gimbal, calibration).cure
+
+
+def test_a_mount_is_written_where_there_is_a_calibration_or_can_be():
+    assert cure(LINE + IN_CALIBRATION) == f"{LINE} in the calibration"
+    assert cure(LINE + IN_CALIBRATION, calibration=False) == f"write a calibration file with {LINE}, for --camera"
+    assert cure("--mount nadir-tail", calibration=False) == "--mount nadir-tail"
+
+
+@pytest.mark.parametrize("text", [LINE + IN_CALIBRATION, "--mount nadir-tail"])
+def test_beside_a_gimbal_its_angles_are_corrected(text):
+    assert cure(text, gimbal=True).startswith("the gimbal's angles replace a mount: correct the angles")
+    assert cure("--correct angles=radians", gimbal=True, cause="radians") == "--correct angles=radians"

@@ -225,16 +225,6 @@ def subtitles(heights_m):
     return "".join(cue.format(n=k + 1, ms=40 * k, h=height_m) for k, height_m in enumerate(heights_m))
 
 
-def test_a_video_with_subtitles_and_a_field_of_view(tmp_path):
-    path = tmp_path / "DJI_0001.mp4"
-    write_video(path, [40 * k for k in range(3)], codec="mp4v")
-    (tmp_path / "DJI_0001.SRT").write_text(subtitles([80.0] * 3))
-    files = FlightFiles.from_flat(map="m.tif", frames=path, hfov_deg=70.0)
-    assert files.telemetry == tmp_path / "DJI_0001.SRT"
-    assert [row.height_agl_m for row in files.open_flight().rows] == [80.0] * 3
-    assert load(files).width_px == 64
-
-
 def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
     """Of a video with a log: pictures, stamps, heights and corrections are those of the frames that are left."""
     path = tmp_path / "DJI_0002.avi"
@@ -243,7 +233,9 @@ def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
     late = Corrections(offset_s=0.04)  # by one frame, which only all of the rows can say
     named = {"map": "m.tif", "frames": path, "hfov_deg": 70.0}
     whole, part = FlightFiles.from_flat(**named), FlightFiles.from_flat(**named, every=3, corrections=late)
+    assert whole.telemetry == tmp_path / "DJI_0002.SRT"
     assert len(whole.open_flight()) == 8
+    assert load(whole).width_px == 64
     flight = part.open_flight()
     assert (flight.names, flight.heights, flight.unused) == (["0", "3", "6"], {"take-off": 3}, 0)
     assert [item.frame.timestamp_ns for item in flight] == [0, 120_000_000, 240_000_000]

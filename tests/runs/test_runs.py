@@ -35,6 +35,7 @@ from scenematch.files.ros.bags import import_rosbags
 from scenematch.files.track import read_track
 from scenematch.files.truth import read_truth
 from scenematch.runs.inputs import FOLDER_LAYOUT
+from tests.support.dark_flight import dark_flight
 from tests.support.refusals import refusal
 
 FRAMES = 3
@@ -141,11 +142,7 @@ def test_what_is_no_picture_is_not_located(flight, tmp_path):
             locate_image(file, flight / "map.tif", camera=flight / "camera.yaml")
 
 
-def test_the_public_names_are_sorted_and_there():
-    assert scenematch.__all__ == sorted(scenematch.__all__)
-    assert set(scenematch.__all__) == set(" ".join(scenematch._NAMES.values()).split())
-    for name in scenematch.__all__:
-        assert getattr(scenematch, name).__doc__
+def test_a_name_that_is_not_public_is_none_of_the_package():
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         scenematch.nothing  # noqa: B018
 
@@ -207,20 +204,14 @@ def test_a_missing_extra_is_always_the_same_error(module, package, extra, use, m
 
 
 @pytest.mark.parametrize("is_wrong", [True, False])
-def test_a_run_in_which_frames_were_refused_ends_with_what_does_not_fit(flight, tmp_path, monkeypatch, is_wrong):
-    """One frame of three is refused, for want of a heading; where all inputs fit, nothing is said of them."""
-    lines = (flight / "telemetry.csv").read_text(encoding="utf-8").splitlines()
-    names, last = lines[0].split(","), lines[-1].split(",")
-    last[names.index("heading_deg")] = ""
-    telemetry = tmp_path / "telemetry.csv"
-    telemetry.write_text("\n".join([*lines[:-1], ",".join(last)]), encoding="utf-8")
+def test_a_run_with_refused_frames_ends_with_what_does_not_fit(flight_in, tmp_path, monkeypatch, is_wrong):
+    """One frame of six is refused; where all inputs fit, nothing is said of them."""
     findings = [Finding("radians", "the heading is in radians", "--correct angles=radians")] if is_wrong else []
     found = Diagnosis(findings, 16, 16, ("attitude",), (Contradiction("heading", 6 * is_wrong, 16),))
     monkeypatch.setattr("scenematch.runs.tracking.diagnose_flight", lambda *_, **__: found)
-    given = {name: flight / file for name, file in FOLDER_LAYOUT.items() if name != "telemetry"}
-    files = FlightFiles.from_flat(**given, telemetry=telemetry)
+    files = dark_flight(flight_in, tmp_path / "flight")
     summary = track(files, tmp_path / "out", TrackSettings(method="ncc"), report=False)
-    assert summary["fixes"] == FRAMES - 1
+    assert summary["fixes"] == summary["frames"] - 1
     said = summary["settings"]["diagnosis"]
     assert (said is not None) == is_wrong
     if said:
