@@ -125,16 +125,11 @@ def test_a_long_way_over_a_huge_map_has_no_more_places_and_no_finer_grid_than_me
     assert plan.audited.size < 200_000
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({}, "part: expected around or route"),
-        ({"around": (40.0, -99.0, 0.0)}, "around: expected metres above 0, got 0"),
-    ],
-)
-def test_a_part_of_nothing_is_refused(options, words):
-    with pytest.raises(OptionError, match=words):
-        MapPart(**options)
+def test_a_part_of_nothing_is_refused():
+    with pytest.raises(OptionError, match="part: expected around or route"):
+        MapPart()
+    with pytest.raises(OptionError, match="around: expected metres above 0, got 0"):
+        MapPart(around=(40.0, -99.0, 0.0))
 
 
 def test_a_part_beside_the_map_is_refused(site):

@@ -215,7 +215,7 @@ def test_what_is_too_short_has_no_row():
 # ---------------------------------------------------------------------------------- the telemetry's velocity
 
 
-STEP_S = 0.5
+STEP_S = 2
 
 
 def turned(noise_m=0.4, count=60, seed=4, offset_m=(0.0, 0.0)):
@@ -224,17 +224,13 @@ def turned(noise_m=0.4, count=60, seed=4, offset_m=(0.0, 0.0)):
     velocity = np.array([[8.0 - 0.1 * k, 0.2 * k] for k in range(count)])
     way = np.vstack([np.zeros(2), np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * STEP_S, axis=0)])
     error = rng.normal(0.0, noise_m, (count, 2))
-    lat, lon = HERE.geodetic_from_enu(*(way + error + offset_m).T)
-    rows, telemetry = [], []
-    for k in range(count):
-        stamp_ns = 10**18 + round(k * STEP_S * 1e9)
-        fixed = k % 7 != 3
-        place = {"lat_deg": float(lat[k]), "lon_deg": float(lon[k])} if fixed else {}
-        rows.append(TrackRow(timestamp_ns=stamp_ns, frame=str(k), status="fix" if fixed else "no_fix", **place))
-        east, north = velocity[k]
-        telemetry.append(
-            TelemetryRow(timestamp_ns=stamp_ns, frame=str(k), east_velocity_mps=east, north_velocity_mps=north)
-        )
+    places = way + error + offset_m
+    seconds = range(0, STEP_S * count, STEP_S)
+    rows = [refusal_at(t) if k % 7 == 3 else fix_at(*places[k], t) for k, t in enumerate(seconds)]
+    telemetry = [
+        TelemetryRow(timestamp_ns=t * SECOND_NS, frame=str(k), east_velocity_mps=east, north_velocity_mps=north)
+        for k, (t, (east, north)) in enumerate(zip(seconds, velocity, strict=True))
+    ]
     return rows, telemetry, error
 
 
@@ -259,9 +255,9 @@ def test_steps_without_a_velocity_or_too_long_do_not_count():
     before = motion_consistency(rows, telemetry, HERE)["steps"]
     gap = [replace(row, east_velocity_mps=None) if row.frame == "3" else row for row in telemetry]
     assert motion_consistency(rows, gap, HERE)["steps"] == before - 1  # frame 3 was refused: one step spans it
-    refused = [TrackRow(timestamp_ns=row.timestamp_ns, frame=row.frame, status="no_fix") for row in rows[4:15]]
+    refused = [refusal_at(STEP_S * k) for k in range(4, 15)]
     assert motion_consistency([*rows[:4], *refused, *rows[15:]], telemetry, HERE)["steps"] == 2 + 3
     bare = [TelemetryRow(timestamp_ns=row.timestamp_ns, frame=row.frame) for row in telemetry]
     for stated in (None, [], bare, telemetry[:-1]):
         assert motion_consistency(rows, stated, HERE) is None
-    assert motion_consistency([*refused, *refused][:1], telemetry[4:5], HERE) is None
+    assert motion_consistency(refused[:1], telemetry[4:5], HERE) is None
