@@ -161,12 +161,6 @@ def test_what_says_nothing_of_a_camera_is_wrong_usage(options, words):
         FlightFiles.from_flat(**{"map": "m.tif", "frames": "f"} | options)
 
 
-def test_pictures_without_exif_need_a_camera(tmp_path):
-    Image.fromarray(noise()).save(tmp_path / "1.png")
-    with pytest.raises(CalibrationError, match=r"1\.png: expected a focal length .* give `hfov_deg` or `camera`"):
-        load(FlightFiles(map="m.tif", frames=tmp_path))
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -8,27 +8,10 @@ from pathlib import Path
 
 import pytest
 
-import scenematch.runs
+import scenematch
 from engine import OptionError, TelemetryError
 from engine.errors import BackendError, MissingExtraError
-from scenematch import (
-    BridgeFiles,
-    BridgeSettings,
-    CameraInput,
-    FlightFiles,
-    MapInput,
-    MavlinkSettings,
-    Progress,
-    TrackSettings,
-    WorldSettings,
-    evaluate,
-    export_track,
-    locate_image,
-    run_mavlink_bridge,
-    simulate,
-    track,
-    write_parameter_file,
-)
+from scenematch import FlightFiles, Progress, TrackSettings, track
 from scenematch.check import Diagnosis, Finding
 from scenematch.check.findings import Contradiction
 from scenematch.files.ros.bags import import_rosbags
@@ -63,7 +46,7 @@ class Recorded(Progress):
 def flight(tmp_path_factory):
     """A flight folder, to be read and not written."""
     folder = tmp_path_factory.mktemp("runs") / "flight"
-    assert simulate(str(folder), WorldSettings(), frames=FRAMES)["frames"] == FRAMES
+    assert scenematch.simulate(str(folder), scenematch.WorldSettings(), frames=FRAMES)["frames"] == FRAMES
     return folder
 
 
@@ -85,7 +68,7 @@ def test_one_frame_in_two_is_tracked_and_scored_again(flight, tmp_path):
     assert [row.frame for row in read_track(tmp_path / "out" / "track.csv")] == names
     assert progress.messages == ["using one frame in 2, 2 in all"]
     page = (tmp_path / "out" / "report.html").read_bytes()
-    summary = evaluate(tmp_path / "out")
+    summary = scenematch.evaluate(tmp_path / "out")
     assert (summary["settings"]["every"], summary["frames_without_truth"]) == (2, 0)
     assert (tmp_path / "out" / "report.html").read_bytes() == page  # with the pictures of the same frames
 
@@ -132,14 +115,14 @@ def test_errors_name_arguments(flight, tmp_path):
     place = next(iter(read_truth(flight / "truth.csv")))
     swapped = TrackSettings(start=f"{place.lon_deg},{place.lat_deg}")
     assert refused(track, files, tmp_path / "out", swapped).endswith("; are latitude and longitude swapped?")
-    assert refused(export_track, tmp_path, "shp").startswith("kind: expected one of gpx")
+    assert refused(scenematch.export_track, tmp_path, "shp").startswith("kind: expected one of gpx")
     assert not (tmp_path / "out").exists()
 
 
 def test_what_is_no_picture_is_not_located(flight, tmp_path):
     for file, said in ((tmp_path / "a.jpg", "no such file"), (flight, "one picture")):
         with pytest.raises(TelemetryError, match=f"expected .*{said}"):
-            locate_image(file, flight / "map.tif", camera=flight / "camera.yaml")
+            scenematch.locate_image(file, flight / "map.tif", camera=flight / "camera.yaml")
 
 
 def test_a_name_that_is_not_public_is_none_of_the_package():
@@ -170,6 +153,8 @@ def serial_link():
 
 
 def bridge():
+    from scenematch import BridgeFiles, BridgeSettings, CameraInput, MapInput, MavlinkSettings, run_mavlink_bridge
+
     files = BridgeFiles(map=MapInput("m.tif"), camera=CameraInput("c.yaml"), frames="f")
     run_mavlink_bridge(files, MavlinkSettings(connect="udpout:127.0.0.1:1"), BridgeSettings())
 
@@ -186,7 +171,7 @@ def ulog():
     ("module", "package", "extra", "use"),
     [
         ("pymavlink", "pymavlink", "mavlink", bridge),
-        ("pymavlink", "pymavlink", "mavlink", lambda: write_parameter_file("px4", "", "out.params")),
+        ("pymavlink", "pymavlink", "mavlink", lambda: scenematch.write_parameter_file("px4", "", "out.params")),
         ("serial", "pyserial", "mavlink", serial_link),
         ("rosbags", "rosbags", "bags", import_rosbags),
         ("rosbags.highlevel", "rosbags", "bags", import_rosbags),

@@ -10,7 +10,6 @@ import pytest
 from engine.geo import attitude_from_rotation, enu_from_body
 from scenematch.simulator.pilot import Pilot, plan_rounds, plan_route
 from scenematch.simulator.quadrotor import (
-    GRAVITY,
     STEP_S,
     Airframe,
     IdealImu,
@@ -61,7 +60,7 @@ def test_the_attitude_gives_the_acceleration_that_is_asked_for(heading):
     attitude, force = aim(wanted, heading, FRAME)
     np.testing.assert_allclose(attitude.T @ attitude, np.eye(3), atol=1e-12)
     assert np.linalg.det(attitude) == pytest.approx(1.0)
-    np.testing.assert_allclose(-attitude[:, 2] * np.linalg.norm(force) + GRAVITY, wanted, atol=1e-12)
+    np.testing.assert_allclose(-attitude[:, 2] * np.linalg.norm(force) - (0, 0, GRAVITY_MPS2), wanted, atol=1e-12)
     # The body's right stays level across the heading.
     sine, cosine = math.sin(math.radians(heading)), math.cos(math.radians(heading))
     assert attitude[:, 1] @ (sine, cosine, 0.0) == pytest.approx(0.0, abs=1e-12)

@@ -13,24 +13,15 @@ from engine.camera import Camera
 from engine.errors import OptionError, ShapeError
 from engine.values import Attitude
 from scenematch.runs.simulation import WorldSettings
-from scenematch.simulator import (
-    Condition,
-    FlightStyle,
-    Optics,
-    SensorNoise,
-    World,
-    build_town,
-    plan_flight,
-    render_frame,
-    take_picture,
-)
+from scenematch.simulator import Condition, FlightStyle, Optics, SensorNoise, World, build_town, plan_flight
 from scenematch.simulator.faults import Fault
 from scenematch.simulator.flight import DRONE_SENSOR, paper_camera
 from scenematch.simulator.light import LIGHTS
 from scenematch.simulator.loop import LoopOptions
+from scenematch.simulator.optics import take_picture
 from scenematch.simulator.pilot import Gains, plan_rounds, plan_route
 from scenematch.simulator.quadrotor import Airframe, Wind
-from scenematch.simulator.render import Glint
+from scenematch.simulator.render import Glint, render_frame
 from scenematch.simulator.sensors import Barometer, Compass, Imu, steps_between
 from tests.support.patches import CAMERA, EPSG, ORIGIN, TO_CRS, patch_world
 from tests.support.towns import drawn_town

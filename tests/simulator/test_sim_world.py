@@ -14,22 +14,12 @@ from engine.errors import OptionError
 from engine.geo import enu_from_body
 from engine.values import Attitude
 from scenematch.files.geotiff import write_geotiff
-from scenematch.simulator import (
-    CONDITIONS,
-    Condition,
-    FlightStyle,
-    SensorNoise,
-    World,
-    build_town,
-    plan_flight,
-    render_frame,
-    world_from_map,
-)
+from scenematch.simulator import FlightStyle, SensorNoise, World, build_town, plan_flight, world_from_map
 from scenematch.simulator.canvas import ASPHALT, CANOPY, GRASS
-from scenematch.simulator.conditions import apply_season, condition_by_name
+from scenematch.simulator.conditions import CONDITIONS, Condition, apply_season, condition_by_name
 from scenematch.simulator.light import LIGHTS, illuminate
 from scenematch.simulator.raster_world import bare_ground
-from scenematch.simulator.render import Atmosphere, Glint
+from scenematch.simulator.render import Atmosphere, Glint, render_frame
 from tests.support.patches import CAMERA, EPSG, GSD, ORIGIN, SIZE, TO_CRS, centre_of_bright, patch_world, project
 from tests.support.towns import site_of, under_map
 
