@@ -6,9 +6,6 @@ import sys
 import pytest
 
 from bench import campaign
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
-from tests.support.towns import drawn_town
 
 PLAN = """
 [runs.ncc]
@@ -41,9 +38,9 @@ def test_fixes_count_alike_in_a_pool():
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # processes, on a machine that may be busy
-def test_a_campaign_goes_on_where_it_ended(tmp_path):
+def test_a_campaign_goes_on_where_it_ended(flight_in, tmp_path):
     flight, out = tmp_path / "flight", tmp_path / "out"
-    write_flight(flight, plan_flight(town=drawn_town(), frames=2))
+    flight_in(flight, frames=2)
     text = (flight / "camera.yaml").read_text(encoding="utf-8")
     (flight / "other.yaml").write_text(text.replace("image_width: 300", "image_width: 320"), encoding="utf-8")
     (tmp_path / "plan.toml").write_text(PLAN.format(folder=flight), encoding="utf-8")

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import rasterio
 from PIL import Image
-from pyproj import Transformer
 from rasterio.enums import Resampling
-from rasterio.transform import Affine
-from rasterio.warp import reproject
+from rasterio.vrt import WarpedVRT
 
 from bench import datasets
 from scenematch.files.telemetry import read_telemetry
@@ -25,35 +23,18 @@ pytestmark = pytest.mark.usefixtures("bare_runs")
 
 
 @pytest.fixture(scope="module")
-def plan():
-    return plan_flight(town=drawn_town(), frames=7)
-
-
-@pytest.fixture(scope="module")
-def taken(plan):
+def taken():
     """Four frames of a flight that is under way, with their truth."""
+    plan = plan_flight(town=drawn_town(), frames=7)
     return list(zip(list(plan.iter_frames())[-4:], plan.truth_rows()[-4:], strict=True))
 
 
 @pytest.fixture(scope="module")
-def in_degrees(plan):
+def in_degrees(flight):
     """The town's map on an even grid of latitude and longitude, with its west, south, east and north."""
-    town = plan.town
-    rows, columns = town.ortho.shape[:2]
-    matrix = town.pixel_to_crs.copy()
-    matrix[:, 2] -= 0.5 * matrix[:, :2].sum(axis=1)
-    own, crs = Affine(*matrix.ravel()), f"EPSG:{town.crs_epsg}"
-    corners = np.array([[0, 0, 1], [columns, 0, 1], [0, rows, 1], [columns, rows, 1]]) @ matrix.T
-    lon, lat = Transformer.from_crs(crs, 4326, always_xy=True).transform(*corners.T)
-    west, south, east, north = lon.min(), lat.min(), lon.max(), lat.max()
-    step = (north - south) / rows  # the same in both directions, as the data set's are
-    width = int((east - west) / step)
-    picture = np.zeros((3, rows, width), np.uint8)
-    reproject(
-        np.moveaxis(town.ortho, 2, 0), picture, src_transform=own, src_crs=crs,
-        dst_transform=Affine(step, 0.0, west, 0.0, -step, north), dst_crs="EPSG:4326", resampling=Resampling.cubic,
-    )  # fmt: skip
-    return np.moveaxis(picture, 0, 2), tuple(float(v) for v in (west, south, west + step * width, north))
+    grid = {"crs": "EPSG:4326", "resampling": Resampling.cubic}
+    with rasterio.open(flight / "map.tif") as own, WarpedVRT(own, **grid) as warped:
+        return np.moveaxis(warped.read([1, 2, 3]), 0, 2), tuple(warped.bounds)
 
 
 def save(path, image):

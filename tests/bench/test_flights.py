@@ -1,23 +1,47 @@
-"""The score of a flight with faults."""
+"""Flights of the benchmark: the score with faults, a simulated vehicle's pilot, recorded flights, their camera."""
 
+import math
+import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from engine.errors import TelemetryError
 from engine.geo import LocalFrame
+from tests.support.videos import write_video
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from bench.live.flights import fly, sitl
 from bench.live.flights.camera import shown_picture
 from bench.live.flights.faults import FAULTS
-from bench.live.flights.fly import report
-from bench.live.flights.recorded import captured_s, off_m
+from bench.live.flights.recorded import captured_s, off_m, recorded
+from bench.live.flights.sitl import Pilot
+from bench.live.flights.video_camera import SIZE, Footage, ground_from_pixel, recorded_from_shown
 from bench.live.standin import State
+
+PLACE = LocalFrame(33.64, 72.99)
+
+
+def message(kind, **fields):
+    return SimpleNamespace(get_type=lambda: kind, **fields)
+
+
+def degrees_1e7(east_m, north_m):
+    lat_deg, lon_deg = PLACE.geodetic_from_enu(east_m, north_m)
+    return round(float(lat_deg) * 1e7), round(float(lon_deg) * 1e7)
+
+
+# ---------------------------------------------------------------------------------------------------------- faults
 
 
 def test_a_fault_is_scored_by_the_first_fix_after_its_end():
     scored = [(1.0, 0.1, 10.0), (17.0, 9.0, 10.0), (20.5, 0.3, 10.0), (36.0, 0.4, 20.0)]
-    lines = report(scored, "begun", FAULTS).splitlines()
+    lines = fly.report(scored, "begun", FAULTS).splitlines()
     assert "| 4 | 4.51 | 0.35 | 9.00 | 1 | 10, 20 |" in lines
     assert "| bridge killed 3 s | 2.50 | 0.30 | 14.5 |" in lines
     assert "| worker killed | 1.00 | 0.40 | 9.0 |" in lines
@@ -25,16 +49,14 @@ def test_a_fault_is_scored_by_the_first_fix_after_its_end():
 
 
 def test_a_flight_without_faults_has_no_table_of_them_and_one_without_fixes_says_so():
-    assert "fault" not in report([(1.0, 0.1, 10.0)], "begun")
-    assert report([], "begun", FAULTS) == "begun\n\nno fixes"
+    assert "fault" not in fly.report([(1.0, 0.1, 10.0)], "begun")
+    assert fly.report([], "begun", FAULTS) == "begun\n\nno fixes"
 
 
 def test_a_global_position_is_stamped_when_it_is_sent_and_says_how_long_it_took():
-    sensor = SimpleNamespace(
-        get_type=lambda: "GLOBAL_POSITION_SENSOR", time_usec=5_300_000, processing_time=300_000
-    )
+    sensor = message("GLOBAL_POSITION_SENSOR", time_usec=5_300_000, processing_time=300_000)
     assert captured_s(sensor) == pytest.approx(5.0)
-    estimate = SimpleNamespace(get_type=lambda: "VISION_POSITION_ESTIMATE", usec=5_000_000)
+    estimate = message("VISION_POSITION_ESTIMATE", usec=5_000_000)
     assert captured_s(estimate) == pytest.approx(5.0)
 
 
@@ -45,10 +67,187 @@ def test_a_fault_covers_the_camera_or_freezes_its_picture():
 
 
 def test_a_fix_is_scored_about_the_origin_that_the_autopilot_has():
-    place, state = LocalFrame(48.25, 16.45), State(10.0, 20.0, 100.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    lat_deg, lon_deg = place.geodetic_from_enu(4.0, 5.0)
-    pilot = SimpleNamespace(place=place, origin=(round(float(lat_deg) * 1e7), round(float(lon_deg) * 1e7), 0))
-    fix = SimpleNamespace(get_type=lambda: "VISION_POSITION_ESTIMATE", usec=0, x=15.0, y=6.0)
+    state = State(10.0, 20.0, 100.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    pilot = SimpleNamespace(place=PLACE, origin=(*degrees_1e7(4.0, 5.0), 0))
+    fix = message("VISION_POSITION_ESTIMATE", usec=0, x=15.0, y=6.0)
     assert off_m(fix, lambda _: state, pilot) == pytest.approx(0.0, abs=0.02)
     pilot.origin = None
     assert off_m(fix, lambda _: state, pilot) == pytest.approx(np.hypot(4.0, 5.0), abs=0.02)
+
+
+# ----------------------------------------------------------------------------------------------- simulated vehicle
+
+
+def test_the_estimate_is_held_against_the_true_state():
+    pilot = Pilot(None, PLACE)
+    lat, lon = degrees_1e7(0.0, 0.0)
+    pilot.take(message("GLOBAL_POSITION_INT", lat=0, lon=0, relative_alt=0))  # no position yet
+    pilot.take(message("SIM_STATE", lat_int=lat, lon_int=lon))
+    assert pilot.errors_m == {}
+    pilot.part = "course"
+    lat, lon = degrees_1e7(53.0, 1.0)
+    pilot.take(message("GLOBAL_POSITION_INT", lat=lat, lon=lon, relative_alt=170_000))
+    lat, lon = degrees_1e7(50.0, 5.0)
+    pilot.take(message("SIM_STATE", lat_int=lat, lon_int=lon))
+    assert pilot.height_m == pytest.approx(170.0)
+    assert pilot.errors_m["course"] == [pytest.approx(5.0, abs=0.02)]
+    assert "| course | 1 | 5.00 | 5.00 |" in sitl.report(pilot)
+
+
+def test_targets_have_the_heading_and_the_velocity_of_the_course():
+    sent = []
+    mav = SimpleNamespace(set_position_target_global_int_send=lambda *fields: sent.append(fields))
+    link = SimpleNamespace(mav=mav, recv_match=lambda **_: None)
+    state = State(10.0, 20.0, 170.0, 0.0, 0.0, 90.0, 3.0, 4.0)
+    assert sitl.follow(Pilot(link, PLACE), lambda _: state, 0.05)
+    ((ignored, *target),) = (fields[4:] for fields in sent)
+    assert target[:2] == [*degrees_1e7(10.0, 20.0)]
+    assert (target[3], target[4]) == (4.0, 3.0)  # north, east
+    assert target[9] == pytest.approx(np.pi / 2.0)
+    names = ("AX", "AY", "AZ", "YAW_RATE")
+    assert ignored == sum(getattr(mavlink, f"POSITION_TARGET_TYPEMASK_{name}_IGNORE") for name in names)
+
+
+ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+
+def heartbeat(mode, *, armed=True):
+    """Of an ArduCopter, in the mode by ArduPilot's number: 4 is GUIDED, 6 RTL, 9 LAND."""
+    return message(
+        "HEARTBEAT", type=mavlink.MAV_TYPE_QUADROTOR, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        base_mode=ARMED if armed else mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, custom_mode=mode,
+        get_srcSystem=lambda: 1, get_srcComponent=lambda: 1,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("mode", "name"), [(9, "LAND"), (6, "RTL")])
+def test_a_vehicle_that_lands_by_itself_is_steered_no_more_and_ends_the_flight(monkeypatch, mode, name):
+    """A link that plays a failsafe early on, and a landing that takes a while."""
+    monkeypatch.setattr(sitl, "take_off", lambda pilot, height_m: None)
+    left = [heartbeat(4)] * 3 + [heartbeat(mode)] * 40 + [heartbeat(mode, armed=False)]
+    waiting, commands, settings = [], [], []
+
+    def heard(**_):
+        time.sleep(0.01)
+        return left.pop(0) if left else None
+
+    mav = SimpleNamespace(
+        set_position_target_global_int_send=lambda *_: waiting.append(len(left)),
+        command_long_send=lambda *fields: commands.append(fields[2]),
+    )
+    link = SimpleNamespace(mav=mav, recv_match=heard, param_set_send=lambda *fields: settings.append(fields))
+    pilot = Pilot(link, PLACE)
+    pilot.texts.append("Scenematch: fixes begin")
+    sitl.fly(pilot, lambda _: State(0.0, 0.0, 170.0, 0.0, 0.0, 0.0, 0.0, 0.0), 60.0, 30.0)
+    assert (pilot.part, pilot.mode, pilot.armed, left) == (f"{name} by itself", name, False, [])
+    assert len(waiting) == 1  # one target, before the failsafe was heard of
+    assert mavlink.MAV_CMD_SET_EKF_SOURCE_SET not in commands
+    assert settings == []  # the receiver stays on
+
+
+# ------------------------------------------------------------------------------------------------ recorded flights
+
+
+RATE_HZ, NORTH_MPS = 25.0, 9.0
+CUE = (
+    "{n}\n00:00:0{s},{ms:03d} --> 00:00:0{s},{ms:03d}\nFrameCnt: {n}\n[latitude: {lat:.6f}] [longitude: 16.2] "
+    "[rel_alt: 80.0 abs_alt: 300.0] {gimbal}\n\n"
+)
+
+
+def video(folder, gimbal, size=(32, 32), shade=1):
+    """Three seconds due north, each frame a shade brighter, with a cue each: positions to 0.1 m, as DJI's."""
+    path, cues = folder / "DJI_0001.mp4", []
+    write_video(path, [shade * k for k in range(75)], size=size, rate_hz=RATE_HZ, codec="mp4v")
+    for k in range(75):
+        lat_deg = 48.1 + NORTH_MPS * k / RATE_HZ / 111_200.0
+        cues.append(CUE.format(n=k + 1, s=k // 25, ms=k % 25 * 40, lat=lat_deg, gimbal=gimbal))
+    (folder / "DJI_0001.SRT").write_text("".join(cues))
+    return path
+
+
+def test_it_flies_the_positions_and_the_velocity_of_the_subtitles(tmp_path):
+    motion, place, duration_s = recorded(video(tmp_path, "[gb_yaw: 30.0 gb_pitch: -90.0 gb_roll: 0.0]"))
+    assert (place.lat_deg, duration_s) == (pytest.approx(48.1), pytest.approx(74 / RATE_HZ))
+    for time_s in (0.0, 1.0, 2.5):
+        state = motion(time_s)
+        assert (state.height_m, state.heading_deg) == pytest.approx((80.0, 30.0))
+        assert (state.east_m, state.north_m) == pytest.approx((0.0, NORTH_MPS * time_s), abs=0.2)
+        assert (state.east_mps, state.north_mps) == pytest.approx((0.0, NORTH_MPS), abs=0.3)
+
+
+def test_subtitles_without_a_heading_are_refused(tmp_path):
+    with pytest.raises(TelemetryError, match="expected subtitles beside it with position, rel_alt and gimbal"):
+        recorded(video(tmp_path, ""))
+
+
+def folder(path, truth, telemetry):
+    """Two seconds due north, a row a second, with these columns besides."""
+    for name, columns in (("truth", truth), ("telemetry", telemetry)):
+        places = {"lat_deg": 48.1, "lon_deg": 16.2} if name == "truth" else {"frame": 0}
+        columns = places | columns
+        rows = [",".join(["timestamp_ns", *columns])]
+        for k in range(3):
+            steps = {"lat_deg": 1e-4 * k, "frame": k}
+            values = [value + steps.get(column, 0) for column, value in columns.items()]
+            rows.append(",".join(map(str, [10**9 * (k + 1), *values])))
+        (path / f"{name}.csv").write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_a_truth_without_heights_above_ground_is_flown_at_the_telemetrys(tmp_path):
+    heading, height, altitude = {"heading_deg": 30.0}, {"height_agl_m": 150.0}, {"alt_amsl_m": 200.0}
+    motion, _, _ = recorded(folder(tmp_path, heading | altitude, height))
+    assert [motion(time_s).height_m for time_s in (0.0, 0.5, 2.0)] == [150.0] * 3
+    motion, _, _ = recorded(folder(tmp_path, heading | {"height_agl_m": 149.0}, height))
+    assert motion(1.0).height_m == 149.0
+    with pytest.raises(TelemetryError, match=r"height_agl_m in truth.csv or telemetry.csv, got none in either$"):
+        recorded(folder(tmp_path, heading | altitude, {}))
+    with pytest.raises(TelemetryError, match=r"truth.csv: expected a heading_deg in every row$"):
+        recorded(folder(tmp_path, altitude, height))
+
+
+# --------------------------------------------------------------------------------------- the camera that shows one
+
+
+FRAME, FOCAL_PX = (852, 480), 680.0
+TAKEN = State(10.0, -20.0, 170.0, 0.0, 0.0, 104.0, 0.0, 0.0)
+MARGIN = np.array([(FRAME[0] - SIZE[0]) / 2.0, (FRAME[1] - SIZE[1]) / 2.0])
+
+
+def moved(forward_m: float, right_m: float) -> State:
+    """The vehicle so far from where the frame was taken."""
+    heading = math.radians(TAKEN.heading_deg)
+    east_m = forward_m * math.sin(heading) + right_m * math.cos(heading)
+    north_m = forward_m * math.cos(heading) - right_m * math.sin(heading)
+    return replace(TAKEN, east_m=TAKEN.east_m + east_m, north_m=TAKEN.north_m + north_m)
+
+
+def test_where_the_frame_was_taken_its_middle_is_shown():
+    warp = recorded_from_shown(TAKEN, FRAME, TAKEN, FOCAL_PX)
+    assert np.allclose(warp, np.column_stack([np.eye(2), MARGIN]), atol=1e-9)
+
+
+def test_forward_is_up_and_right_is_right():
+    metre_px = FOCAL_PX / TAKEN.height_m
+    warp = recorded_from_shown(TAKEN, FRAME, moved(5.0, 3.0), FOCAL_PX)
+    assert np.allclose(warp[:, 2] - MARGIN, [3.0 * metre_px, -5.0 * metre_px], atol=1e-9)
+
+
+def test_a_pixel_is_on_the_same_ground_in_both_pictures():
+    vehicle = replace(moved(-4.0, 2.0), height_m=181.0, heading_deg=97.0)
+    warp = recorded_from_shown(TAKEN, FRAME, vehicle, FOCAL_PX)
+    for pixel in ((0.0, 0.0, 1.0), (639.0, 399.0, 1.0), (100.0, 300.0, 1.0)):
+        on_ground = ground_from_pixel(vehicle, SIZE, FOCAL_PX) @ pixel
+        recorded = warp @ pixel
+        assert np.allclose(ground_from_pixel(TAKEN, FRAME, FOCAL_PX) @ [*recorded, 1.0], on_ground, atol=1e-9)
+
+
+def test_the_picture_is_of_the_frame_that_was_taken_nearest(tmp_path):
+    """Frames of one shade each, 0.36 m apart due north: the shade tells the frame."""
+    path = video(tmp_path, "[gb_yaw: 0.0 gb_pitch: -90.0 gb_roll: 0.0]", FRAME, shade=3)
+    footage = Footage(path, 64.1, every=5)
+    for index in (0, 7, 14):
+        shade = footage.picture(footage.states[index]).mean()
+        assert shade == pytest.approx(15 * index, abs=4)
+    assert footage.hfov_deg == pytest.approx(50.4, abs=0.1)

@@ -1,28 +1,48 @@
-"""Audits: what is painted on a map is flagged as what it is, the raster lies where the map does, routes read."""
+"""Audits: what is painted on a map is flagged as what it is, also of parts of a huge map; routes; the command."""
 
 import json
 import re
+import tracemalloc
 
 import cv2
 import numpy as np
 import pytest
 import rasterio
+from affine import Affine
 from pyproj import Transformer
+from rasterio.enums import Resampling
+from rasterio.windows import Window as RasterWindow
 
-from bench.accuracy.audit import Trial, auc, fit
 from engine import Camera, OrthoMap
 from engine.errors import OptionError, TelemetryError
 from scenematch.check.availability import Flag, audit_site, fix_probability, predict_route
-from scenematch.check.plan import AuditOptions, plan_audit
+from scenematch.check.plan import AuditOptions, MapPart, plan_audit
 from scenematch.check.self_match import measure_self_match
 from scenematch.cli.app import run
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.route import read_route
-from tests.support.audits import CAMERA, GRID, HEIGHT_M, SIDE, UTM, audit, lat_lon, town_gray
 from tests.support.commands import refusal
+from tests.support.towns import drawn_town
+
+CAMERA, HEIGHT_M = Camera.from_fov(300, 300, 60.0), 75.0
+GRID, UTM = np.array([[0.5, 0.0, 600_000.0], [0.0, -0.5, 4_500_000.0]]), "EPSG:32614"
+SIDE = 900
 
 NOISE = 3.0  # of the water, in grey levels
 HALF = SIDE // 2
+HUGE_SIDE = 24_000  # pixels of the huge map: more than are audited as a whole
+CORNER = (18_000, 7_000)  # of the town on it
+MIDDLE = (CORNER[0] + 450, CORNER[1] + 450)
+
+
+def town_gray():
+    """A town, (SIDE, SIDE)."""
+    return cv2.cvtColor(drawn_town(1).ortho, cv2.COLOR_RGB2GRAY)[:SIDE, :SIDE]
+
+
+def lat_lon(site, xy_px):
+    """Latitudes and longitudes (N, 2) of pixels."""
+    return np.stack(site.geodetic_from_pixel(np.asarray(xy_px, float)), axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -186,24 +206,19 @@ def test_a_route_without_a_way_is_refused(found):
         predict_route(found, [40.0, 40.0], [-100.0, -100.0])
 
 
+def simple(command, *place):
+    """A mission item; by default its place is where the vehicle then is."""
+    lat, lon = place or (None, None)
+    return {"type": "SimpleItem", "command": command, "params": [0, 0, 0, None, lat, lon, 50]}
+
+
 LINE = {"type": "LineString", "coordinates": [[8.0, 47.0, 500.0], [8.1, 47.2]]}
-SIMPLE = {"type": "SimpleItem", "command": 16, "params": [0, 0, 0, None, 47.0, 8.0, 50]}
-PLAN = {
-    "fileType": "Plan",
-    "mission": {
-        "plannedHomePosition": [46.9, 7.9, 400],
-        "items": [
-            {"type": "SimpleItem", "command": 22, "params": [0, 0, 0, None, None, None, 50]},
-            SIMPLE,
-            {"type": "SimpleItem", "command": 178, "params": [1, 5, -1, 0, 1, 1, 0]},
-            {
-                "type": "ComplexItem",
-                "TransectStyleComplexItem": {"Items": [{**SIMPLE, "params": [0, 0, 0, None, 47.2, 8.1, 50]}]},
-            },
-            {"type": "SimpleItem", "command": 20, "params": [0] * 7},
-        ],
-    },
-}
+FEATURE = {"type": "Feature", "properties": {}, "geometry": LINE}
+POINT = {"type": "Feature", "geometry": {"type": "Point", "coordinates": [1, 2]}}
+SURVEY = {"type": "ComplexItem", "TransectStyleComplexItem": {"Items": [simple(16, 47.2, 8.1)]}}
+SPEED = {"type": "SimpleItem", "command": 178, "params": [1, 5, -1, 0, 1, 1, 0]}
+ITEMS = [simple(22), simple(16, 47.0, 8.0), SPEED, SURVEY, simple(20)]  # from take-off to the return home
+PLAN = {"fileType": "Plan", "mission": {"plannedHomePosition": [46.9, 7.9, 400], "items": ITEMS}}
 
 
 def written(tmp_path, content):
@@ -212,20 +227,7 @@ def written(tmp_path, content):
     return path
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        LINE,
-        {"type": "Feature", "properties": {}, "geometry": LINE},
-        {
-            "type": "FeatureCollection",
-            "features": [
-                {"type": "Feature", "geometry": {"type": "Point", "coordinates": [1, 2]}},
-                {"type": "Feature", "geometry": LINE},
-            ],
-        },
-    ],
-)
+@pytest.mark.parametrize("content", [LINE, FEATURE, {"type": "FeatureCollection", "features": [POINT, FEATURE]}])
 def test_geojson_gives_latitude_before_longitude(tmp_path, content):
     assert read_route(written(tmp_path, content)).tolist() == [[47.0, 8.0], [47.2, 8.1]]
 
@@ -257,7 +259,124 @@ def test_a_bad_route_is_one_clear_line(tmp_path, content, words):
     assert "\n" not in str(error.value)
 
 
+# -------------------------------------------------------------------------------------------------- parts of a map
+
+
+@pytest.fixture(scope="module")
+def town():
+    return OrthoMap.from_arrays(np.maximum(town_gray(), 1), GRID, UTM)
+
+
+@pytest.fixture(scope="module")
+def huge_path(tmp_path_factory):
+    """A sparse GeoTIFF with overviews; all but the town is nodata, over which averages would take long."""
+    path = tmp_path_factory.mktemp("huge") / "huge.tif"
+    at = Affine(0.5, 0.0, 600_000.0 - 0.5 * CORNER[0], 0.0, -0.5, 4_500_000.0 + 0.5 * CORNER[1])
+    profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "crs": UTM, "transform": at, "nodata": 0}
+    profile |= {"tiled": True, "blockxsize": 512, "blockysize": 512, "sparse_ok": True, "compress": "deflate"}
+    profile |= {"width": HUGE_SIDE, "height": HUGE_SIDE}
+    with rasterio.Env(SPARSE_OK_OVERVIEW="ON"), rasterio.open(path, "w", **profile) as dataset:
+        dataset.write(np.maximum(town_gray(), 1), 1, window=RasterWindow(*CORNER, 900, 900))
+        dataset.build_overviews([2, 4, 8, 16, 32], Resampling.nearest)
+    return path
+
+
+@pytest.fixture(scope="module")
+def huge(huge_path):
+    return OrthoMap.open(huge_path)
+
+
+def around(site, xy_px, radius_m):
+    return (*lat_lon(site, xy_px).tolist(), radius_m)
+
+
+def test_around_a_place_all_within_the_radius_is_looked_at_and_nothing_else(town):
+    plan = plan_audit(town, CAMERA, HEIGHT_M, part=MapPart(around=around(town, [450, 300], 100.0)))
+    off_m = np.hypot(*np.moveaxis(plan.centers_px - [450, 300], -1, 0)) * town.gsd_m_per_px
+    np.testing.assert_array_equal(plan.audited, off_m <= 100.0)
+    assert plan.area_px * town.gsd_m_per_px**2 == pytest.approx(np.pi * 100.0**2, rel=0.1)
+    whole = plan_audit(town, CAMERA, HEIGHT_M)
+    assert plan.spacing_px == pytest.approx(whole.spacing_px, rel=0.1)
+    assert len(plan) < len(whole) / 4
+
+
+def test_a_radius_below_the_spacing_is_one_place_there(town):
+    plan = plan_audit(town, CAMERA, HEIGHT_M, part=MapPart(around=around(town, [450, 300], 1.0)))
+    assert plan.centers_px[plan.audited] == pytest.approx(np.array([[450, 300]]), abs=3.0)
+
+
+def test_a_part_at_the_edge_ends_with_the_map(town):
+    plan = plan_audit(town, CAMERA, HEIGHT_M, part=MapPart(around=around(town, [5, 890], 60.0)))
+    assert (plan.window.x0, plan.window.y0 + plan.window.height_px) == (0, 900)
+
+
+@pytest.mark.slow
+def test_a_route_is_predicted_from_its_corridor_as_from_the_whole_map(town):
+    route = lat_lon(town, [[200, 250], [640, 300], [700, 650]])
+    whole = audit_site(town, CAMERA, HEIGHT_M)
+    part = audit_site(town, CAMERA, HEIGHT_M, part=MapPart(route=route, corridor_m=10.0))
+    assert len(part.plan) < 0.5 * len(whole.plan)
+    stated, expected = (predict_route(one, *route.T) for one in (part, whole))
+    assert stated.length_m == expected.length_m
+    assert stated.availability == pytest.approx(expected.availability, abs=0.05)
+    assert Flag.OUTSIDE not in part.flag_at(stated.xy_px)
+    assert (part.flags == Flag.OUTSIDE).any()
+    np.testing.assert_array_equal(part.flags == Flag.OUTSIDE, ~part.plan.audited)
+    assert np.isnan(part.availability[~part.plan.audited]).all()
+    assert sum(part.shares.values()) == pytest.approx(1.0)
+
+
+def test_the_corridor_is_of_what_the_camera_sees_not_of_where_it_flies(town):
+    """A camera that looks 30 degrees to one side sees ground beside the route."""
+    turn = cv2.Rodrigues(np.radians([30.0, 0.0, 0.0]))[0]
+    aside = Camera(300, 300, CAMERA.matrix, mount=turn @ CAMERA.mount)
+    route = lat_lon(town, [[200, 450], [700, 450]])
+    fine = AuditOptions(spacing=0.05)
+    plan = plan_audit(town, aside, HEIGHT_M, fine, part=MapPart(route=route, corridor_m=5.0))
+    beside_m = abs(plan.centers_px[plan.audited][:, 1].mean() - 450) * town.gsd_m_per_px
+    assert beside_m == pytest.approx(HEIGHT_M * np.tan(np.radians(30.0)), abs=3.0)
+
+
+def test_both_parts_are_looked_at(town):
+    place, route = around(town, [200, 200], 50.0), lat_lon(town, [[500, 700], [800, 700]])
+    both = plan_audit(town, CAMERA, HEIGHT_M, part=MapPart(around=place, route=route))
+    one, other = (
+        plan_audit(town, CAMERA, HEIGHT_M, part=part) for part in (MapPart(around=place), MapPart(route=route))
+    )
+    assert len(both) == pytest.approx(len(one) + len(other), rel=0.15)
+
+
+@pytest.mark.slow
+def test_a_long_way_over_a_huge_map_has_no_more_places_and_no_finer_grid_than_memory_allows(huge):
+    route = lat_lon(huge, [[10, 10], [23_990, 23_990], [23_990, 10]])
+    plan = plan_audit(huge, CAMERA, 20.0, AuditOptions(max_cells=500), part=MapPart(route=route, corridor_m=5.0))
+    assert 100 < len(plan) <= 500
+    assert plan.audited.size < 200_000
+
+
+def test_a_part_of_nothing_is_refused():
+    with pytest.raises(OptionError, match="part: expected around or route"):
+        MapPart()
+    with pytest.raises(OptionError, match="around: expected metres above 0, got 0"):
+        MapPart(around=(40.0, -99.0, 0.0))
+
+
+def test_a_part_beside_the_map_is_refused(town):
+    with pytest.raises(OptionError, match="part: expected one on the map arrays, got one off it"):
+        plan_audit(town, CAMERA, HEIGHT_M, part=MapPart(around=around(town, [-5000, 100], 100.0)))
+
+
 # ---------------------------------------------------------------------------------------------- command line
+
+
+def audit(map_file, out, *more):
+    """The command."""
+    return ["map", "audit", str(map_file), f"--height-agl={HEIGHT_M:g}", f"--out={out}", *map(str, more)]
+
+
+def write_route(folder, site, xy_px):
+    """A route through pixels of a map, as GeoJSON."""
+    return written(folder, {"type": "LineString", "coordinates": lat_lon(site, xy_px)[:, ::-1].tolist()})
 
 
 @pytest.fixture(scope="module")
@@ -270,11 +389,7 @@ def map_file(patchwork, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def route_file(site, tmp_path_factory):
-    route = lat_lon(site, [[130, 225], [780, 225]])
-    path = tmp_path_factory.mktemp("route") / "route.geojson"
-    line = {"type": "LineString", "coordinates": route[:, ::-1].tolist()}
-    path.write_text(json.dumps(line), encoding="utf-8")
-    return path
+    return write_route(tmp_path_factory.mktemp("route"), site, [[130, 225], [780, 225]])
 
 
 @pytest.mark.slow
@@ -356,24 +471,74 @@ def test_a_route_elsewhere_is_refused(map_file, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-# ---------------------------------------------------------------------------------------------- its benchmark
+@pytest.fixture(scope="module")
+def huge_route(huge, tmp_path_factory):
+    return write_route(tmp_path_factory.mktemp("route"), huge, np.array([[200, 250], [640, 300]]) + CORNER)
 
 
-def test_auc_is_the_share_of_pairs_in_the_right_order():
-    right = np.array([True, True, False, False, False])
-    assert auc(np.array([5.0, 4.0, 3.0, 2.0, 1.0]), right) == 1.0
-    assert auc(np.array([1.0, 2.0, 3.0, 4.0, 5.0]), right) == 0.0
-    assert auc(np.ones(5), right) == 0.5
-    assert auc(np.array([5.0, 1.5, 3.0, 2.0, 1.0]), right) == pytest.approx(4 / 6)
-    assert np.isnan(auc(np.ones(2), np.array([True, True])))
+def place_option(site, xy_px, radius_m):
+    lat, lon = lat_lon(site, xy_px)
+    return f"--around={lat:.8f},{lon:.8f},{radius_m:g}"
 
 
-def test_the_fit_finds_the_weights_that_drew_the_outcomes():
-    rng = np.random.default_rng(0)
-    weights, features = np.array([-1.0, 0.5, 0.0, 2.0]), rng.normal(size=(20_000, 3))
-    chance = 1.0 / (1.0 + np.exp(-weights[0] - features @ weights[1:]))
-    found = [
-        Trial(60.0, 0.5, row, bool(right), False)
-        for row, right in zip(features, rng.random(len(chance)) < chance, strict=True)
-    ]
-    assert fit(found) == pytest.approx(weights, abs=0.1)
+@pytest.mark.slow
+def test_a_huge_map_is_audited_around_a_place_in_a_part_of_the_memory(huge_path, huge, tmp_path, capsys):
+    """Its grey levels and validity would take 1,152 MB."""
+    import matplotlib.figure  # noqa: F401  an import while memory is traced takes long
+
+    tracemalloc.start()
+    code = run(audit(huge_path, tmp_path / "out", place_option(huge, MIDDLE, 80.0), "--json"))
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert code == 0
+    assert peak_bytes < HUGE_SIDE * HUGE_SIDE / 3
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["part"]["area_km2"] == pytest.approx(np.pi * 0.08**2, rel=0.15)
+    assert summary["part"]["places"] < np.prod(summary["places"])
+    assert summary["shares"]["nodata"] == 0.0
+    assert summary["availability"] > 0.3
+    with rasterio.open(tmp_path / "out" / "matchability.tif") as raster:
+        values, at = raster.read(1), raster.transform
+        x, y = at @ (values.shape[1] / 2, values.shape[0] / 2)
+    lon, lat = Transformer.from_crs(UTM, "EPSG:4326", always_xy=True).transform(x, y)
+    assert huge.pixel_from_geodetic(lat, lon) == pytest.approx(MIDDLE, abs=2.0)
+    assert values[0, 0] == -1.0  # a corner of the square about the circle
+    assert values[values.shape[0] // 2, values.shape[1] // 2] >= 0.0
+    assert cv2.imread(str(tmp_path / "out" / "audit.png"), cv2.IMREAD_GRAYSCALE).std() > 5
+
+
+@pytest.mark.slow
+def test_a_huge_map_is_audited_along_a_route(huge_path, huge_route, tmp_path, capsys):
+    assert run(audit(huge_path, tmp_path / "out", f"--route={huge_route}", "--json")) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["route"]["availability"] > 0.3
+    assert 0.02 < summary["part"]["area_km2"] < 0.08
+    assert run(audit(huge_path, tmp_path / "near", f"--route={huge_route}", "--corridor-m=10", "--json")) == 0
+    assert json.loads(capsys.readouterr().out)["part"]["area_km2"] < summary["part"]["area_km2"] / 2
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ([], "--around: expected LAT,LON,RADIUS_M, or a --route to audit along: the map of 12 x 12 km is too"),
+        (["--around=40.6,-97.7"], "--around: expected LAT,LON,RADIUS_M in degrees and metres, got '40.6,-97.7'"),
+        (["--around=north"], "--around: expected LAT,LON,RADIUS_M in degrees and metres, got 'north'"),
+        (["--around=40.6,-97.7,0"], "--around: expected a place on the Earth and a radius above 0 m"),
+        (["--around=95,-97.7,10"], "--around: expected a place on the Earth and a radius above 0 m"),
+        (["--around=41.6,-97.7,10"], "--around: expected a place on the map huge.tif, got 41.6,-97.7"),
+        (["--corridor-m=50"], "--corridor-m: expected a --route with it, got none"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_audited_is_one_line_and_no_folder(huge_path, tmp_path, capsys, more, words):
+    assert refusal(capsys, audit(huge_path, tmp_path / "out", *more)).startswith(words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_corridor_of_no_width_is_refused_by_the_name_that_was_typed(huge_path, huge_route, tmp_path, capsys):
+    command = audit(huge_path, tmp_path / "out", f"--route={huge_route}", "--corridor-m=-1")
+    assert refusal(capsys, command) == "--corridor-m: expected metres above 0, got -1\n"
+
+
+def test_a_part_as_large_as_a_huge_map_is_refused(huge_path, huge, tmp_path, capsys):
+    command = audit(huge_path, tmp_path / "out", place_option(huge, [12_000, 12_000], 9000.0))
+    assert "--around: expected at most 134 km2 of the map to audit, got 14" in refusal(capsys, command)

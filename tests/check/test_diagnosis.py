@@ -11,11 +11,11 @@ from engine.camera import mount_rotation
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.values import Attitude, Prior
 from scenematch.check import Diagnosis, diagnose
-from scenematch.check.causes import findings, is_known
+from scenematch.check.causes import IN_CALIBRATION, findings, is_known
 from scenematch.check.contradictions import contradictions
-from scenematch.check.findings import TelemetrySeries
+from scenematch.check.findings import Finding, TelemetrySeries
 from scenematch.check.sightings import Sighting
-from scenematch.runs.checking import as_rows
+from scenematch.runs.checking import _that_can_be_set, as_rows
 from scenematch.simulator import plan_flight
 from tests.support.towns import drawn_town, site_of
 
@@ -109,21 +109,32 @@ def test_false_sightings_over_a_straight_line_are_no_optical_centre(outliers):
 
 
 @pytest.mark.parametrize(
-    ("angles", "cause"),
+    ("field", "values", "cause", "word"),
     [
-        (np.radians(ANGLES), "radians"),
-        (ANGLES[:, [1, 0, 2]], "swapped"),
-        (ANGLES * [-1, 1, 1], "sign"),
-        (ANGLES * [-1, -1, 1], "sign"),
-        (ANGLES * [1, 1, -1], "heading_convention"),
-        (ANGLES * [1, 1, -1] + np.array([0, 0, 90]), "heading_convention"),
-        (ANGLES + np.array([0, 0, 8.1]), "heading"),
-        (ANGLES + np.array([0, 0, -14.0]), "heading"),
-        (ANGLES + np.array([4.0, -3.0, 0]), "mount"),
+        ("angles_deg", np.radians(ANGLES), "radians", ""),
+        ("angles_deg", ANGLES[:, [1, 0, 2]], "swapped", ""),
+        ("angles_deg", ANGLES * [-1, 1, 1], "sign", ""),
+        ("angles_deg", ANGLES * [-1, -1, 1], "sign", ""),
+        ("angles_deg", ANGLES * [1, 1, -1], "heading_convention", ""),
+        ("angles_deg", ANGLES * [1, 1, -1] + np.array([0, 0, 90]), "heading_convention", ""),
+        ("angles_deg", ANGLES + np.array([0, 0, 8.1]), "heading", ""),
+        ("angles_deg", ANGLES + np.array([0, 0, -14.0]), "heading", ""),
+        ("angles_deg", ANGLES + np.array([4.0, -3.0, 0]), "mount", ""),
+        ("height_m", np.full(N, 140.0), "height", ""),
+        ("height_m", np.full(N, 100.0), "height", ""),
+        ("height_m", np.full(N, 330.0), "height", ""),
+        ("height_m", np.full(N, 120.0 / 0.3048), "height_feet", ""),
+        ("velocity_mps", VELOCITY[:, ::-1], "velocity", "swapped"),
+        ("velocity_mps", -VELOCITY, "velocity", "sign"),
+        ("velocity_mps", 3.6 * VELOCITY, "velocity", "km/h"),
+        ("velocity_mps", VELOCITY / 0.5144, "velocity", "knots"),
+        ("velocity_mps", VELOCITY / 1.7, "velocity", "times as far"),
     ],
 )
-def test_an_attitude_that_is_wrong_is_named(angles, cause):
-    assert causes(series(angles_deg=np.asarray(angles, float)), seen()) == [cause]
+def test_a_field_that_is_wrong_is_named(field, values, cause, word):
+    (found,) = findings(series(**{field: values}), seen(), 1.0)
+    assert found.cause == cause
+    assert word in found.text
 
 
 def test_an_offset_has_its_value_within_three_sigma():
@@ -149,13 +160,6 @@ def test_a_camera_that_is_turned_is_no_compass_error(turn_deg):
     assert found.cure == f"--mount {name}"
 
 
-@pytest.mark.parametrize(
-    ("height", "cause"), [(140.0, "height"), (100.0, "height"), (120.0 / 0.3048, "height_feet"), (330.0, "height")]
-)
-def test_a_height_that_is_wrong_is_named(height, cause):
-    assert causes(series(height_m=np.full(N, height)), seen()) == [cause]
-
-
 def test_a_height_that_is_scaled_is_told_from_one_that_is_shifted():
     true = 60.0 + TIME_S * 2.0
     poses = [replace(one, height_agl_m=float(true[one.index])) for one in seen(outliers=0)]
@@ -169,17 +173,6 @@ def test_a_clock_that_is_off_is_named(shift_s):
     (found,) = findings(series(angles_deg=late), seen(), 1.0)
     assert found.cause == "clock"
     assert found.value == pytest.approx(shift_s, abs=0.15)
-
-
-@pytest.mark.parametrize(
-    ("velocity", "word"),
-    [(VELOCITY[:, ::-1], "swapped"), (-VELOCITY, "sign"), (3.6 * VELOCITY, "km/h"), (VELOCITY / 0.5144, "knots"),
-     (VELOCITY / 1.7, "times as far")],
-)  # fmt: skip
-def test_a_velocity_that_is_wrong_is_named(velocity, word):
-    (found,) = findings(series(velocity_mps=np.asarray(velocity, float)), seen(), 1.0)
-    assert found.cause == "velocity"
-    assert word in found.text
 
 
 def test_a_map_that_other_positions_contradict_is_named():
@@ -309,3 +302,25 @@ def test_positions_of_what_the_middle_shows_are_no_shifted_map():
     telemetry = series(angles_deg=angles, reference_m=PLACES - (left_m, 0.0), reference_sigma_m=np.full(N, 1.0))
     assert causes(telemetry, tilted) == []
     assert causes(replace(telemetry, reference_m=PLACES - (left_m, -30.0)), tilted) == ["map"]
+
+
+# --------------------------------------------------------------------------------------------- what a user can set
+
+
+LINE = "mount: [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]"
+
+
+def cure(text, *, gimbal=False, calibration=True, cause="mount"):
+    return _that_can_be_set(Finding(cause, "it hangs off", text), gimbal, calibration).cure
+
+
+def test_a_mount_is_written_where_there_is_a_calibration_or_can_be():
+    assert cure(LINE + IN_CALIBRATION) == f"{LINE} in the calibration"
+    assert cure(LINE + IN_CALIBRATION, calibration=False) == f"write a calibration file with {LINE}, for --camera"
+    assert cure("--mount nadir-tail", calibration=False) == "--mount nadir-tail"
+
+
+@pytest.mark.parametrize("text", [LINE + IN_CALIBRATION, "--mount nadir-tail"])
+def test_beside_a_gimbal_its_angles_are_corrected(text):
+    assert cure(text, gimbal=True).startswith("the gimbal's angles replace a mount: correct the angles")
+    assert cure("--correct angles=radians", gimbal=True, cause="radians") == "--correct angles=radians"

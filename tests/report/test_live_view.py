@@ -34,9 +34,7 @@ from scenematch.report import live_view
 from scenematch.report.live_shapes import FIX_RGB, SIGMAS, ellipsoid
 from tests.support import browser
 from tests.support.commands import refusal
-
-FRAMES = 6
-DARK = 4  # a frame that shows nothing
+from tests.support.dark_flight import DARK, FRAMES, dark_flight
 
 
 def rows_of(recording):
@@ -64,8 +62,7 @@ def has_content(row):
 def flown(flight_in, tmp_path_factory):
     """A flight with a black frame, and what tracks it by a method and says where the results are."""
     folder = tmp_path_factory.mktemp("live")
-    files = flight_in(folder / "flight", frames=FRAMES)
-    cv2.imwrite(str(folder / "flight" / "frames" / f"{DARK:06d}.jpg"), np.zeros((300, 300, 3), np.uint8))
+    files = dark_flight(flight_in, folder / "flight")
 
     @cache
     def tracked(method, name):

@@ -1,15 +1,20 @@
-"""Figures of merit against hand-made tracks, and labels of logarithmic axes."""
+"""Figures of merit against hand-made tracks; segments and steps by velocity against plain loops."""
 
 import json
 import math
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from engine.geo import LocalFrame
 from engine.values import Truth
+from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
-from scenematch.report.metrics import Ground, errors_en_m, summarise
+from scenematch.report.consistency import motion_consistency
+from scenematch.report.metrics import Ground, TrackErrors, errors_en_m, summarise
+from scenematch.report.segments import segment_ends, segment_errors
 
 HERE = LocalFrame(32.79, 34.99)
 SECOND_NS = 1_000_000_000
@@ -115,16 +120,6 @@ def test_a_false_fix_is_wrong_by_10_m_and_by_3_of_its_own_sigmas(error_en_m, sig
     assert (summary["wrong_over_10m"], summary["false_fixes"]) == (wrong, false)
 
 
-def test_nees_of_a_consistent_covariance_is_2():
-    rng = np.random.default_rng(8)
-    root = np.array([[2.0, 0.0], [0.9, 0.6]])
-    covariance = root @ root.T
-    sigma = np.sqrt(np.diag(covariance))
-    rows = [fix_at(*(root @ rng.normal(size=2)), t, sigma, covariance[0, 1]) for t in range(1500)]
-    truth = [truth_at(0, 0, t) for t in range(1500)]
-    assert summarise(rows, truth, frame=HERE)["nees_mean"] == pytest.approx(2.0, abs=0.15)
-
-
 def test_the_origin_of_the_frame_does_not_matter():
     rows = [fix_at(7.0 * t + 2.0, 3.0 * t - 1.0, t) for t in range(8)]
     here, elsewhere = (summarise(rows, straight(), frame=frame) for frame in (HERE, LocalFrame(32.80, 35.0)))
@@ -150,3 +145,119 @@ def test_a_summary_is_json_without_nan():
     rows = [fix_at(0, 0, 0, sigma_m=(0.0, 0.0)), refusal_at(None), fix_at(1, 1, 1, sigma_m=(None, None))]
     for truth in (None, straight(), [truth_at(0, 0, 999)]):
         assert json.loads(json.dumps(summarise(rows, truth), allow_nan=False))
+
+
+# ------------------------------------------------------------------------------------------------ segments
+
+
+def walked(seed=3, count=400, rate_hz=5.0):
+    """A walk with a stop, refusals and errors that are known."""
+    rng = np.random.default_rng(seed)
+    step = rng.normal([1.2, 0.4], 0.3, (count, 2))
+    step[100:140] = 0.0  # it hovers
+    true = np.cumsum(step, axis=0)
+    error = rng.normal(0.0, 0.5, (count, 2))
+    error[rng.random(count) < 0.1] = np.nan
+    rows = [TrackRow(timestamp_ns=round(i * 1e9 / rate_hz), frame=str(i), status="fix") for i in range(count)]
+    return rows, TrackErrors(true, true + error, error, np.tile(np.eye(2), (count, 1, 1)))
+
+
+def by_hand(along, error, asked):
+    """Every pair (i, j), j not before i, nearest to the asked length and within a tenth of it."""
+    off = []
+    for i in range(len(along)):
+        best = min(range(i, len(along)), key=lambda j: (abs(along[j] - along[i] - asked), j))
+        if abs(along[best] - along[i] - asked) <= 0.1 * asked:
+            off.append(math.dist(error[best], error[i]))
+    return off
+
+
+def test_the_table_is_that_of_a_plain_loop():
+    rows, errors = walked()
+    known = np.isfinite(errors.error_en_m[:, 0])
+    true, error = errors.truth_en_m[known], errors.error_en_m[known]
+    path = [0.0]
+    for a, b in pairwise(true):
+        path.append(path[-1] + math.dist(a, b))
+    time = [rows[i].timestamp_ns / 1e9 for i in np.flatnonzero(known)]
+    found = segment_errors(rows, errors)
+    assert [row["length_m"] for row in found if "length_m" in row][:3] == [10.0, 50.0, 100.0]
+    assert [row["duration_s"] for row in found if "duration_s" in row] == [1.0, 10.0, 30.0, 60.0]
+    for row in found:
+        along, asked = (path, row["length_m"]) if "length_m" in row else (time, row["duration_s"])
+        off = by_hand(along, error, asked)
+        assert row["segments"] == len(off)
+        assert row["median_m"] == pytest.approx(np.median(off), abs=1e-9)
+        assert row["p95_m"] == pytest.approx(np.percentile(off, 95), abs=1e-9)
+        assert row["max_m"] == pytest.approx(max(off), abs=1e-9)
+
+
+def test_an_offset_does_not_show_and_a_drift_does():
+    rows, errors = walked()
+    still = errors.truth_en_m + np.array([7.0, -3.0])
+    shifted = TrackErrors(errors.truth_en_m, still, still - errors.truth_en_m, errors.covariance_en_m2)
+    assert all(row["max_m"] < 1e-9 for row in segment_errors(rows, shifted))
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(errors.truth_en_m, axis=0), axis=1))])
+    drift = np.column_stack([0.01 * path, np.zeros(len(path))])
+    drifted = TrackErrors(errors.truth_en_m, errors.truth_en_m + drift, drift, errors.covariance_en_m2)
+    (row,) = [row for row in segment_errors(rows, drifted) if row.get("length_m") == 100.0]
+    assert row["median_m"] == pytest.approx(1.0, abs=0.02)  # a hundredth of 100 m
+
+
+def test_what_is_too_short_has_no_row():
+    rows, errors = walked(count=3)
+    assert [row.get("length_m", row.get("duration_s")) for row in segment_errors(rows, errors)] in ([], [1.0])
+    begins, ends = segment_ends(np.array([0.0, 0.0, 4.0]), 100.0)
+    assert (begins.size, ends.size) == (0, 0)
+    assert segment_errors(*walked(count=1)) == []
+
+
+# ---------------------------------------------------------------------------------- the telemetry's velocity
+
+
+STEP_S = 2
+
+
+def turned(noise_m=0.4, count=60, seed=4, offset_m=(0.0, 0.0)):
+    """A turn with velocities that a trapezoid integrates exactly, fixes with known errors, and some refusals."""
+    rng = np.random.default_rng(seed)
+    velocity = np.array([[8.0 - 0.1 * k, 0.2 * k] for k in range(count)])
+    way = np.vstack([np.zeros(2), np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * STEP_S, axis=0)])
+    error = rng.normal(0.0, noise_m, (count, 2))
+    places = way + error + offset_m
+    seconds = range(0, STEP_S * count, STEP_S)
+    rows = [refusal_at(t) if k % 7 == 3 else fix_at(*places[k], t) for k, t in enumerate(seconds)]
+    telemetry = [
+        TelemetryRow(timestamp_ns=t * SECOND_NS, frame=str(k), east_velocity_mps=east, north_velocity_mps=north)
+        for k, (t, (east, north)) in enumerate(zip(seconds, velocity, strict=True))
+    ]
+    return rows, telemetry, error
+
+
+def test_steps_are_off_by_what_the_errors_of_their_ends_differ():
+    rows, telemetry, error = turned()
+    found = motion_consistency(rows, telemetry, HERE)
+    fixed = [k for k, row in enumerate(rows) if row.fixed]
+    off_m = [math.dist(error[a], error[b]) for a, b in pairwise(fixed)]
+    assert (found["steps"], found["interval_s"]) == (len(off_m), STEP_S)
+    assert found["median_m"] == pytest.approx(np.median(off_m), abs=1e-4)
+    assert found["p95_m"] == pytest.approx(np.percentile(off_m, 95), abs=1e-4)
+    assert found["max_m"] == pytest.approx(max(off_m), abs=1e-4)
+
+
+def test_an_offset_that_stays_does_not_show():
+    rows, telemetry, _ = turned(noise_m=0.0, offset_m=(30.0, -20.0))
+    assert motion_consistency(rows, telemetry, HERE)["max_m"] < 1e-3
+
+
+def test_steps_without_a_velocity_or_too_long_do_not_count():
+    rows, telemetry, _ = turned(count=20)
+    before = motion_consistency(rows, telemetry, HERE)["steps"]
+    gap = [replace(row, east_velocity_mps=None) if row.frame == "3" else row for row in telemetry]
+    assert motion_consistency(rows, gap, HERE)["steps"] == before - 1  # frame 3 was refused: one step spans it
+    refused = [refusal_at(STEP_S * k) for k in range(4, 15)]
+    assert motion_consistency([*rows[:4], *refused, *rows[15:]], telemetry, HERE)["steps"] == 2 + 3
+    bare = [TelemetryRow(timestamp_ns=row.timestamp_ns, frame=row.frame) for row in telemetry]
+    for stated in (None, [], bare, telemetry[:-1]):
+        assert motion_consistency(rows, stated, HERE) is None
+    assert motion_consistency(refused[:1], telemetry[4:5], HERE) is None

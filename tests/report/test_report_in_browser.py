@@ -1,12 +1,10 @@
-"""Reports on shared flights, a closed loop and several runs as Chromium shows them: light, dark, desk, phone.
+"""Reports on a flight, a closed loop and several runs as Chromium shows them: light, dark, desk, phone."""
 
-Pictures of them are left in the folder that ``SCENEMATCH_SCREENSHOTS`` names.
-"""
-
+import base64
 import json
-import os
-from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from engine.geo import LocalFrame
@@ -20,54 +18,31 @@ from scenematch.runs.reporting import report
 from scenematch.runs.settings import TrackSettings
 from scenematch.runs.tracking import track
 from tests.support.contrast import SCRIPT
+from tests.support.dark_flight import DARK, FRAMES, data_of
 from tests.support.runs import bare_runs
 
 pytestmark = pytest.mark.slow
 
-PAGES = ("nust", "gazebo-a1-evening", "closed-loop", "runs")
+PAGES = ("flight", "no-truth", "closed-loop", "runs")
 WIDTHS = {"desk": 1400, "phone": 390}
-EVERY = 12  # frame of a shared flight that is followed
-
-
-def thinned(source, target):
-    """Every few rows of a telemetry, alone in a folder, so that no truth lies beside it."""
-    head, *rows = source.read_text(encoding="utf-8").splitlines()
-    target.parent.mkdir()
-    target.write_text("\n".join([head, *rows[::EVERY]]) + "\n", encoding="utf-8")
-    return target
-
-
-def followed(flight, out, method="ncc", **given):
-    """A run over a shared flight, begun at its true place."""
-    first = read_truth(flight / "truth.csv")[0]
-    files = FlightFiles.from_flat(
-        map=flight / "map.tif",
-        camera=flight / "camera.yaml",
-        telemetry=thinned(flight / "telemetry.csv", out.with_name(f"{out.name}-telemetry") / "telemetry.csv"),
-        **given,
-    )
-    start = f"{first.lat_deg},{first.lon_deg},20"
-    track(files, out, TrackSettings(method=method, start=start, device="cpu"), diagnosis=False)
-    return out
 
 
 @pytest.fixture(scope="module")
-def pages(shared, browser, tmp_path_factory):
+def pages(browser, flown, flight_in, tmp_path_factory):
     """The pages by name; none are made where no browser shows them."""
     folder = tmp_path_factory.mktemp("pages")
-    nust, evening = shared / "nust", shared / "gazebo-a1-evening"
+    flight_in(folder / "flight", frames=FRAMES)
+    (folder / "flight" / "truth.csv").unlink()
     with bare_runs():
-        followed(nust, folder / "nust", frames=nust / "flight.mp4")  # without truth
-        own = {"frames": evening / "frames", "surface": evening / "dsm.tif", "truth": evening / "truth.csv"}
-        runs = [followed(evening, folder / f"gazebo-{method}", method, **own) for method in ("ncc", "sift")]
+        track(FlightFiles.in_folder(folder / "flight"), folder / "no-truth", TrackSettings(method="sift"))
         fly_closed_loop(folder / "closed-loop", loop=ClosedLoopSettings(minutes=0.2, method="ncc", fault="killed"))
-    report(runs, folder / "runs.html")
-    return {
-        "nust": folder / "nust" / "report.html",
-        "gazebo-a1-evening": runs[0] / "report.html",
-        "closed-loop": folder / "closed-loop" / "report.html",
-        "runs": folder / "runs.html",
-    }
+    report([flown, folder / "no-truth"], folder / "runs.html")
+    tracks = {"flight": flown, "no-truth": folder / "no-truth", "closed-loop": folder / "closed-loop"}
+    return {name: out / "report.html" for name, out in tracks.items()} | {"runs": folder / "runs.html"}
+
+
+def texts(browser, selector):
+    return browser.run(f"return [...document.querySelectorAll('{selector}')].map(e => e.textContent)")
 
 
 def dress(browser, scheme):
@@ -87,12 +62,16 @@ def test_the_page_is_read_at_any_width_by_day_and_by_night(browser, pages, name,
     assert browser.run(SCRIPT) == []
     dark = browser.run("return getComputedStyle(document.body).backgroundColor")
     assert (dark == "rgb(19, 22, 26)") == (scheme == "dark")
-    if folder := os.environ.get("SCENEMATCH_SCREENSHOTS"):
-        browser.resize(WIDTHS[size], browser.run("return document.documentElement.scrollHeight"))
-        browser.save(Path(folder) / f"{name}-{scheme}-{size}.png")
+    assert all(browser.run("return [...document.querySelectorAll('svg[role]')].map(s => !!s.ariaLabel)"))
 
 
-@pytest.mark.parametrize("name", ["nust", "gazebo-a1-evening", "closed-loop"])
+def test_a_name_that_is_markup_is_shown_as_text(browser, pages):
+    browser.open(pages["flight"], 1400)
+    assert browser.run("return typeof hacked") == "undefined"
+    assert browser.run("return document.querySelectorAll('img').length") == 0
+
+
+@pytest.mark.parametrize("name", ["flight", "no-truth", "closed-loop"])
 def test_ellipses_are_outlines_and_few(browser, pages, name):
     browser.open(pages[name], 1400)
     fills = browser.run("return [...document.querySelectorAll('.map ellipse')].map(e => getComputedStyle(e).fill)")
@@ -101,28 +80,22 @@ def test_ellipses_are_outlines_and_few(browser, pages, name):
 
 
 def test_the_map_is_in_colour_and_wider_than_a_frame(browser, pages):
-    browser.open(pages["nust"], 1400)
-    spread = browser.run("""
-        const image = new Image(); image.src = document.querySelector('.map image').getAttribute('href');
-        const canvas = document.createElement('canvas'); canvas.width = image.width; canvas.height = image.height;
-        const at = canvas.getContext('2d'); at.drawImage(image, 0, 0);
-        const { data } = at.getImageData(0, 0, image.width, image.height);
-        let most = 0;
-        for (let i = 0; i < data.length; i += 4) most = Math.max(most, Math.abs(data[i] - data[i + 2]));
-        return most;""")
-    assert spread > 30
-    width_m = browser.run("return parseFloat(document.querySelector('.on-map + .hint').textContent)")
-    assert 300 < width_m < 1500
+    browser.open(pages["flight"], 1400)
+    href = browser.run("return document.querySelector('.map image').getAttribute('href')")
+    jpeg = np.frombuffer(base64.b64decode(href.partition(",")[2]), np.uint8)
+    blue, _, red = cv2.split(cv2.imdecode(jpeg, cv2.IMREAD_COLOR).astype(int))
+    assert np.abs(blue - red).max() > 30
+    width_m = float(texts(browser, ".on-map + .hint")[0].split()[0])
+    assert 200 < width_m < 600  # a frame shows 173
 
 
 def span(browser):
-    said = browser.run("return document.getElementById('time-span').textContent")
-    return [float(t) for t in said.split(" to ")]
+    return [float(t) for t in texts(browser, "#time-span")[0].split(" to ")]
 
 
 def drag(browser, begin, end):
     """From one share of the first chart's width to another, until the page shows another span of time."""
-    before = json.dumps(browser.run("return document.getElementById('time-span').textContent"))
+    before = json.dumps(texts(browser, "#time-span")[0])
     box = browser.run(
         "const c = document.querySelector('svg.chart[data-from]'); c.scrollIntoView({block: 'center'});"
         "const b = c.querySelector('.axis').getBoundingClientRect(); return [b.left, b.width, b.top]"
@@ -136,7 +109,7 @@ def drag(browser, begin, end):
 
 def test_time_zooms_in_all_charts_by_dragging_and_comes_back(browser, pages):
     dress(browser, "light")
-    browser.open(pages["gazebo-a1-evening"], 1400)
+    browser.open(pages["closed-loop"], 1400)
     low, high = span(browser)
     drag(browser, 0.25, 0.5)
     near = span(browser)
@@ -170,35 +143,69 @@ def test_a_run_is_hidden_on_map_and_charts(browser, pages):
     assert browser.run(shown) == 0
 
 
-def test_the_numbers_on_the_page_are_those_of_the_metrics(shared, browser, pages):
-    folder = pages["gazebo-a1-evening"].parent
-    rows, truth = read_track(folder / "track.csv"), read_truth(shared / "gazebo-a1-evening" / "truth.csv")
+def test_the_numbers_on_the_page_are_those_of_the_metrics(browser, pages):
+    folder = pages["closed-loop"].parent
+    rows, truth = read_track(folder / "track.csv"), read_truth(folder / "truth.csv")
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     mine = summarise(rows, truth, frame=LocalFrame(**summary["settings"]["origin"]))
-    browser.open(pages["gazebo-a1-evening"], 1400)
-    tiles = dict(
-        browser.run(
-            "return [...document.querySelectorAll('.tiles li')].map("
-            "li => [li.querySelector('span').textContent, li.querySelector('strong').textContent])"
-        )
-    )
+    browser.open(pages["closed-loop"], 1400)
+    tiles = dict(zip(texts(browser, ".tiles li span"), texts(browser, ".tiles li strong"), strict=True))
     assert tiles["median error"] == metres(mine["median_m"])
     assert tiles["largest error"] == metres(mine["max_m"])
     assert tiles["within 3 stated sigmas; 98.9 % if consistent"] == f"{mine['within_3_sigma']:.1%}"
-    cells = browser.run(
-        "return [...document.querySelectorAll('.figures tbody tr')].map("
-        "r => [...r.children].map(c => c.textContent))"
-    )
-    assert [row[1:] for row in cells] == [
-        [str(s["segments"]), *(metres(s[key]) for key in ("median_m", "p95_m", "max_m"))]
+    figures = [
+        figure
         for s in summary["segments"]
+        for figure in (str(s["segments"]), *(metres(s[key]) for key in ("median_m", "p95_m", "max_m")))
     ]
-    assert len(cells) >= 4
+    assert figures
+    assert texts(browser, ".figures tbody td + td") == figures
 
 
 def test_the_closed_loop_says_how_far_it_was_from_its_plan(browser, pages):
     figures = json.loads((pages["closed-loop"].parent / "loop.json").read_text(encoding="utf-8"))
     browser.open(pages["closed-loop"], 1400)
-    said = browser.run("return document.querySelector('.verdict').textContent")
+    (said,) = texts(browser, ".verdict")
     for key in ("plan_rms_m", "plan_max_m", "estimate_rms_m"):
         assert metres(figures[key]) in said
+
+
+PICTURES = "return [...document.querySelectorAll('#pictures image')].map(i => i.getAttribute('href'))"
+
+
+def test_keys_move_through_the_frames(browser, pages):
+    browser.open(pages["flight"], 1280)
+    seen = [browser.run(PICTURES)]
+    for key in ("ArrowRight", "ArrowRight"):
+        browser.press(key)
+        seen.append(browser.run(PICTURES))
+    assert [len(pictures) for pictures in seen] == [4, 4, 4]
+    assert len({pictures[0] for pictures in seen}) == 3
+    assert texts(browser, "#facts h3") == ["000002.jpg"]
+    browser.press("ArrowLeft")
+    assert browser.run(PICTURES) == seen[1]
+    browser.run("document.getElementById('slider').focus()")
+    browser.press("End")  # the slider's own
+    assert texts(browser, "#facts h3") == [f"{FRAMES - 1:06d}.jpg"]
+    assert browser.complaints() == []
+
+
+def test_a_refusal_is_found_from_its_reason(browser, pages):
+    browser.open(pages["flight"], 1280)
+    browser.run("document.querySelector('[data-goto]').click()")
+    assert texts(browser, "#facts h3") == [f"{DARK:06d}.jpg"]
+    assert texts(browser, "#facts .answer") == ["Refused: no texture"]
+
+
+def test_the_map_zooms_about_the_frame_shown(browser, pages):
+    browser.open(pages["flight"], 1280)
+    box = "return document.getElementById('map').getAttribute('viewBox').split(' ').map(Number)"
+    whole = browser.run(box)
+    browser.run("document.getElementById('zoom-in').click()")
+    near = browser.run(box)
+    x, y = data_of(pages["flight"])["frames"][0]["xy"]
+    assert near[2] == pytest.approx(0.6 * whole[2])
+    assert near[0] <= x <= near[0] + near[2]
+    assert near[1] <= y <= near[1] + near[3]
+    browser.run("document.getElementById('zoom-all').click()")
+    assert browser.run(box) == whole

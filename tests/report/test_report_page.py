@@ -1,16 +1,17 @@
-"""The report page: its words, what it shows of single matches, and how it behaves in a real browser."""
+"""The report page: its words, what it shows of single matches, and what is kept where it is drawn again."""
 
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
 from engine.options import MatcherOptions, NccOptions, SiftOptions
 from engine.values import Reason, Window
+from scenematch.cli.app import run
 from scenematch.files.notes import FrameNote, frame_note, read_notes, write_notes
 from scenematch.files.settings import changed, nested, options_from_mapping
 from scenematch.files.track import TrackRow, read_track
@@ -22,13 +23,10 @@ from scenematch.report.page import write_page
 from scenematch.report.verdict import MEANINGS, verdict_of
 from scenematch.runs.evaluation import evaluate
 from scenematch.runs.settings import TrackSettings
-from scenematch.runs.tracking import track
-from tests.support.runs import bare_runs
+from tests.support.commands import refusal
+from tests.support.dark_flight import DARK, FRAMES, data_of
 
-FRAMES = 6
-DARK = 4  # a frame that shows nothing
-HOSTILE = "<img src=x onerror=hacked=1>"
-
+pytestmark = pytest.mark.usefixtures("bare_runs")
 
 # --------------------------------------------------------------------------------------------- the verdict
 
@@ -115,9 +113,8 @@ def test_ticks_are_round_and_inside(low, span):
     assert values.max() <= low + span * (1 + 1e-9)
     assert [float(text.replace(",", "")) for _, text in found] == pytest.approx(list(values), rel=1e-9, abs=1e-12)
     step = values[1] - values[0]
-    assert step / 10 ** np.floor(np.log10(step) + 1e-9) == pytest.approx(1, rel=1e-4) or round(
-        step / 10 ** np.floor(np.log10(step)), 3
-    ) in (2, 2.5, 5)
+    leading = step / 10 ** np.floor(np.log10(step) + 1e-9)
+    assert any(leading == pytest.approx(round_one, rel=1e-4) for round_one in (1, 2, 2.5, 5))
 
 
 def test_a_line_breaks_where_nothing_is_known_and_a_dot_outside_is_not_drawn():
@@ -226,25 +223,6 @@ def test_nothing_is_made_up_where_the_telemetry_is_silent(sim_flight, sim_site):
 # --------------------------------------------------------------------------------------------- the page
 
 
-@pytest.fixture(scope="module")
-def flown(flight_in, tmp_path_factory):
-    """A finished run over a flight with a black frame."""
-    folder = tmp_path_factory.mktemp(HOSTILE.replace("/", "")) / "flight"
-    files = flight_in(folder, frames=FRAMES)
-    black = folder / "frames" / f"{DARK:06d}.jpg"
-    Image.fromarray(np.zeros((300, 300, 3), np.uint8)).save(black)
-    with bare_runs():
-        track(files, folder.parent / "out", TrackSettings(device="cpu", budget_ms=3_600_000.0))
-    return folder.parent / "out"
-
-
-def data_of(page):
-    """What the page's script is given."""
-    text = page.read_text(encoding="utf-8")
-    start = text.index('id="data">') + len('id="data">')
-    return json.loads(text[start : text.index("</script>", start)])
-
-
 def test_the_page_needs_nothing_but_itself(flown):
     text = (flown / "report.html").read_text(encoding="utf-8")
     assert set(re.findall(r"https?://[^\s\"'<]+", text)) == {"http://www.w3.org/2000/svg"}
@@ -259,7 +237,6 @@ def test_every_frame_is_shown_with_its_match(flown):
     assert "deviate" in frames[DARK]["detail"]
 
 
-@pytest.mark.usefixtures("bare_runs")
 def test_a_run_that_left_no_notes_has_a_page_without_frames(flown, tmp_path):
     again = shutil.copytree(flown, tmp_path / "again")
     (again / "notes.csv").unlink()
@@ -294,62 +271,49 @@ def test_a_track_without_a_single_fix_has_a_page(page_of, count):
     assert "nan" not in re.sub(r'data:image[^"]*', "", text).lower()
 
 
-# --------------------------------------------------------------------------------------------- the browser
+# --------------------------------------------------------------------------------------------- drawn again
 
 
-PICTURES = "return [...document.querySelectorAll('#pictures image')].map(i => i.getAttribute('href'))"
+@pytest.fixture
+def moved(flown, tmp_path):
+    """A copy of the track whose frames are not where they were."""
+    out = Path(shutil.copytree(flown, tmp_path / "out"))
+    frames = flown.parent / "flight" / "frames"
+    frames.rename(frames.with_name("moved"))
+    yield out
+    frames.with_name("moved").rename(frames)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("width_px", [1280, 420])
-def test_the_page_loads_without_complaint_or_network_and_fits(browser, flown, width_px):
-    page = flown / "report.html"
-    browser.open(page, width_px)
-    browser.run("window.scrollTo(0, document.body.scrollHeight)")
-    assert browser.complaints() == []
-    assert browser.requests() == [page.resolve().as_uri()]
-    assert browser.run("return document.documentElement.scrollWidth") == width_px
-    assert browser.run("return typeof hacked") == "undefined"
-    assert browser.run("return document.querySelectorAll('img').length") == 0
-    assert all(browser.run("return [...document.querySelectorAll('svg[role]')].map(s => !!s.ariaLabel)"))
+def test_a_page_loses_frames_that_were_moved_only_where_it_may(moved, capsys):
+    before = (moved / "report.html").read_text(encoding="utf-8")
+    assert 'id="slider"' in before
+    told = r"DIR.*: .*report\.html shows frames, which redrawing would lose; add --force to do it anyway; .*frames"
+    assert re.match(told, refusal(capsys, ["evaluate", moved]))
+    assert (moved / "report.html").read_text(encoding="utf-8") == before
+    assert run(["evaluate", str(moved), "--force"]) == 0
+    assert "report.html loses the frames that it shows: " in capsys.readouterr().err
+    after = (moved / "report.html").read_text(encoding="utf-8")
+    assert ('id="slider"' in after, "No frames are shown: " in after) == (False, True)
+    assert run(["evaluate", str(moved)]) == 0  # there is nothing more to lose
 
 
-@pytest.mark.slow
-def test_keys_move_through_the_frames(browser, flown):
-    browser.open(flown / "report.html", 1280)
-    seen = [browser.run(PICTURES)]
-    for key in ("ArrowRight", "ArrowRight"):
-        browser.press(key)
-        seen.append(browser.run(PICTURES))
-    assert [len(pictures) for pictures in seen] == [4, 4, 4]
-    assert len({pictures[0] for pictures in seen}) == 3
-    assert browser.run("return document.querySelector('#facts h3').textContent") == "000002.jpg"
-    browser.press("ArrowLeft")
-    assert browser.run(PICTURES) == seen[1]
-    browser.run("document.getElementById('slider').focus()")
-    browser.press("End")  # the slider's own
-    assert browser.run("return document.querySelector('#facts h3').textContent") == f"{FRAMES - 1:06d}.jpg"
-    assert browser.complaints() == []
+def test_seconds_and_numbers_of_frames_are_not_drawn_over_one_axis(flown, tmp_path):
+    other = Path(shutil.copytree(flown, tmp_path / "other"))
+    rows = (other / "track.csv").read_text(encoding="utf-8").splitlines()
+    blank = [line if k == 0 else "," + line.partition(",")[2] for k, line in enumerate(rows)]
+    (other / "track.csv").write_text("\n".join(blank) + "\n", encoding="utf-8")
+    third, alike, mixed = shutil.copytree(other, tmp_path / "c"), tmp_path / "alike.html", tmp_path / "mixed.html"
+    assert run(["evaluate", str(flown), str(third), f"--out={mixed}"]) == 0
+    assert run(["evaluate", str(other), str(third), f"--out={alike}"]) == 0
+    assert "Stated sigma (m)" in alike.read_text(encoding="utf-8")
+    assert "Stated sigma (m)" not in mixed.read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
-def test_a_refusal_is_found_from_its_reason(browser, flown):
-    browser.open(flown / "report.html", 1280)
-    browser.run("document.querySelector('[data-goto]').click()")
-    assert browser.run("return document.querySelector('#facts h3').textContent") == f"{DARK:06d}.jpg"
-    assert browser.run("return document.querySelector('#facts .answer').textContent") == "Refused: no texture"
-
-
-@pytest.mark.slow
-def test_the_map_zooms_about_the_frame_shown(browser, flown):
-    browser.open(flown / "report.html", 1280)
-    box = "return document.getElementById('map').getAttribute('viewBox').split(' ').map(Number)"
-    whole = browser.run(box)
-    browser.run("document.getElementById('zoom-in').click()")
-    near = browser.run(box)
-    x, y = data_of(flown / "report.html")["frames"][0]["xy"]
-    assert near[2] == pytest.approx(0.6 * whole[2])
-    assert near[0] <= x <= near[0] + near[2]
-    assert near[1] <= y <= near[1] + near[3]
-    browser.run("document.getElementById('zoom-all').click()")
-    assert browser.run(box) == whole
+def test_a_page_for_a_folder_that_is_not_there_is_refused_before_anything_is_drawn(
+    flown, tmp_path, monkeypatch, capsys
+):
+    other = shutil.copytree(flown, tmp_path / "other")
+    monkeypatch.setattr("scenematch.runs.reporting.draw_together", lambda *_, **__: pytest.fail("drawn"))
+    page = tmp_path / "nofolder" / "x.html"
+    line = refusal(capsys, ["evaluate", flown, other, f"--out={page}"])
+    assert line == f"--out: expected a file in a folder that exists, got {page}\n"

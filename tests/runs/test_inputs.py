@@ -3,7 +3,6 @@
 import shlex
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 import rasterio
@@ -162,12 +161,6 @@ def test_what_says_nothing_of_a_camera_is_wrong_usage(options, words):
         FlightFiles.from_flat(**{"map": "m.tif", "frames": "f"} | options)
 
 
-def test_pictures_without_exif_need_a_camera(tmp_path):
-    Image.fromarray(noise()).save(tmp_path / "1.png")
-    with pytest.raises(CalibrationError, match=r"1\.png: expected a focal length .* give `hfov_deg` or `camera`"):
-        load(FlightFiles(map="m.tif", frames=tmp_path))
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -226,16 +219,6 @@ def subtitles(heights_m):
     return "".join(cue.format(n=k + 1, ms=40 * k, h=height_m) for k, height_m in enumerate(heights_m))
 
 
-def test_a_video_with_subtitles_and_a_field_of_view(tmp_path):
-    path = tmp_path / "DJI_0001.mp4"
-    write_video(path, [40 * k for k in range(3)], codec="mp4v")
-    (tmp_path / "DJI_0001.SRT").write_text(subtitles([80.0] * 3))
-    files = FlightFiles.from_flat(map="m.tif", frames=path, hfov_deg=70.0)
-    assert files.telemetry == tmp_path / "DJI_0001.SRT"
-    assert [row.height_agl_m for row in files.open_flight().rows] == [80.0] * 3
-    assert load(files).width_px == 64
-
-
 def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
     """Of a video with a log: pictures, stamps, heights and corrections are those of the frames that are left."""
     path = tmp_path / "DJI_0002.avi"
@@ -244,7 +227,9 @@ def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
     late = Corrections(offset_s=0.04)  # by one frame, which only all of the rows can say
     named = {"map": "m.tif", "frames": path, "hfov_deg": 70.0}
     whole, part = FlightFiles.from_flat(**named), FlightFiles.from_flat(**named, every=3, corrections=late)
+    assert whole.telemetry == tmp_path / "DJI_0002.SRT"
     assert len(whole.open_flight()) == 8
+    assert load(whole).width_px == 64
     flight = part.open_flight()
     assert (flight.names, flight.heights, flight.unused) == (["0", "3", "6"], {"take-off": 3}, 0)
     assert [item.frame.timestamp_ns for item in flight] == [0, 120_000_000, 240_000_000]
@@ -256,17 +241,10 @@ def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
 
 @pytest.fixture
 def calibration(tmp_path):
-    """As OpenCV writes it, for pictures of twice the photographs' size."""
-    path = tmp_path / "opencv.yml"
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in (
-        ("image_width", 640),
-        ("image_height", 480),
-        ("camera_matrix", np.array([[500.0, 0.0, 319.5], [0.0, 505.0, 239.5], [0.0, 0.0, 1.0]])),
-        ("distortion_coefficients", np.array([[-0.28, 0.09, 0.0007, -0.0004, -0.01]])),
-    ):
-        storage.write(name, value)
-    storage.release()
+    """For pictures of twice the photographs' size."""
+    matrix = np.array([[500.0, 0.0, 319.5], [0.0, 505.0, 239.5], [0.0, 0.0, 1.0]])
+    path = tmp_path / "640x480.yaml"
+    path.write_text(camera_info(Camera(640, 480, matrix, distortion=np.array([-0.28, 0.09, 7e-4, -4e-4, -0.01]))))
     return path
 
 
@@ -296,7 +274,9 @@ def test_without_the_request_another_size_is_refused_and_the_request_named(photo
 def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
     with pytest.raises(OptionError, match="scale_calibration: expected with `camera`"):
         FlightFiles.from_flat(map="m.tif", frames=photos, scale_calibration=True)
-    calibration.write_text(calibration.read_text().replace("480", "360"), encoding="utf-8")
+    calibration.write_text(
+        calibration.read_text().replace("image_height: 480", "image_height: 360"), encoding="utf-8"
+    )
     files = FlightFiles.from_flat(map="m.tif", frames=photos, camera=calibration, scale_calibration=True)
     with pytest.raises(CalibrationError, match="a part may have been cut off"):
         load(files)

@@ -160,7 +160,6 @@ def test_an_older_run_is_kept_without_force_and_leaves_nothing_with_it(folder, l
         (["--map", "map.tif", "--relief-m", "5"], "--relief-m"),
         (["--frames", "0"], "--frames"),
         (["--closed-loop", "--camera-pitch-deg", "-45"], "--camera-pitch-deg"),
-        (["--closed-loop", "--condition", "eclipse"], "--condition"),
     ],
 )
 def test_wrong_usage_is_one_line_and_leaves_no_folder(arguments, named, tmp_path, capsys):

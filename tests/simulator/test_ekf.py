@@ -11,24 +11,9 @@ import pytest
 
 from engine.errors import StateError
 from engine.geo import enu_from_body
-from engine.values import Attitude, Fix
-from scenematch.simulator.ekf import (
-    ACCEL,
-    COMPASS,
-    GYRO,
-    POSITION,
-    STATES,
-    TURN,
-    VELOCITY,
-    FilterState,
-    correct,
-    fix_chi_square,
-    fuse_fix,
-    fuse_heading,
-    fuse_height,
-    initial_state,
-    predict,
-)
+from engine.values import Attitude
+from scenematch.simulator import ekf
+from scenematch.simulator.ekf import STATES, FilterState, fuse_fix, fuse_heading, fuse_height
 from scenematch.simulator.history import History
 from scenematch.simulator.quadrotor import STEP_S, Airframe, IdealImu, Wind, WindField, advance, hovering, shaken
 from scenematch.simulator.rotations import rotation, rotation_vector
@@ -37,8 +22,8 @@ from tests.support.fixes import a_fix
 
 SUITE = SensorSuite()
 ADDITIVE = {
-    "position_m": POSITION, "velocity_mps": VELOCITY, "accel_bias_mps2": ACCEL, "gyro_bias_rps": GYRO,
-    "baro_drift_m": 15, "compass_bias_rad": COMPASS,
+    "position_m": ekf.POSITION, "velocity_mps": ekf.VELOCITY, "accel_bias_mps2": ekf.ACCEL,
+    "gyro_bias_rps": ekf.GYRO, "baro_drift_m": 15, "compass_bias_rad": ekf.COMPASS,
 }  # fmt: skip
 """Where each part of the state but the attitude lies in an error."""
 FIX_SIGMA_M, FIX_LATENCY_S = 1.5, 0.11
@@ -64,7 +49,7 @@ def some_belief() -> FilterState:
 def moved(estimate: FilterState, error: np.ndarray) -> FilterState:
     """The truth where the estimate is off by an error."""
     sums = {name: getattr(estimate, name) + error[part] for name, part in ADDITIVE.items()}
-    return replace(estimate, enu_from_body=rotation(error[TURN]) @ estimate.enu_from_body, **sums)
+    return replace(estimate, enu_from_body=rotation(error[ekf.TURN]) @ estimate.enu_from_body, **sums)
 
 
 def apart(truth: FilterState, estimate: FilterState) -> np.ndarray:
@@ -72,25 +57,23 @@ def apart(truth: FilterState, estimate: FilterState) -> np.ndarray:
     error = np.empty(STATES)
     for name, part in ADDITIVE.items():
         error[part] = getattr(truth, name) - getattr(estimate, name)
-    error[TURN] = rotation_vector(truth.enu_from_body @ estimate.enu_from_body.T)
+    error[ekf.TURN] = rotation_vector(truth.enu_from_body @ estimate.enu_from_body.T)
     return error
 
 
-def fix_at(east_m, north_m, up_m=None, sigma_m=0.5) -> Fix:
-    return a_fix(east_m, north_m, sigma_m, up_m=up_m)
+def derivatives(function, estimate: FilterState, step: float) -> np.ndarray:
+    """Columns of differences by each of the 17 errors."""
+    errors = step * np.eye(STATES)
+    return np.stack([(function(moved(estimate, e)) - function(estimate)) / step for e in errors], axis=-1)
 
 
 # ------------------------------------------------------------------------------------- derivatives and algebra
 
 
 def test_prediction_carries_errors_as_differences_say():
-    estimate, step = some_belief(), 1e-5
-    expected = predict(estimate, SAMPLE, SUITE)
-    F = np.empty((STATES, STATES))
-    for k in range(STATES):
-        error = np.zeros(STATES)
-        error[k] = step
-        F[:, k] = apart(predict(moved(estimate, error), SAMPLE, SUITE), expected) / step
+    estimate = some_belief()
+    expected = ekf.predict(estimate, SAMPLE, SUITE)
+    F = derivatives(lambda belief: apart(ekf.predict(belief, SAMPLE, SUITE), expected), estimate, 1e-5)
     added = expected.covariance - F @ estimate.covariance @ F.T
     np.testing.assert_allclose(added - np.diag(np.diag(added)), 0.0, atol=2e-5)
     assert np.diag(added).min() > -2e-5  # noise is white: on the diagonal
@@ -110,12 +93,8 @@ def test_prediction_carries_errors_as_differences_say():
     ids=["barometer", "compass"],
 )  # fmt: skip
 def test_a_measurement_moves_the_belief_as_its_differences_say(fuse, measured, variance):
-    estimate, step = some_belief(), 1e-6
-    H = np.empty(STATES)
-    for k in range(STATES):
-        error = np.zeros(STATES)
-        error[k] = step
-        H[k] = (measured(moved(estimate, error)) - measured(estimate)) / step
+    estimate = some_belief()
+    H = derivatives(measured, estimate, 1e-6)
     gain = estimate.covariance @ H / (H @ estimate.covariance @ H + variance)
     np.testing.assert_allclose(apart(fuse(estimate, measured(estimate) + 0.01), estimate), 0.01 * gain, atol=2e-6)
 
@@ -130,7 +109,7 @@ def test_joseph_is_the_textbook_where_that_is_exact():
     estimate = some_belief()
     H = np.random.default_rng(1).normal(size=(2, STATES))
     R = np.diag([0.3, 0.7])
-    after = correct(estimate, np.zeros(2), H, R)
+    after = ekf.correct(estimate, np.zeros(2), H, R)
     P = estimate.covariance
     expected = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H)
     np.testing.assert_allclose(after.covariance, expected, atol=1e-9)
@@ -139,25 +118,21 @@ def test_joseph_is_the_textbook_where_that_is_exact():
 
 def test_a_fix_pulls_by_its_covariance_and_without_height_leaves_the_height():
     estimate = replace(some_belief(), covariance=np.eye(STATES))
-    np.testing.assert_allclose(
-        fuse_fix(estimate, fix_at(12.0, -5.0, sigma_m=1.0)).position_m, [11.0, -5.0, 120.0], atol=1e-9
-    )
-    np.testing.assert_allclose(
-        fuse_fix(estimate, fix_at(10.0, -5.0, 122.0, sigma_m=1.0)).position_m, [10.0, -5.0, 121.0], atol=1e-9
-    )
-    assert fix_chi_square(estimate, fix_at(14.0, -2.0, sigma_m=1.0)) == pytest.approx(25.0 / 2.0)
+    assert fuse_fix(estimate, a_fix(12.0, -5.0)).position_m == pytest.approx([11.0, -5.0, 120.0])
+    assert fuse_fix(estimate, a_fix(10.0, -5.0, up_m=122.0)).position_m == pytest.approx([10.0, -5.0, 121.0])
+    assert ekf.fix_chi_square(estimate, a_fix(14.0, -2.0)) == pytest.approx(25.0 / 2.0)
 
 
 def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
     state, rng = hovering(np.array([0.0, 0.0, 100.0]), 200.0), np.random.default_rng(9)
-    estimate = replace(initial_state(state.position_m, 1.0, Attitude(0.0, 0.0, 200.0), SUITE))
+    estimate = ekf.initial_state(state.position_m, 1.0, Attitude(0.0, 0.0, 200.0), SUITE)
     air = WindField(Wind(), rng)
     for k in range(500):
         if k % 250 == 0:
             state = shaken(state, Airframe(), rng)
         wanted = np.array([1.0, math.cos(k / 60), 0.1])
         state, felt = advance(state, wanted, 200.0 + 0.1 * k, Airframe(), air.next())
-        estimate = predict(estimate, felt, SUITE)
+        estimate = ekf.predict(estimate, felt, SUITE)
     np.testing.assert_allclose(estimate.position_m, state.position_m, atol=1e-6)
     np.testing.assert_allclose(estimate.enu_from_body, state.enu_from_body, atol=1e-9)
 
@@ -172,7 +147,7 @@ def fly(seed, seconds, fixes_until_s=math.inf):
     state, off = hovering(np.array([0.0, 0.0, 150.0]), 0.0), start.standard_normal(8)
     state = replace(state, velocity_mps=0.1 * off[:3])
     believed = Attitude(0.5 * off[3], 0.5 * off[4], carried.heading_deg(state))
-    history = History(initial_state(state.position_m + 2.0 * off[5:], 2.0, believed, SUITE), SUITE)
+    history = History(ekf.initial_state(state.position_m + 2.0 * off[5:], 2.0, believed, SUITE), SUITE)
     pending, rows = [], []
     for k in range(1, round(seconds / STEP_S) + 1):
         if k % 300 == 0:
@@ -187,9 +162,8 @@ def fly(seed, seconds, fixes_until_s=math.inf):
             heading_deg = carried.heading_deg(state)
             history.fuse(partial(fuse_heading, heading_deg=heading_deg, suite=SUITE), state.time_s)
         if k % 20 == 0 and state.time_s < fixes_until_s:
-            pending.append(
-                (state.time_s, fix_at(*(state.position_m + FIX_SIGMA_M * start.standard_normal(3)), FIX_SIGMA_M))
-            )
+            east_m, north_m, up_m = state.position_m + FIX_SIGMA_M * start.standard_normal(3)
+            pending.append((state.time_s, a_fix(east_m, north_m, FIX_SIGMA_M, up_m=up_m)))
         if pending and state.time_s >= pending[0][0] + FIX_LATENCY_S:
             time_s, fix = pending.pop(0)
             history.fuse(partial(fuse_fix, fix=fix), time_s)
@@ -212,7 +186,7 @@ def flights():
 @pytest.mark.slow
 def test_errors_are_as_large_as_the_covariance_says(flights):
     """The NEES at the end of every flight lies in the 99.9 % interval of its chi-square, whole and by parts."""
-    parts = [POSITION, VELOCITY, TURN, ACCEL, GYRO, slice(0, STATES)]
+    parts = [ekf.POSITION, ekf.VELOCITY, ekf.TURN, ekf.ACCEL, ekf.GYRO, slice(0, STATES)]
     for part in parts:
         squares = [e[part] @ np.linalg.solve(P[part, part], e[part]) for rows in flights for e, P, _ in rows[-1:]]
         freedom = len(squares) * (part.stop - part.start)
@@ -246,7 +220,7 @@ def test_without_positions_the_sigma_grows_and_holds_the_error():
 def test_a_measurement_that_comes_late_does_what_it_would_have_done_in_time():
     rng = np.random.default_rng(6)
     samples = [IdealImu(SAMPLE.force_mps2 + 0.1 * rng.normal(size=3), 0.1 * rng.normal(size=3)) for _ in range(60)]
-    fix = partial(fuse_fix, fix=fix_at(11.0, -4.0))
+    fix = partial(fuse_fix, fix=a_fix(11.0, -4.0, 0.5))
     prompt, late = (History(replace(some_belief(), time_s=0.0), SUITE) for _ in range(2))
     for k, sample in enumerate(samples):
         for history in (prompt, late):
@@ -267,10 +241,10 @@ def test_the_start_can_be_corrected_too_and_no_other_moment():
     for _ in range(10):
         history.advance(SAMPLE)
     before = history.now.sigma_m
-    history.fuse(partial(fuse_fix, fix=fix_at(10.0, -5.0)), 0.0)
+    history.fuse(partial(fuse_fix, fix=a_fix(10.0, -5.0, 0.5)), 0.0)
     assert history.now.sigma_m < before
     for _ in range(20):
         history.advance(SAMPLE)
     for moment in (0.0, 0.31):
         with pytest.raises(StateError, match="time_s"):
-            history.fuse(partial(fuse_fix, fix=fix_at(10.0, -5.0)), moment)
+            history.fuse(partial(fuse_fix, fix=a_fix(10.0, -5.0, 0.5)), moment)

@@ -10,30 +10,21 @@ import numpy as np
 import pytest
 
 from engine.camera import Camera
-from engine.errors import MapError, OptionError, ShapeError
+from engine.errors import OptionError, ShapeError
 from engine.values import Attitude
 from scenematch.runs.simulation import WorldSettings
-from scenematch.simulator import (
-    Condition,
-    FlightStyle,
-    Optics,
-    SensorNoise,
-    World,
-    build_town,
-    plan_flight,
-    render_frame,
-    take_picture,
-    world_from_map,
-)
+from scenematch.simulator import Condition, FlightStyle, Optics, SensorNoise, World, build_town, plan_flight
 from scenematch.simulator.faults import Fault
 from scenematch.simulator.flight import DRONE_SENSOR, paper_camera
 from scenematch.simulator.light import LIGHTS
 from scenematch.simulator.loop import LoopOptions
+from scenematch.simulator.optics import take_picture
 from scenematch.simulator.pilot import Gains, plan_rounds, plan_route
 from scenematch.simulator.quadrotor import Airframe, Wind
-from scenematch.simulator.render import Glint
+from scenematch.simulator.render import Glint, render_frame
 from scenematch.simulator.sensors import Barometer, Compass, Imu, steps_between
 from tests.support.patches import CAMERA, EPSG, ORIGIN, TO_CRS, patch_world
+from tests.support.towns import drawn_town
 
 LEVEL = Attitude(0.0, 0.0, 0.0)
 BENT = Camera(300, 300, CAMERA.matrix, distortion=np.array([0.1, 0, 0, 0, 0]))
@@ -88,6 +79,10 @@ def seen(height_agl_m=150.0, attitude=LEVEL, camera=CAMERA):
         (lambda: Fault(shift_m=math.inf), "shift_m"),
         (lambda: LoopOptions(frame_rate_hz=0.0), "rate_hz"),
         (lambda: LoopOptions(hold_sigma_m=-1.0), "hold_sigma_m"),
+        (lambda: plan_flight(town=drawn_town(), frames=0), "frames"),
+        (lambda: plan_flight(town=drawn_town(), rate_hz=0.0), "rate_hz"),
+        (lambda: plan_flight(town=drawn_town(), style=FlightStyle(height_agl_m=400.0)),
+         "town: expected a map larger"),
         *((lambda rate_hz=rate_hz: steps_between(rate_hz), "rate_hz") for rate_hz in (0.0, -1.0, 101.0, math.nan)),
         *((lambda sensor=sensor, name=name: sensor(**{name: -1.0}), name)
           for sensor in (Imu, Compass, Barometer) for name in sensor.__dataclass_fields__),
@@ -96,19 +91,6 @@ def seen(height_agl_m=150.0, attitude=LEVEL, camera=CAMERA):
 def test_an_option_that_cannot_be_is_refused(make, words):
     with pytest.raises(OptionError, match=words):
         make()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"frames": 0}, "frames"),
-        ({"rate_hz": 0.0}, "rate_hz"),
-        ({"style": FlightStyle(height_agl_m=400.0)}, "town: expected a map larger"),
-    ],
-)
-def test_a_flight_that_cannot_be_is_refused(sim_town, options, words):
-    with pytest.raises(OptionError, match=words):
-        plan_flight(town=sim_town, **options)
 
 
 @pytest.mark.parametrize(
@@ -123,8 +105,3 @@ def test_a_flight_that_cannot_be_is_refused(sim_town, options, words):
 def test_rasters_of_a_world_fit_together(make, words):
     with pytest.raises(ShapeError, match=words):
         make(world())
-
-
-def test_a_world_of_no_map_is_refused(tmp_path):
-    with pytest.raises(MapError, match="does not exist"):
-        world_from_map(tmp_path / "none.tif")

@@ -1,6 +1,8 @@
-"""The simulated camera: motion, shutter, lens and exposure against what optics says of them."""
+"""The simulated camera: motion, shutter, lens, exposure and obliquity against what optics and geometry say."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -8,9 +10,13 @@ import pytest
 
 from engine.camera import Camera
 from engine.values import Attitude
-from scenematch.simulator import ExposureMotion, FlightStyle, Optics, plan_flight, render_frame, take_picture
-from scenematch.simulator.flight import DRONE_SENSOR
-from scenematch.simulator.optics import Sensor
+from scenematch.runs.simulation import WorldSettings
+from scenematch.simulator import ExposureMotion, FlightStyle, Optics, Town, World, plan_flight, render_frame
+from scenematch.simulator.flight import DRONE_SENSOR, paper_camera
+from scenematch.simulator.optics import Sensor, take_picture
+from scenematch.simulator.rays import FAR_DEG
+from scenematch.simulator.render import SKY_RGB
+from tests.support import patches
 from tests.support.patches import CAMERA, ORIGIN, TO_CRS, TO_GRID, centre_of_bright, patch_world, project
 
 LEVEL = Attitude(0.0, 0.0, 0.0)
@@ -88,11 +94,9 @@ def test_exposure_scales_light_and_noise(sim_town):
     one, half = (snap(sim_town.world, optics=Optics(gain=g), grid=where).astype(float) for g in (1.0, 0.5))
     np.testing.assert_allclose(half, 0.5 * one, atol=1.0)
     for level in (40.0, 90.0):
-        assert snap(sim_town.world, optics=Optics(target_level=level), grid=where).mean() == pytest.approx(
-            level, abs=3.0
-        )
-    noisy = Sensor(**{name: getattr(IDEAL, name) for name in IDEAL.__dataclass_fields__} | {"noise_sd": 2.0})
-    dark = patch_world(600, 600, 0.0)
+        exposed = snap(sim_town.world, optics=Optics(target_level=level), grid=where)
+        assert exposed.mean() == pytest.approx(level, abs=3.0)
+    noisy, dark = replace(IDEAL, noise_sd=2.0), patch_world(600, 600, 0.0)
     grain = [snap(dark, sensor=noisy, optics=Optics(gain=g))[:100].std() for g in (1.0, 4.0)]
     assert grain[1] == pytest.approx(4.0 * grain[0], rel=0.1)
 
@@ -108,3 +112,92 @@ def test_a_planned_flight_moves_while_its_shutter_is_open(sim_town):
     seen, stated = next(blurred.iter_frames()), next(still.iter_frames())
     assert seen.heading_deg == stated.heading_deg
     assert still.telemetry.heading_deg.tobytes() == blurred.telemetry.heading_deg.tobytes()
+
+
+# ------------------------------------------------------------------------------------------------- oblique cameras
+
+
+def off_by(metres_north: float, metres_east: float = 0.0) -> np.ndarray:
+    """Grid position so far from the world's middle."""
+    return np.array([ORIGIN[0] + metres_east, ORIGIN[1] + metres_north])
+
+
+def centre_near(seen: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Of the bright patch about a place; the sky is bright too."""
+    x, y = np.rint(place).astype(int)
+    return centre_of_bright(seen[y - 15 : y + 16, x - 15 : x + 16]) + np.array([x - 15, y - 15])
+
+
+def test_pitch_is_a_gimbals():
+    np.testing.assert_array_equal(paper_camera(-90.0).mount, paper_camera().mount)
+    for pitch, axis in ((-90.0, (0, 0, 1)), (-45.0, (0.5**0.5, 0, 0.5**0.5)), (-30.0, (0.75**0.5, 0, 0.5))):
+        np.testing.assert_allclose(paper_camera(pitch).mount @ (0, 0, 1), axis, atol=1e-12)
+        right = paper_camera(pitch).mount @ (1, 0, 0)
+        np.testing.assert_allclose(right, (0, 1, 0), atol=1e-12)  # stays right
+
+
+@pytest.mark.parametrize("attitude", [LEVEL, Attitude(5.0, -4.0, 37.0), Attitude(-6.5, 3.0, 251.0)])
+@pytest.mark.parametrize(
+    ("pitch", "slope"),
+    [(-90.0, 0.08), (-90.0, -0.15), (-60.0, 0.15), (-45.0, 0.0), (-45.0, -0.15), (-30.0, 0.08)],
+)
+def test_a_patch_on_a_hillside_appears_where_geo_and_camera_put_it(pitch, slope, attitude):
+    flat, (x, y) = patch_world(600, 600, 0.0), (600, 600)
+    ground = (45.0 + slope * patches.GSD * (np.arange(patches.SIZE) - x)).astype(np.float32)
+    ground = np.ascontiguousarray(np.broadcast_to(np.maximum(ground, 0.0), (patches.SIZE, patches.SIZE)))
+    world = World(flat.rgb, flat.sides, ground, TO_CRS, patches.EPSG, ground_m=ground)
+    camera, grid = paper_camera(pitch), TO_CRS @ (x, y, 1.0)
+    ahead = 80.0 / np.tan(np.radians(-pitch))  # the patch lies in the frame, and not below the vehicle
+    turn = np.radians(attitude.heading_deg)
+    position = off_by(15.0 - ahead * np.cos(turn), -20.0 - ahead * np.sin(turn))
+    seen = render_frame(world, camera, tuple(position), 125.0, attitude, supersample=1)
+    expected = project(camera, grid, 45.0, position, 125.0, attitude)
+    np.testing.assert_allclose(centre_near(seen, expected), expected, atol=0.25)
+    assert world.ground_at(tuple(grid)) == pytest.approx(45.0)
+
+
+def test_a_house_hides_what_is_behind_it():
+    world, camera = patch_world(600, 600, 20.0), paper_camera(-30.0)
+    behind = replace(world, rgb=world.rgb.copy())
+    behind.rgb[500:560, 590:610] = (250, 0, 0)  # north of the box, 2 to 17 m behind its wall of 20 m
+    for side, hidden in ((-100.0, True), (100.0, False)):
+        heading = 0.0 if side < 0 else 180.0
+        seen = render_frame(behind, camera, tuple(off_by(side)), 60.0, Attitude(0.0, 0.0, heading))
+        red = ((seen[..., 0] > 150) & (seen[..., 2] < 60)).sum()
+        assert (red < 60) == hidden, red
+
+
+def test_beyond_the_far_field_there_is_only_sky():
+    camera = paper_camera(-20.0)  # 70 degrees off the vertical: the horizon is in the picture
+    seen = render_frame(patch_world(600, 600, 0.0), camera, ORIGIN, 100.0, LEVEL, supersample=1)
+    rows = np.arange(camera.height_px)
+    angle = 70.0 - np.degrees(np.arctan((rows - 149.5) / camera.focal_px))  # of the middle column
+    sky = (np.abs(seen[:, 150] - np.array(SKY_RGB)) <= 1.0).all(axis=1)
+    np.testing.assert_array_equal(sky[angle > FAR_DEG + 0.5], True)
+    np.testing.assert_array_equal(sky[angle < FAR_DEG - 0.5], False)
+
+
+def test_a_world_continues_mirrored():
+    world, camera = patch_world(600, 60, 0.0), paper_camera(-45.0)
+    beyond = TO_CRS @ (600, -61, 1.0)  # as far beyond the northern edge as the patch is from it
+    position = beyond - (0.0, 100.0)
+    seen = render_frame(world, camera, tuple(position), 100.0, LEVEL, supersample=1)
+    expected = project(camera, beyond, 0.0, position, 100.0, LEVEL)
+    np.testing.assert_allclose(centre_near(seen, expected), expected, atol=0.25)
+
+
+@pytest.mark.parametrize("pitch", [-60.0, -45.0])
+def test_a_flight_keeps_what_it_looks_at_on_the_map_and_its_truth_is_the_vehicles(pitch):
+    blank, half = np.zeros((700, 700), np.float32), 350.0
+    to_crs = np.array([[1.0, 0.0, ORIGIN[0] - half], [0.0, -1.0, ORIGIN[1] + half]])
+    town = Town(np.zeros((700, 700, 3), np.uint8), blank, to_crs, patches.EPSG, 1.0, patch_world(600, 600, 0.0))
+    plan = plan_flight(3, town=town, camera=paper_camera(pitch), rate_hz=0.3)
+    heading = np.radians(plan.truth.heading_deg)
+    ahead = 150.0 / np.tan(np.radians(-pitch)) * np.column_stack([np.sin(heading), np.cos(heading)])
+    assert np.abs(plan.truth.position_m[:, :2] + ahead).max() < half
+    east, north = plan.origin.enu_from_geodetic(plan.truth_rows()[5].lat_deg, plan.truth_rows()[5].lon_deg)
+    np.testing.assert_allclose((east, north), plan.truth.position_m[5, :2], atol=0.01)
+
+
+def test_a_simulation_has_the_camera_of_its_pitch():
+    assert WorldSettings(camera_pitch_deg=-45.0).camera().mount.tolist() == paper_camera(-45.0).mount.tolist()

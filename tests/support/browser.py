@@ -51,7 +51,8 @@ class Browser:
         """Load a file or an address in a window of this size, and wait until it is drawn: until then Chromium
         drops what is typed and clicked.
         """
-        self.resize(width_px, height_px)
+        size = {"width": width_px, "height": height_px, "deviceScaleFactor": 1, "mobile": False}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         self.requests()  # those of the page before, and of the browser's own first one
         self.driver.get(page if isinstance(page, str) else page.resolve().as_uri())
         self.wait_for("performance.getEntriesByName('first-contentful-paint').length > 0")
@@ -89,11 +90,6 @@ class Browser:
                 return
             time.sleep(0.5)
         raise TimeoutError("the page did not come to rest")
-
-    def resize(self, width_px: int, height_px: int) -> None:
-        """Change the window."""
-        size = {"width": width_px, "height": height_px, "deviceScaleFactor": 1, "mobile": False}
-        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
 
     def run(self, script: str) -> Any:
         """What a script returns."""

@@ -4,16 +4,21 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.accuracy import quality
+from bench.accuracy import quality, years
+from bench.accuracy.audit import Trial, fit
 from bench.accuracy.flights import attitude_rms_deg, moved_to_middle
 from bench.accuracy.quality import Keypoints, ViewPair, judge
+from bench.accuracy.recall import DETECTORS, WARPS, measured, warped
+from bench.accuracy.trials import ground_quad_px, picture
 from bench.inputs.map_views import map_pairs
 from bench.inputs.views import by_homography, warped_pairs
+from bench.pages.integrity import auc, calibration_error, false_positives
 from bench.speed.detectors import detectors
 from engine import Camera
 from engine.values import Attitude, Truth
 from tests.support.fixes import a_fix
 
+CAMERA = Camera.from_fov(300, 300, 60.0)
 SIZE = 200
 TURN = np.array([[0.0, -1.0, SIZE - 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a quarter: (x, y) to (last - y, x)
 
@@ -138,9 +143,73 @@ def test_the_attitudes_error_is_the_angle_between_the_attitudes():
 
 
 def test_a_fix_moves_to_where_its_axis_meets_the_ground(ground):
-    camera = Camera.from_fov(300, 300, 60.0)
-    level = moved_to_middle(fix_with(Attitude(0.0, 0.0, 30.0)), ground.site, camera)
+    level = moved_to_middle(fix_with(Attitude(0.0, 0.0, 30.0)), ground.site, CAMERA)
     assert (level.east_m, level.north_m) == pytest.approx((5.0, -3.0))
     # Heading north with the nose up it looks ahead.
-    nose_up = moved_to_middle(fix_with(Attitude(0.0, 10.0, 0.0)), ground.site, camera)
+    nose_up = moved_to_middle(fix_with(Attitude(0.0, 10.0, 0.0)), ground.site, CAMERA)
     assert (nose_up.east_m, nose_up.north_m) == pytest.approx((5.0, -3.0 + 100.0 * np.tan(np.radians(10.0))))
+
+
+# ---------------------------------------------------------------------------------------------------------- recall
+
+
+@pytest.mark.parametrize("name", list(DETECTORS))
+def test_matches_are_judged_by_the_warp(name):
+    noise = np.random.default_rng(0).normal(0.0, 1.0, (160, 200))
+    gray = np.clip(128.0 + 200.0 * cv2.GaussianBlur(noise, (0, 0), 2.0), 0, 255).astype(np.uint8)
+    found, _ = measured(DETECTORS[name], 100, [warped("noise", gray, *warp) for warp in WARPS])
+    assert all(quality.correct > 20 for quality in found)
+    assert all(quality.inlier_ratio > 0.9 for quality in found)
+    assert all(quality.error_px < 0.5 for quality in found)
+
+
+# ------------------------------------------------------------------------------------------------------ statistics
+
+
+def test_scores_are_ranked():
+    """Right ones 3 and 1, wrong ones 2 and 0: of four pairs three are in order; 1 is kept, so 2 passes."""
+    score, right = np.array([3.0, 1.0, 2.0, 0.0]), np.array([True, True, False, False])
+    assert auc(score, right) == 0.75
+    assert auc(np.ones(4), right) == 0.5
+    assert np.isnan(auc(np.ones(2), right[[0, 1]]))
+    assert false_positives(score, right, kept=1.0) == 0.5
+    assert calibration_error(np.array([0.75] * 4), np.array([True, True, True, False])) == 0.0
+    assert calibration_error(np.array([1.0] * 4), right) == 0.5
+
+
+def test_the_fit_finds_the_weights_that_drew_the_outcomes():
+    rng = np.random.default_rng(0)
+    weights, features = np.array([-1.0, 0.5, 0.0, 2.0]), rng.normal(size=(20_000, 3))
+    chance = 1.0 / (1.0 + np.exp(-weights[0] - features @ weights[1:]))
+    right = rng.random(len(chance)) < chance
+    found = [Trial(60.0, 0.5, row, bool(one), False) for row, one in zip(features, right, strict=True)]
+    assert fit(found) == pytest.approx(weights, abs=0.1)
+
+
+# -------------------------------------------------------------------------------------------------- pairs of years
+
+
+@pytest.mark.usefixtures("shared")
+def test_every_place_is_in_one_half():
+    fit, report = (set(years.places(half)) for half in years.HALVES)
+    assert not fit & report
+    assert len(fit | report) == 38
+    assert abs(len(fit) - len(report)) <= 4
+
+
+@pytest.mark.usefixtures("shared")
+def test_a_shift_back_is_the_shift_forth_turned_round():
+    first, second = years.YEARS[:2]
+    for place in years.places("fit"):
+        np.testing.assert_array_equal(years.shift(place, first, second), -years.shift(place, second, first))
+
+
+def test_a_level_frame_that_looks_north_shows_the_map_under_its_place(ground):
+    place_m = ground.site.enu_from_pixel(np.array([310.0, 305.0]))
+    quad_px = ground_quad_px(ground.site, CAMERA, place_m, 100.0, 0.0)
+    np.testing.assert_allclose(quad_px.mean(axis=0), [310.0, 305.0], atol=1e-3)
+    image = picture(ground.gray, ground.site, CAMERA, place_m, 100.0, 0.0)
+    scale = (quad_px[1, 0] - quad_px[0, 0]) / (CAMERA.width_px - 1)
+    x, y = np.round(quad_px[0] + 150 * scale).astype(int)
+    near = ground.gray[y - 1 : y + 2, x - 1 : x + 2]
+    assert near.min() <= image[150, 150] <= near.max()
