@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from engine.errors import TelemetryError
 from engine.geo import attitude_from_rotation, enu_from_body, wrap_heading_deg
 from engine.values import Truth
 from scenematch.files.frames import PictureFolder, opened_picture
+from scenematch.files.stamps import since_1970_ns
 from scenematch.files.telemetry import TelemetryRow, take_off_sigma_m
 
 COMPASS_SIGMA_DEG = 3.0
@@ -189,9 +190,7 @@ def _capture_ns(exif: Mapping[int, Any]) -> int | None:
     except (KeyError, ValueError):
         return None
     fraction = re.match(r"[0-9]*", str(exif.get(0x9291, "")).strip())
-    nanoseconds = int(fraction.group().ljust(9, "0")[:9]) if fraction else 0
-    since = time - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + nanoseconds
+    return since_1970_ns(time, fraction.group() if fraction else "")
 
 
 def _finite(value: Any) -> float | None:
