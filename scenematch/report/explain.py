@@ -128,8 +128,11 @@ def jpeg_bytes(image: Image, quality: int) -> bytes:
 def resized(image: Image, side_px: int) -> Image:
     """Resize an image so that its longer side is ``side_px``."""
     scale = side_px / max(image.shape[:2])
+    return _scaled(image, scale, cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST)
+
+
+def _scaled(image: Image, scale: float, interpolation: int) -> Image:
     size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    interpolation = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
     return np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
 
 
@@ -285,16 +288,14 @@ def draw_surface(surface: ScoreSurface) -> tuple[Image, Array]:
     Returns:
         (H, W, 3) RGB image of the correlation by the position of the template's centre, and (2,) its peak in that.
     """
-    high, rows, columns = surface.score, *surface.scores.shape
-    low = min_shown_score(surface)
+    low, high = min_shown_score(surface), surface.score
     levels = np.clip((surface.scores - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0).astype(np.uint8)
-    scale = SIDE_PX / max(rows, columns)
-    size = (max(1, round(columns * scale)), max(1, round(rows * scale)))
+    scale = SIDE_PX / max(levels.shape)
     if scale < 1.0:  # the maximum within each pixel: a mean would remove a narrow peak
         reach = math.ceil(1.0 / scale)
         levels = np.asarray(cv2.dilate(levels, np.ones((reach, reach), np.uint8)), np.uint8)
-    levels = np.asarray(cv2.resize(levels, size, interpolation=cv2.INTER_LINEAR), np.uint8)
-    coloured = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+    coloured = cv2.applyColorMap(_scaled(levels, scale, cv2.INTER_LINEAR), cv2.COLORMAP_VIRIDIS)
+    coloured = cv2.cvtColor(coloured, cv2.COLOR_BGR2RGB)
     return np.asarray(coloured, np.uint8), (np.array(surface.peak_px) + 0.5) * scale
 
 
