@@ -10,7 +10,7 @@ import pytest
 from engine.geo import LocalFrame
 from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
-from scenematch.report.consistency import motion_consistency
+from scenematch.report.segments import motion_consistency
 
 FRAME = LocalFrame(48.2, 16.3)
 STEP_S = 0.5
