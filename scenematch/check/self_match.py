@@ -107,7 +107,8 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px:
     region = prepared.cut(_window(plan, middle), level)
     scores = surface(region.search, _templates(gray, noise, other))
     x, y = x0 - region.window.x0, y0 - region.window.y0
-    own, rivals = _own_and_rivals(scores, x, y, plan.exclusion_px)
+    exclusion_px = NCC.exclusion_m / (site.gsd_m_per_px * 2.0**level)
+    own, rivals = _own_and_rivals(scores, x, y, exclusion_px)
     leads = own - rivals
     sigma = score_sigma(height * width)
     changed = slice(2, 2 + _DRAWS)
