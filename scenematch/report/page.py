@@ -83,23 +83,21 @@ def _where(track: FinishedTrack, track_map: TrackMap, slider: bool) -> str:
 
 
 def _map_legend(track: FinishedTrack, slider: bool) -> Legend:
-    has_truth = np.isfinite(track.errors.truth_en_m).any()
-    line, kind = ("truth", "truth") if has_truth else ("path of the fixes", "fix")
-    legend = [(line, f'<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="{kind}"/>')]
-    if track.loop is not None:
-        legend += [(name, f'<path d="M0 7h22" class="line {name}"/>') for name in ("plan", "estimate")]
-    legend.append(("fix", '<path class="dots fix" d="M11 7h0"/>'))
-    if np.isfinite(track.errors.covariance_en_m2).any():
-        legend.append(("three stated sigmas, of some fixes", '<circle cx="11" cy="7" r="6" class="fix"/>'))
-    if not track.fixed.all():
-        legend.append(("refused", f'<path d="{CROSS}" class="refused"/>'))
-    if track.errors.beyond.any():
-        legend.append(("fix beyond three of its sigmas", f'<path d="{CROSS}" class="beyond"/>'))
-    if slider:
-        legend.append(
-            ("frame shown below and its window", '<rect class="now" x="2" y="1" width="18" height="12"/>')
-        )
-    return legend
+    errors, is_loop = track.errors, track.loop is not None
+    has_truth = np.isfinite(errors.truth_en_m).any()
+    path, kind = ("truth", "truth") if has_truth else ("path of the fixes", "fix")
+    marks = [
+        (True, path, f'<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="{kind}"/>'),
+        (is_loop, "plan", '<path d="M0 7h22" class="line plan"/>'),
+        (is_loop, "estimate", '<path d="M0 7h22" class="line estimate"/>'),
+        (True, "fix", '<path class="dots fix" d="M11 7h0"/>'),
+        (np.isfinite(errors.covariance_en_m2).any(), "three stated sigmas, of some fixes",
+         '<circle cx="11" cy="7" r="6" class="fix"/>'),
+        (not track.fixed.all(), "refused", f'<path d="{CROSS}" class="refused"/>'),
+        (errors.beyond.any(), "fix beyond three of its sigmas", f'<path d="{CROSS}" class="beyond"/>'),
+        (slider, "frame shown below and its window", '<rect class="now" x="2" y="1" width="18" height="12"/>'),
+    ]  # fmt: skip
+    return [(name, mark) for is_shown, name, mark in marks if is_shown]
 
 
 def _when(track: FinishedTrack) -> str:
@@ -107,21 +105,17 @@ def _when(track: FinishedTrack) -> str:
     charts = draw_charts(track)
     if not charts:
         return "<p>There are no frames.</p>"
-    legend = [("fix", '<path class="dots fix" d="M11 7h0"/>')]
-    if track.errors.beyond.any():
-        legend.append(("fix beyond three of its sigmas", '<path class="dots beyond" d="M11 7h0"/>'))
-    if np.isfinite(track.errors.truth_en_m).any():
-        legend.append(("truth", '<path d="M0 7h22" class="line truth"/>'))
-    if track.telemetry:
-        legend.append(("telemetry", '<path d="M0 7h22" class="line telemetry"/>'))
-    states = {"coasting": "on dead reckoning", "searching": "searching for a first fix", "lost": "lost"}
-    seen = {note.state for note in track.notes or ()}
-    legend += [
-        (name, f'<rect class="{state}" width="22" height="14"/>')
-        for state, name in states.items()
-        if state in seen
+    errors, states = track.errors, {note.state for note in track.notes or ()}
+    marks = [
+        (True, "fix", '<path class="dots fix" d="M11 7h0"/>'),
+        (errors.beyond.any(), "fix beyond three of its sigmas", '<path class="dots beyond" d="M11 7h0"/>'),
+        (np.isfinite(errors.truth_en_m).any(), "truth", '<path d="M0 7h22" class="line truth"/>'),
+        (track.telemetry, "telemetry", '<path d="M0 7h22" class="line telemetry"/>'),
+        ("coasting" in states, "on dead reckoning", '<rect class="coasting" width="22" height="14"/>'),
+        ("searching" in states, "searching for a first fix", '<rect class="searching" width="22" height="14"/>'),
+        ("lost" in states, "lost", '<rect class="lost" width="22" height="14"/>'),
     ]
-    return charts_with_axis(charts, legend)
+    return charts_with_axis(charts, [(name, mark) for is_shown, name, mark in marks if is_shown])
 
 
 # ------------------------------------------------------------------------------------------------ frame by frame
