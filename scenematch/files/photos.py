@@ -90,16 +90,9 @@ def read_photo_tags(path: Path) -> PhotoTags:
     return PhotoTags(path, size_px, exif, gps, xmp, dewarp if len(dewarp) == 9 else (), software)
 
 
-def exif_telemetry(source: str | Path | Sequence[str | Path]) -> list[TelemetryRow]:
-    """Telemetry from photographs' EXIF and DJI's XMP, see :func:`photo_telemetry`.
-
-    Args:
-        source: a folder, or paths of images.
-    """
-    if isinstance(source, (str, Path)):
-        folder = PictureFolder(Path(source))
-        source = [folder.path / name for name in folder.names]
-    return photo_telemetry([Path(path) for path in source])[0]
+def exif_telemetry(folder: Path) -> list[TelemetryRow]:
+    """Telemetry from the EXIF and DJI's XMP of a folder's photographs, see :func:`photo_telemetry`."""
+    return photo_telemetry([folder / name for name in PictureFolder(folder).names])[0]
 
 
 def photo_truth(folder: Path) -> list[Truth]:

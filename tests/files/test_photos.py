@@ -38,7 +38,7 @@ def test_exif_heading_counts_only_from_true_north(tmp_path):
 
 def test_exif_without_a_fix_or_below_the_sea(tmp_path):
     nowhere = {1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0), 5: b"\1", 6: 3.0, 31: 2.5}
-    (row,) = exif_telemetry([photograph(tmp_path / "a.jpg", gps=nowhere)])
+    (row,), _ = photo_telemetry([photograph(tmp_path / "a.jpg", gps=nowhere)])
     assert row.prior is None
     assert row.alt_amsl_m == -3.0
 
