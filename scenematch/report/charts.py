@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -104,15 +105,12 @@ class ChartArea:
 
     def strip(self, x: Array, values: Sequence[str]) -> str:
         """A background in the CSS class of each x, up to the next x."""
-        parts, begin = [], 0
-        ends = np.append(x[1:], x[-1:])
-        for i in range(len(values)):
-            if i + 1 == len(values) or values[i + 1] != values[begin]:
-                left, right = float(self.x(float(x[begin]))), float(self.x(float(ends[i])))
-                size = f'width="{max(right - left, 0.8):.1f}" height="{HEIGHT - _BOTTOM - _TOP}"'
-                kind = escape(values[begin], quote=True)
-                parts.append(f'<rect class="{kind}" x="{left:.1f}" y="{_TOP}" {size}/>')
-                begin = i + 1
+        parts, edges = [], self.x(np.append(x, x[-1:])).tolist()
+        for kind, same in itertools.groupby(range(len(values)), key=values.__getitem__):
+            places = list(same)
+            left, right = edges[places[0]], edges[places[-1] + 1]
+            size = f'width="{max(right - left, 0.8):.1f}" height="{HEIGHT - _BOTTOM - _TOP}"'
+            parts.append(f'<rect class="{escape(kind)}" x="{left:.1f}" y="{_TOP}" {size}/>')
         return "".join(parts)
 
     def svg(

@@ -103,15 +103,19 @@ def _answers(track: FinishedTrack) -> Chart:
 
 def _height(track: FinishedTrack) -> Chart:
     measured, true = track.heights.T
-    known = track.heights[np.isfinite(track.heights)]
-    low, high = np.percentile(known, [1, 99])
-    margin = max(0.15 * (high - low), 1.0)
-    area = ChartArea(track.time_limits, (float(low - margin), float(high + margin)))
+    area = _area_around(track.heights, 1.0, track)
     marks = [area.line(track.time, true, "truth"), area.dots(track.time, measured, "fix")]
     what = "True height above ground (m); this method measures none"
     if np.isfinite(measured).any():
         what = "Height above ground (m)" + (", measured and true (line)" if np.isfinite(true).any() else "")
     return what, area.svg(what, track.time_label, marks, timed=True)
+
+
+def _area_around(values: Array, least_margin: float, track: FinishedTrack) -> ChartArea:
+    """The area that shows values over time, without a few outliers."""
+    low, high = np.percentile(values[np.isfinite(values)], [1, 99]).tolist()
+    margin = max(0.15 * (high - low), least_margin)
+    return ChartArea(track.time_limits, (low - margin, high + margin))
 
 
 def _score(track: FinishedTrack) -> Chart:
@@ -241,10 +245,7 @@ def _chart(
     caption: str, fix: Array, stated: Array, true: Array, track: FinishedTrack, period: float | None = None
 ) -> Chart:
     """Dots of the fixes on lines of telemetry and truth."""
-    values = np.concatenate([fix, stated, true])
-    low, high = np.percentile(values[np.isfinite(values)], [1, 99])
-    margin = max(0.15 * (high - low), 0.5)
-    area = ChartArea(track.time_limits, (float(low - margin), float(high + margin)))
+    area = _area_around(np.concatenate([fix, stated, true]), 0.5, track)
     marks = [
         area.line(track.time, stated, "telemetry"),
         area.dots(track.time, fix, "fix"),
