@@ -82,9 +82,7 @@ def _is_enough(found: Sequence[Sighting], frames: Sequence[Frame]) -> bool:
 
 
 def _mirrored(frame: Frame) -> Frame:
-    image = frame.image
-    flipped = np.ascontiguousarray(image[:, ::-1]) if isinstance(image, np.ndarray) else image.flip(1)
-    return replace(frame, image=flipped)
+    return replace(frame, image=np.ascontiguousarray(np.asarray(frame.image)[:, ::-1]))
 
 
 def _by_features(matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]) -> list[Sighting]:

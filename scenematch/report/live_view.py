@@ -113,7 +113,7 @@ class LiveView:
         entities = self._match_entities(name, frame, result, word, latency_ms)
         for entity in (*PICTURES, *PLACES):
             stream.log(entity, entities.get(entity) or rr.Clear(recursive=False))
-        image = _pixels(frame)
+        image = np.asarray(frame.image, np.uint8)
         stream.log("frame", _jpeg(resized(image, min(_FRAME_PX, max(image.shape[:2])))))
         stream.log("state", rr.StateChange(state=word))
         stream.log("plots/latency_ms", rr.Scalars(latency_ms))
@@ -255,11 +255,6 @@ def open_live_view(matcher: SceneMatcher, recording: Path | None, address: str |
     except RuntimeError as error:
         raise BackendError(f"recording: {recording} cannot be written: {error}") from None
     return LiveView(stream, matcher)
-
-
-def _pixels(frame: Frame) -> Image:
-    image = frame.image
-    return np.asarray(image if isinstance(image, np.ndarray) else image.cpu().numpy(), np.uint8)
 
 
 def _line(name: str, result: Fix | NoFix) -> str:
