@@ -206,12 +206,10 @@ def _position(gps: Mapping[int, Any]) -> dict[str, float | None]:
 
 
 def _degrees(parts: Any, negative: bool) -> float | None:
-    values = [_finite(part) for part in parts or ()]
-    if len(values) != 3 or None in values:
+    known = [value for part in parts or () if (value := _finite(part)) is not None]
+    if len(known) != 3:
         return None
-    degrees = sum(
-        value / unit for value, unit in zip(values, (1.0, 60.0, 3600.0), strict=True) if value is not None
-    )
+    degrees = known[0] + known[1] / 60.0 + known[2] / 3600.0
     return -degrees if negative else degrees
 
 
