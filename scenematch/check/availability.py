@@ -128,11 +128,10 @@ class Audit:
         Returns:
             (...,) uint8 values of :class:`Flag`; EDGE off the map.
         """
+        framed = np.pad(self.flags, 1, constant_values=Flag.EDGE)
         cell = np.floor(self.plan.cell_from_pixel(xy_px) + 0.5).astype(int)
-        rows, columns = self.flags.shape
-        x, y = np.moveaxis(cell, -1, 0)
-        on = (x >= 0) & (y >= 0) & (x < columns) & (y < rows)
-        return np.where(on, self.flags[np.clip(y, 0, rows - 1), np.clip(x, 0, columns - 1)], Flag.EDGE)
+        x, y = np.moveaxis(np.clip(cell, -1, self.flags.shape[::-1]) + 1, -1, 0)
+        return np.asarray(framed[y, x], np.uint8)
 
 
 def gather(plan: AuditPlan, measured: Iterable[SelfMatchStatistics]) -> Audit:

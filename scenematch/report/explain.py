@@ -17,7 +17,7 @@ from engine.matching.explanation import Explanation, PointMatches, ScoreSurface
 from engine.matching.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
 from engine.values import Frame, Window
-from engine.window import level_crop
+from engine.window import level_crop, level_for
 from scenematch.files.flight import Flight, FlightFrame
 from scenematch.files.notes import FrameNote
 from scenematch.files.track import TrackRow
@@ -252,9 +252,7 @@ def draw_window(site: OrthoMap, window: Window) -> tuple[Image, float]:
         (H, W) grey image, and its pixels per pixel of the map.
     """
     per_px = SIDE_PX / max(window.width_px, window.height_px)
-    level = 0
-    while per_px * 2.0 ** (level + 1) <= 1.0 and level + 1 < site.levels:
-        level += 1
+    level = level_for(1.0, 1.0 / per_px, site.levels, coarser=0.0)  # the coarsest that is as fine as the drawing
     gray = site.gray(level_crop(site, window, level), level)
     size = (max(1, round(window.width_px * per_px)), max(1, round(window.height_px * per_px)))
     interpolation = cv2.INTER_AREA if per_px * 2.0**level < 1.0 else cv2.INTER_LINEAR
