@@ -112,18 +112,12 @@ class Audit:
         Returns:
             (...,) in [0, 1]; nodata, pixels off the map and cells outside the audited part count as 0.
         """
-        cell = self.plan.cell_from_pixel(xy_px).astype(np.float32)
-        known = np.nan_to_num(self.availability, nan=0.0).astype(np.float32)
-        flat = cell.reshape(-1, 2)
-        low, high = np.zeros(2, np.float32), np.array(known.shape[::-1], np.float32) - 1.0
-        inside = np.clip(flat, low, high)  # the outer half of an edge cell has the value of its centre
-        x, y = inside.T
-        x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
-        x1, y1 = np.minimum(x0 + 1, known.shape[1] - 1), np.minimum(y0 + 1, known.shape[0] - 1)
-        u, v = x - x0, y - y0
-        top, bottom = known[y0, x0] * (1 - u) + known[y0, x1] * u, known[y1, x0] * (1 - u) + known[y1, x1] * u
-        off = (np.abs(flat - inside) > 0.5).any(axis=1)
-        return np.where(off, 0.0, top * (1 - v) + bottom * v).reshape(cell.shape[:-1]).astype(np.float64)
+        from engine.kernels.map_points import bilinear_heights  # numba takes a while to import
+
+        known, cell = np.nan_to_num(self.availability), np.ascontiguousarray(self.plan.cell_from_pixel(xy_px))
+        found = np.empty(cell.shape[:-1])
+        bilinear_heights(known.astype(np.float32), cell.reshape(-1, 2), found.reshape(-1))
+        return np.nan_to_num(found)
 
     def flag_at(self, xy_px: ArrayLike) -> NDArray[np.uint8]:
         """Flags of the nearest cells.
@@ -134,11 +128,10 @@ class Audit:
         Returns:
             (...,) uint8 values of :class:`Flag`; EDGE off the map.
         """
+        framed = np.pad(self.flags, 1, constant_values=Flag.EDGE)
         cell = np.floor(self.plan.cell_from_pixel(xy_px) + 0.5).astype(int)
-        rows, columns = self.flags.shape
-        x, y = np.moveaxis(cell, -1, 0)
-        on = (x >= 0) & (y >= 0) & (x < columns) & (y < rows)
-        return np.where(on, self.flags[np.clip(y, 0, rows - 1), np.clip(x, 0, columns - 1)], Flag.EDGE)
+        x, y = np.moveaxis(np.clip(cell, -1, self.flags.shape[::-1]) + 1, -1, 0)
+        return np.asarray(framed[y, x], np.uint8)
 
 
 def gather(plan: AuditPlan, measured: Iterable[SelfMatchStatistics]) -> Audit:

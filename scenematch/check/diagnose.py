@@ -146,12 +146,9 @@ def _frozen(
     chosen: Sequence[int], frames: Sequence[Frame], picture: Callable[[int], Frame], count: int
 ) -> Finding | None:
     """Compare each sampled picture with the flight's next one."""
-    repeated = looked = 0
-    for k, frame in zip(chosen, frames, strict=True):
-        if k + 1 < count:
-            looked += 1
-            repeated += bool(np.array_equal(np.asarray(frame.image), np.asarray(picture(k + 1).image)))
-    if repeated <= _FROZEN_SHARE * looked:
+    followed = [(k, frame) for k, frame in zip(chosen, frames, strict=True) if k + 1 < count]
+    repeated = sum(np.array_equal(frame.image, picture(k + 1).image) for k, frame in followed)
+    if repeated <= _FROZEN_SHARE * len(followed):
         return None
-    text = f"{repeated} of {looked} pictures are repeated by the next"
+    text = f"{repeated} of {len(followed)} pictures are repeated by the next"
     return Finding("frozen", text, "look at the camera, or at how its pictures were saved", float(repeated))

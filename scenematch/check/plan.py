@@ -74,65 +74,32 @@ class MapPart:
 
 
 @dataclass(frozen=True)
-class AuditPlan:
-    """The grid of an audit, and the view of a frame.
+class CellGrid:
+    """A grid of equal cells over a part of the map.
 
     Attributes:
-        site: the map.
-        camera: of the flights.
-        height_agl_m: of the flights.
-        options: settings.
-        level: of the map's pyramid.
-        view: of a level camera that looks north, in pixels of the level.
-        shape: (h, w) of a template.
-        window: the part of the map that the grid covers, in pixels of the map.
-        audited: (rows, columns) which cells are audited.
-        other: map of the same ground at another date, or None.
+        window: the part, in pixels of the map.
+        cells: rows and columns.
     """
 
-    site: OrthoMap
-    camera: Camera
-    height_agl_m: float
-    options: AuditOptions
-    level: int
-    view: GroundView
-    shape: tuple[int, int]
     window: Window
-    audited: Mask
-    other: OrthoMap | None = None
+    cells: tuple[int, int]
 
-    def __len__(self) -> int:
-        return int(np.count_nonzero(self.audited))
-
-    @property
-    def cells(self) -> tuple[int, int]:
-        """Rows and columns of the grid."""
-        return self.audited.shape[0], self.audited.shape[1]
-
-    @property
-    def area_px(self) -> float:
-        """Audited area in pixels of the map."""
-        return len(self) * float(self.spacing_px.prod())
+    @classmethod
+    def over(cls, window: Window, step_px: float) -> CellGrid:
+        """The grid of the largest cells that are at most ``step_px`` wide."""
+        return cls(window, (math.ceil(window.height_px / step_px), math.ceil(window.width_px / step_px)))
 
     @cached_property
     def spacing_px(self) -> Array:
         """(2,) size of a cell along x and y, in pixels of the map."""
-        return _spacing_px(self.window, self.cells)
-
-    @property
-    def exclusion_px(self) -> float:
-        """Rivals closer than this belong to the peak itself, in pixels of the level."""
-        return NCC.exclusion_m / (self.site.gsd_m_per_px * 2.0**self.level)
+        return np.array([self.window.width_px / self.cells[1], self.window.height_px / self.cells[0]])
 
     @cached_property
     def centers_px(self) -> Array:
         """(rows, columns, 2) centres of the cells, in pixels of the map; the middle of a frame shows them."""
-        return _centers_px(self.window, self.cells)
-
-    @cached_property
-    def view_offset_m(self) -> Array:
-        """(2,) metres east and north from a level vehicle heading north to the middle of its frame."""
-        return _view_offset_m(self.site, self.view, self.level, _middle_px(self.window))
+        j, i = np.mgrid[: self.cells[0], : self.cells[1]]
+        return self.pixel_from_cell(np.stack([i, j], axis=-1))
 
     def cell_from_pixel(self, xy_px: ArrayLike) -> Array:
         """Grid coordinates of pixels.
@@ -157,6 +124,41 @@ class AuditPlan:
         """
         corner = np.array([self.window.x0, self.window.y0])
         return np.asarray((np.asarray(cell, np.float64) + 0.5) * self.spacing_px + corner - 0.5)
+
+
+@dataclass(frozen=True)
+class AuditPlan(CellGrid):
+    """The grid of an audit, and the view of a frame.
+
+    Attributes:
+        site: the map.
+        height_agl_m: of the flights.
+        options: settings.
+        level: of the map's pyramid.
+        view: of a level camera that looks north, in pixels of the level.
+        view_offset_m: (2,) metres east and north from a level vehicle heading north to the middle of its frame.
+        shape: (h, w) of a template.
+        audited: (rows, columns) which cells are audited.
+        other: map of the same ground at another date, or None.
+    """
+
+    site: OrthoMap
+    height_agl_m: float
+    options: AuditOptions
+    level: int
+    view: GroundView
+    view_offset_m: Array
+    shape: tuple[int, int]
+    audited: Mask
+    other: OrthoMap | None
+
+    def __len__(self) -> int:
+        return int(np.count_nonzero(self.audited))
+
+    @property
+    def area_px(self) -> float:
+        """Audited area in pixels of the map."""
+        return len(self) * float(self.spacing_px.prod())
 
     def corner_px(self, center_px: Array) -> tuple[int, int]:
         """The top-left pixel of a template.
@@ -209,15 +211,19 @@ def plan_audit(
     if not (math.isfinite(height_agl_m) and height_agl_m > 0):
         raise OptionError(f"height_agl_m: expected metres above 0, got {height_agl_m:g}")
     whole = Window(0, 0, site.width_px, site.height_px)
-    middle = _middle_px(whole) if part is None else _middle_of(part, site)
+    middle = np.array([site.width_px - 1, site.height_px - 1]) / 2.0 if part is None else _middle_of(part, site)
     level, view, shape = _seen_at(site, camera, height_agl_m, options, middle)
+    view_offset_m = np.asarray((site.enu_jacobian(middle) * 2.0**level) @ view.center_px)
     step_px = options.spacing * math.sqrt(view.area_px) * 2.0**level
     if part is not None:
-        window, audited = _near(part, site, view, level, step_px, options.max_cells)
+        reach_m = part.corridor_m or max(view.footprint_px) * 2.0**level * site.gsd_m_per_px
+        grid, audited = _near(part, site, reach_m, view_offset_m, step_px, options.max_cells)
     else:
-        step_px = max(step_px, math.sqrt(whole.area_px / options.max_cells))
-        window, audited = whole, np.ones(_cells(whole, step_px), np.bool_)
-    return AuditPlan(site, camera, height_agl_m, options, level, view, shape, window, audited, other)
+        grid = CellGrid.over(whole, max(step_px, math.sqrt(whole.area_px / options.max_cells)))
+        audited = np.ones(grid.cells, np.bool_)
+    return AuditPlan(
+        grid.window, grid.cells, site, height_agl_m, options, level, view, view_offset_m, shape, audited, other
+    )
 
 
 def _seen_at(
@@ -248,28 +254,6 @@ def _seen_at(
         level += 1
 
 
-# ------------------------------------------------------------------------------------------------ grid of cells
-
-
-def _cells(window: Window, step_px: float) -> tuple[int, int]:
-    """Rows and columns of cells that are at most ``step_px`` wide."""
-    return math.ceil(window.height_px / step_px), math.ceil(window.width_px / step_px)
-
-
-def _spacing_px(window: Window, cells: tuple[int, int]) -> Array:
-    return np.array([window.width_px / cells[1], window.height_px / cells[0]])
-
-
-def _centers_px(window: Window, cells: tuple[int, int]) -> Array:
-    j, i = np.mgrid[: cells[0], : cells[1]]
-    corner = np.array([window.x0, window.y0])
-    return np.asarray(np.stack([i + 0.5, j + 0.5], axis=-1) * _spacing_px(window, cells) + corner - 0.5)
-
-
-def _middle_px(window: Window) -> Array:
-    return np.array([window.x0 + (window.width_px - 1) / 2.0, window.y0 + (window.height_px - 1) / 2.0])
-
-
 # -------------------------------------------------------------------------------------------------------- parts
 
 
@@ -283,20 +267,19 @@ def _middle_of(part: MapPart, site: OrthoMap) -> Array:
 
 
 def _near(
-    part: MapPart, site: OrthoMap, view: GroundView, level: int, step_px: float, max_cells: int
-) -> tuple[Window, Mask]:
-    """The window of the map under a part, and which cells (rows, columns) of a grid on it belong to the part.
+    part: MapPart, site: OrthoMap, reach_m: float, view_offset_m: Array, step_px: float, max_cells: int
+) -> tuple[CellGrid, Mask]:
+    """A grid over the part, and which of its cells (rows, columns) belong to it.
 
-    The cells are ``step_px`` wide, or wider if there would be more than ``max_cells``.
+    The cells are ``step_px`` wide, or wider if there would be more than ``max_cells``. They reach
+    ``reach_m`` beside what the camera sees along a route.
     """
     gsd_m = site.gsd_m_per_px
-    reach_m = part.corridor_m or max(view.footprint_px) * 2.0**level * gsd_m
     while True:
         discs = []  # (N, 3) each: pixels x and y, and a radius
         if part.around is not None:
             discs.append(np.array([[*site.pixel_from_geodetic(*part.around[:2]), part.around[2] / gsd_m]]))
         if part.route is not None:
-            view_offset_m = _view_offset_m(site, view, level, _middle_of(part, site))
             seen = site.pixel_from_enu(sample_route(site, part.route, 0.5 * step_px * gsd_m, view_offset_m).view_m)
             reach_px = max(reach_m / gsd_m, _MARGIN_STEPS * step_px)
             discs.append(np.column_stack([seen, np.full(len(seen), reach_px)]))
@@ -305,15 +288,13 @@ def _near(
         if step_px < min_step_px:
             step_px = min_step_px
             continue
-        cells = _cells(window, step_px)
-        audited = np.zeros(cells, np.bool_)
-        for some in discs:
-            audited |= _within(some, window, cells)
+        grid = CellGrid.over(window, step_px)
+        audited = np.any([_within(some, grid) for some in discs], axis=0)
         count = np.count_nonzero(audited)
         if count == 0:
             raise OptionError(f"part: expected one on the map {site.name}, got one off it")
         if count <= max_cells or step_px >= max(window.width_px, window.height_px):
-            return window, audited
+            return grid, audited
         step_px *= max(1.02, math.sqrt(count / max_cells))
 
 
@@ -329,18 +310,18 @@ def _window_of(discs: Array, site: OrthoMap) -> Window:
     return Window(x0, y0, width, height)
 
 
-def _within(discs: Array, window: Window, cells: tuple[int, int]) -> Mask:
+def _within(discs: Array, grid: CellGrid) -> Mask:
     """Which cells (rows, columns) are within the radius, the same for all, of any of the discs (N, 3)."""
-    spacing, reach_px = _spacing_px(window, cells), float(discs[0, 2])
+    spacing, reach_px = grid.spacing_px, float(discs[0, 2])
     if len(discs) == 1:
-        off = _centers_px(window, cells) - discs[0, :2]
+        off = grid.centers_px - discs[0, :2]
         return np.asarray(np.hypot(off[..., 0], off[..., 1]) <= max(reach_px, 0.51 * float(np.hypot(*spacing))))
-    x, y = np.floor((discs[:, :2] + 0.5 - np.array([window.x0, window.y0])) / spacing).astype(int).T
-    inside = (x >= 0) & (y >= 0) & (x < cells[1]) & (y < cells[0])
-    far = np.ones(cells, np.uint8)
+    x, y = np.floor(grid.cell_from_pixel(discs[:, :2]) + 0.5).astype(int).T
+    inside = (x >= 0) & (y >= 0) & (x < grid.cells[1]) & (y < grid.cells[0])
+    far = np.ones(grid.cells, np.uint8)
     far[y[inside], x[inside]] = 0
     if not inside.any():
-        return np.zeros(cells, np.bool_)
+        return np.zeros(grid.cells, np.bool_)
     return np.asarray(cv2.distanceTransform(far, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * spacing.min() <= reach_px)
 
 
@@ -390,7 +371,3 @@ def sample_route(site: OrthoMap, route: ArrayLike, step_m: float, view_offset_m:
     right, ahead = view_offset_m
     view = np.stack([north * right + east * ahead, north * ahead - east * right], axis=1)
     return RouteSamples(at, en, en + view)
-
-
-def _view_offset_m(site: OrthoMap, view: GroundView, level: int, middle_px: Array) -> Array:
-    return np.asarray((site.enu_jacobian(middle_px) * 2.0**level) @ view.center_px)

@@ -35,10 +35,8 @@ _DRAWS = 2
 _TURN_DEG, _SCALE, _SHIFT_PX = 1.0, 1.01, 0.4  # residual errors of telemetry and level
 _NOISE_SD = 3.0  # grey levels, of the sensor
 _CHANGE, _CHANGE_PX = 1.0, 2.0  # other ground: standard deviations of the enhanced picture, and grain
-_SHAKE_PX, _SHAKE_BLUR_PX = (
-    2.0,
-    1.0,
-)  # shift at the edges, and a blur: a change that only fine texture is sensitive to
+# Shift at the edges, and a blur: a change that only fine texture is sensitive to.
+_SHAKE_PX, _SHAKE_BLUR_PX = 2.0, 1.0
 _NEAR_PX = 3  # largest shift at which a changed patch counts as matched at its own position
 
 
@@ -109,7 +107,8 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px:
     region = prepared.cut(_window(plan, middle), level)
     scores = surface(region.search, _templates(gray, noise, other))
     x, y = x0 - region.window.x0, y0 - region.window.y0
-    own, rivals = _own_and_rivals(scores, x, y, plan.exclusion_px)
+    exclusion_px = NCC.exclusion_m / (site.gsd_m_per_px * 2.0**level)
+    own, rivals = _own_and_rivals(scores, x, y, exclusion_px)
     leads = own - rivals
     sigma = score_sigma(height * width)
     changed = slice(2, 2 + _DRAWS)

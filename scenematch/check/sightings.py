@@ -63,22 +63,18 @@ def sight(frames: Sequence[Frame], priors: Sequence[Prior | None], site: OrthoMa
         site: the map.
         camera: the calibration.
     """
-    features = SceneMatcher(site, camera, "sift", "cpu", MatcherOptions())
-    found = _by_features(features, frames, priors)
-    if _is_enough(found, frames):
-        return Seen(found, mirrored=False)
     mirrored = [_mirrored(frame) for frame in frames]
-    there = _by_features(features, mirrored, priors)
-    if _is_enough(there, frames):
-        return Seen(there, mirrored=True)
-    correlation = SceneMatcher(site, camera, "ncc", "cpu", MatcherOptions())
-    correlated = _by_correlation(correlation, frames, priors)
-    if _is_enough(correlated, frames):
-        return Seen(correlated, mirrored=False)
-    reflected = _by_correlation(correlation, mirrored, priors)
-    if _is_enough(reflected, frames):
-        return Seen(reflected, mirrored=True)
-    return Seen(max((found, correlated), key=len), mirrored=False)
+    most: list[Sighting] = []
+    for method, locate in (("sift", _by_features), ("ncc", _by_correlation)):
+        matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions())
+        found = locate(matcher, frames, priors)
+        if _is_enough(found, frames):
+            return Seen(found, mirrored=False)
+        reflected = locate(matcher, mirrored, priors)
+        if _is_enough(reflected, frames):
+            return Seen(reflected, mirrored=True)
+        most = max(most, found, key=len)
+    return Seen(most, mirrored=False)
 
 
 def _is_enough(found: Sequence[Sighting], frames: Sequence[Frame]) -> bool:
@@ -86,9 +82,7 @@ def _is_enough(found: Sequence[Sighting], frames: Sequence[Frame]) -> bool:
 
 
 def _mirrored(frame: Frame) -> Frame:
-    image = frame.image
-    flipped = np.ascontiguousarray(image[:, ::-1]) if isinstance(image, np.ndarray) else image.flip(1)
-    return replace(frame, image=flipped)
+    return replace(frame, image=np.ascontiguousarray(np.asarray(frame.image)[:, ::-1]))
 
 
 def _by_features(matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]) -> list[Sighting]:

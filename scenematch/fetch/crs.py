@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from engine.errors import MapError, OptionError
-from scenematch.fetch.place import Place
+from scenematch.fetch.grid import Place
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -24,9 +24,12 @@ def chosen_name(argument: str, asked: str | None, offered: Sequence[str], what: 
     if asked is None and len(offered) == 1:
         return offered[0]
     if asked is None or asked not in offered:
-        listed = ", ".join(offered[:20]) + (f" and {len(offered) - 20} more" if len(offered) > 20 else "")
-        raise OptionError(f"{argument}: expected {what}, {listed or 'none'}, got {asked or 'none'}")
+        raise OptionError(f"{argument}: expected {what}, {_listed(offered) or 'none'}, got {asked or 'none'}")
     return asked
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:20]) + (f" and {len(names) - 20} more" if len(names) > 20 else "")
 
 
 def code_of(name: str) -> str:
@@ -98,9 +101,8 @@ def chosen_crs(asked: str | None, offered: Sequence[str], place: Place) -> str:
     ordered = (code for code in (*utm, *_MERCATOR, *others, *_DEGREES) if code in codes)
     chosen = next((code for code in ordered if _reaches(code, place)), None)
     if chosen is None:
-        listed = ", ".join(codes[:20]) + (f" and {len(codes) - 20} more" if len(codes) > 20 else "")
         raise OptionError(
-            f"crs: expected one for {place.lat_deg:g},{place.lon_deg:g} that PROJ knows, got {listed}; "
+            f"crs: expected one for {place.lat_deg:g},{place.lon_deg:g} that PROJ knows, got {_listed(codes)}; "
             "name one of them to use it"
         )
     return chosen

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
+from engine.geo import Array
 from engine.maps import xyz_tiles
 from engine.maps.rasters import open_source, vertical_datum
-from scenematch.fetch.grid import reason_of
-from scenematch.fetch.place import Bounds
+from scenematch.fetch.grid import Bounds, reason_of
 from scenematch.fetch.urls import PLACEHOLDER, check_url, shown, user_agent
 from scenematch.files.geotiff import replaced, write_geotiff
 
@@ -43,15 +43,13 @@ class Heights:
 
     Attributes:
         heights_m: (H, W) float32, NaN where unknown.
-        corner: x and y of the north-western corner.
-        step: size of a pixel in x and y.
+        pixel_to_crs: (2, 3) affine transform from pixel centres (x, y, 1).
         crs: compound if the vertical datum is known.
         datum: name of the vertical datum; None if it is unknown.
     """
 
     heights_m: NDArray[np.float32]
-    corner: tuple[float, float]
-    step: tuple[float, float]
+    pixel_to_crs: Array
     crs: CRS
     datum: str | None
 
@@ -116,9 +114,7 @@ def read_part(
     }
     with rasterio.Env(**settings), ExitStack() as opened:
         found = {shown(file): _opened(file) for file in files}
-        datasets = {name: dataset for name, dataset in found.items() if dataset is not None}
-        for dataset in datasets.values():
-            opened.callback(dataset.close)
+        datasets = {name: opened.enter_context(data) for name, data in found.items() if data is not None}
         if not datasets:
             raise MapError(f"surface: expected a file of heights, but there is no {' and no '.join(found)}")
         return _joined(datasets, map_bounds, map_crs, datum)
@@ -156,22 +152,22 @@ def _joined(datasets: Mapping[str, Any], map_bounds: Bounds, map_crs: CRS, datum
     horizontal, own = _horizontal(first, name), vertical_datum(first)
     vertical = _vertical(name, own, datum)
     box = _grid_box(first, name, horizontal, map_bounds, map_crs)
-    step = first.transform.a, -first.transform.e
+    right, down = first.transform.a, first.transform.e
     how = {"nodata": NODATA, "dtype": "float32", "indexes": [1], "resampling": Resampling.bilinear}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PendingDeprecationWarning)  # rasterio's own, of affine 3
-            data, _ = merge(list(datasets.values()), bounds=box, res=step, **how)
+            data, _ = merge(list(datasets.values()), bounds=box, res=(right, -down), **how)
     except (RasterioError, OSError, ValueError) as error:
         raise MapError(f"surface: cannot read {name}: {shown(str(error).splitlines()[0])}") from None
     heights = np.where(data[0] == NODATA, np.nan, data[0] * first.scales[0] + first.offsets[0]).astype(np.float32)
     if not np.isfinite(heights).any():
         raise MapError(f"surface: expected heights under the map, got none in {name}")
-    corner = box[0], box[3]
+    affine = np.array([[right, 0.0, box[0] + 0.5 * right], [0.0, down, box[3] + 0.5 * down]])
     if vertical is None:
-        return Heights(heights, corner, step, _crs(first), own)
+        return Heights(heights, affine, _crs(first), own)
     compound = CompoundCRS(f"{horizontal.name} + {vertical.name}", [horizontal, vertical])
-    return Heights(heights, corner, step, compound, str(vertical.name))
+    return Heights(heights, affine, compound, str(vertical.name))
 
 
 def _crs(dataset: Any) -> CRS:
@@ -244,7 +240,6 @@ def write_heights(heights: Heights, out: Path, tags: Mapping[str, object]) -> No
     Raises:
         MapError: it cannot be written.
     """
-    (x, y), (right, down) = heights.corner, heights.step
-    affine = [[right, 0.0, x + 0.5 * right], [0.0, -down, y - 0.5 * down]]
+    known_m = np.nan_to_num(heights.heights_m, nan=NODATA)
     with replaced(out) as part:
-        write_geotiff(part, np.nan_to_num(heights.heights_m, nan=NODATA), affine, heights.crs, NODATA, tags=tags)
+        write_geotiff(part, known_m, heights.pixel_to_crs, heights.crs, NODATA, tags=tags)

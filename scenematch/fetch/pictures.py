@@ -52,15 +52,18 @@ def fetch_pictures(
         For each picture, its number of pixels with data.
 
     Raises:
-        MapError: the server refuses or sends something else, or the file cannot be written.
+        MapError: the server refuses, has no data there or sends something else, or the file cannot be written.
     """
     import rasterio
     from rasterio.errors import RasterioError
+    from rasterio.windows import Window
 
     level = {} if grid.overview is None else {"overview_level": grid.overview}
-    (x, y), (step_x, step_y), (width, height) = grid.corner, grid.step, grid.size_px
-    corner = np.array([[step_x, 0.0, x], [0.0, -step_y, y]])
+    (left, top), (step_x, step_y), (width, height) = grid.corner, grid.step, grid.size_px
+    corner = np.array([[step_x, 0.0, left], [0.0, -step_y, top]])
     profile = tiled_profile((height, width, 3), "uint8", corner, grid.crs)
+    (across, down), known = grid.tile_px, 0
+    places = [(x, y) for y in range(0, height, down) for x in range(0, width, across)]
     try:
         with (
             replaced(out) as part,
@@ -68,38 +71,23 @@ def fetch_pictures(
             rasterio.open(grid.source, **level) as source,
             rasterio.open(part, "w", **profile) as file,
         ):
-            yield from _copied(source, file, grid, lambda k: pause_s * (k > cached), url, say)
+            for k, (x, y) in enumerate(places):
+                time.sleep(pause_s * (k > cached))
+                size = min(across, width - x), min(down, height - y)
+                rgba = _read(source, Window(grid.offset_px[0] + x, grid.offset_px[1] + y, *size), url, say)
+                valid = rgba[3] >= _OPAQUE
+                file.write(rgba[:3] * valid, window=Window(x, y, *size))
+                file.write_mask(valid * np.uint8(255), window=Window(x, y, *size))
+                known += int(valid.sum())
+                yield int(valid.sum())
+            if known == 0:
+                raise MapError(
+                    f"source: the server has no data there on level {grid.level!r}, {grid.gsd_m_per_px:.3g} m/px; "
+                    "it may have some with a larger `gsd_m_per_px`"
+                )
             file.update_tags(**{name: str(value) for name, value in tags.items()})
     except (RasterioError, OSError) as error:
         raise MapError(f"{out}: cannot be written: {str(error).splitlines()[0]}") from None
-
-
-def _copied(
-    source: Any, file: Any, grid: Grid, pause_s: Callable[[int], float], url: str, say: Callable[[str], None]
-) -> Iterator[int]:
-    """Copy picture by picture; yields each one's number of pixels with data.
-
-    Raises:
-        MapError: none has data.
-    """
-    from rasterio.windows import Window
-
-    (width, height), (across, down), known = grid.size_px, grid.tile_px, 0
-    places = [(x, y) for y in range(0, height, down) for x in range(0, width, across)]
-    for k, (x, y) in enumerate(places):
-        time.sleep(pause_s(k))
-        size = min(across, width - x), min(down, height - y)
-        rgba = _read(source, Window(grid.offset_px[0] + x, grid.offset_px[1] + y, *size), url, say)
-        valid = rgba[3] >= _OPAQUE
-        file.write(rgba[:3] * valid, window=Window(x, y, *size))
-        file.write_mask(valid * np.uint8(255), window=Window(x, y, *size))
-        known += int(valid.sum())
-        yield int(valid.sum())
-    if known == 0:
-        raise MapError(
-            f"source: the server has no data there on level {grid.level!r}, {grid.gsd_m_per_px:.3g} m/px; it may "
-            "have some with a larger `gsd_m_per_px`"
-        )
 
 
 def _read(source: Any, window: Any, url: str, say: Callable[[str], None]) -> NDArray[np.uint8]:

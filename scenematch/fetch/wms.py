@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree as Xml
 
 from scenematch.fetch.crs import chosen_crs, chosen_name, crs_of
-from scenematch.fetch.grid import Access, Grid, gdal_xml
-from scenematch.fetch.place import Place, Wanted
+from scenematch.fetch.grid import Grid, Place, Wanted, gdal_xml
 from scenematch.fetch.services import OWN_WORDS, chosen_format, query_value, stated, text_of, with_query
 
 if TYPE_CHECKING:
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 _MAX_PX = 1024  # of a piece, if the server allows it
 
 
-def plan_wms(root: Xml.Element, url: str, wanted: Wanted, access: Access) -> Grid:
+def plan_wms(root: Xml.Element, url: str, wanted: Wanted) -> Grid:
     """A map that the server draws on a grid in pixels of the size asked for."""
     layers = _asked_layers(root, wanted.layer or query_value(url, "layers"))
     place, first_layer = wanted.place, next(iter(layers.values()))
@@ -42,7 +41,7 @@ def plan_wms(root: Xml.Element, url: str, wanted: Wanted, access: Access) -> Gri
         {
             'Service name="WMS"': service, "DataWindow": window, "Projection": crs.to_string(),
             "BlockSizeX": across, "BlockSizeY": down, "OverviewCount": 0,
-        } | access.elements(),
+        } | wanted.elements(),
     )  # fmt: skip
     credited = dict.fromkeys(text_of(one, "Title") for one in root.iterfind(".//{*}Attribution"))
     states = stated(root.find("{*}Service")) | ({"Attribution": "; ".join(credited)} if credited else {})

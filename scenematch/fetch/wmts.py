@@ -8,15 +8,14 @@ from xml.etree import ElementTree as Xml
 
 from engine.errors import MapError
 from scenematch.fetch.crs import chosen_crs, chosen_name, code_of, crs_of, is_known
-from scenematch.fetch.grid import FINE_ENOUGH, Access, Grid, gdal_xml, part_of, reason_of
-from scenematch.fetch.place import Wanted
+from scenematch.fetch.grid import FINE_ENOUGH, Grid, Wanted, gdal_xml, part_of, reason_of
 from scenematch.fetch.services import OWN_WORDS, chosen_format, query_value, stated, text_of, with_query
 from scenematch.fetch.urls import shown
 
 _HREF = "{http://www.w3.org/1999/xlink}href"
 
 
-def plan_wmts(root: Xml.Element, url: str, wanted: Wanted, access: Access) -> Grid:
+def plan_wmts(root: Xml.Element, url: str, wanted: Wanted) -> Grid:
     """The level of a WMTS that is fine enough, over a place."""
     import rasterio
     from rasterio.errors import RasterioError
@@ -33,7 +32,7 @@ def plan_wmts(root: Xml.Element, url: str, wanted: Wanted, access: Access) -> Gr
         "ExtraQueryParameters": _extra_query(root, url), "Layer": name, "TileMatrixSet": sets[code],
         "Format": chosen_format(wanted.image_format, layers[name].iterfind("{*}Format")),
     }  # fmt: skip
-    source, crs = gdal_xml("GDAL_WMTS", elements | access.elements()), crs_of(code)
+    source, crs = gdal_xml("GDAL_WMTS", elements | wanted.elements()), crs_of(code)
     try:
         with rasterio.open(source) as raster:
             t, sizes = raster.transform, (raster.width, raster.height)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -63,13 +63,9 @@ class Corrections:
         """Whether these are the defaults."""
         return self == Corrections()
 
-    def facts(self) -> dict[str, Any]:
-        """As JSON holds it."""
-        return asdict(self) | {"columns": list(self.columns)}
-
     @classmethod
     def from_facts(cls, values: Any) -> Corrections:
-        """From :meth:`facts`; None uses the defaults."""
+        """From its fields as JSON holds them; None uses the defaults."""
         return cls() if values is None else cls(**{**values, "columns": tuple(values.get("columns", ()))})
 
     @classmethod

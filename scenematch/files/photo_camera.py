@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,17 +28,8 @@ _CONTRADICTION = 1.25  # between two focal lengths of one photograph: rounding a
 _FOCAL_RANGE = (0.2, 50.0)  # of a focal length, in widths of the picture
 
 
-@dataclass(frozen=True, slots=True)
-class PhotoCamera:
-    """A camera, and the tags that describe it.
-
-    Attributes:
-        camera: mounted nadir.
-        source: the tags in words.
-    """
-
-    camera: Camera
-    source: str
+PhotoCamera = tuple[Camera, str]
+"""A camera mounted nadir, and the tags that describe it, in words."""
 
 
 def photo_camera(paths: Sequence[Path]) -> PhotoCamera:
@@ -59,10 +49,9 @@ def photo_camera(paths: Sequence[Path]) -> PhotoCamera:
         CalibrationError: a photograph has none of these or contradicts itself, or they are from different cameras.
         TelemetryError: one cannot be opened.
     """
-    first = _camera_of(read_photo_tags(paths[0]))
+    one, source = _camera_of(read_photo_tags(paths[0]))
     for path in paths[1:]:
-        other = _camera_of(read_photo_tags(path))
-        one, two = first.camera, other.camera
+        two, _ = _camera_of(read_photo_tags(path))
         if (one.width_px, one.height_px) != (two.width_px, two.height_px):
             raise CalibrationError(
                 f"{path}: expected {one.width_px} x {one.height_px} px as {paths[0].name}, "
@@ -73,7 +62,7 @@ def photo_camera(paths: Sequence[Path]) -> PhotoCamera:
                 f"{path}: expected the focal length of {paths[0].name}, {one.focal_px:.0f} px, "
                 f"got {two.focal_px:.0f} px; photographs of two lenses are two flights"
             )
-    return first
+    return one, source
 
 
 def _camera_of(tags: PhotoTags) -> PhotoCamera:
@@ -95,9 +84,9 @@ def _camera_of(tags: PhotoTags) -> PhotoCamera:
             f"{film:.0f} px by FocalLengthIn35mmFilm; give `hfov_deg` or `camera`"
         )
     if plane is not None:
-        return PhotoCamera(_ideal(tags, plane), "FocalLength and FocalPlaneXResolution")
+        return _ideal(tags, plane), "FocalLength and FocalPlaneXResolution"
     assert film is not None  # one of the two is known
-    return PhotoCamera(_ideal(tags, film), "FocalLengthIn35mmFilm")
+    return _ideal(tags, film), "FocalLengthIn35mmFilm"
 
 
 def _ideal(tags: PhotoTags, focal_px: float) -> Camera:
@@ -129,7 +118,7 @@ def _dewarp_camera(tags: PhotoTags) -> PhotoCamera | None:
     matrix = np.array([[fx, 0.0, (width_px - 1) / 2 + cx], [0.0, fy, (height_px - 1) / 2 + cy], [0.0, 0.0, 1.0]])
     undone = tags.xmp.get("DewarpFlag") == 1.0
     camera = Camera(width_px, height_px, matrix, distortion=np.zeros(5) if undone else np.array(tags.dewarp[4:]))
-    return PhotoCamera(camera, "drone-dji:DewarpData")
+    return camera, "drone-dji:DewarpData"
 
 
 def _calibrated_camera(tags: PhotoTags) -> PhotoCamera | None:
@@ -137,7 +126,7 @@ def _calibrated_camera(tags: PhotoTags) -> PhotoCamera | None:
     if focal_px <= 0.0 or middle_px <= 0.0:  # the centre tells the width that the focal length refers to
         return None
     scale = tags.size_px[0] / (2.0 * middle_px)
-    return PhotoCamera(_ideal(tags, focal_px * scale), "drone-dji:CalibratedFocalLength")
+    return _ideal(tags, focal_px * scale), "drone-dji:CalibratedFocalLength"
 
 
 def _plane_focal_px(tags: PhotoTags) -> float | None:

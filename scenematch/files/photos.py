@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from engine.errors import TelemetryError
 from engine.geo import attitude_from_rotation, enu_from_body, wrap_heading_deg
 from engine.values import Truth
 from scenematch.files.frames import PictureFolder, opened_picture
+from scenematch.files.stamps import since_1970_ns
 from scenematch.files.telemetry import TelemetryRow, take_off_sigma_m
 
 COMPASS_SIGMA_DEG = 3.0
@@ -89,16 +90,9 @@ def read_photo_tags(path: Path) -> PhotoTags:
     return PhotoTags(path, size_px, exif, gps, xmp, dewarp if len(dewarp) == 9 else (), software)
 
 
-def exif_telemetry(source: str | Path | Sequence[str | Path]) -> list[TelemetryRow]:
-    """Telemetry from photographs' EXIF and DJI's XMP, see :func:`photo_telemetry`.
-
-    Args:
-        source: a folder, or paths of images.
-    """
-    if isinstance(source, (str, Path)):
-        folder = PictureFolder(Path(source))
-        source = [folder.path / name for name in folder.names]
-    return photo_telemetry([Path(path) for path in source])[0]
+def exif_telemetry(folder: Path) -> list[TelemetryRow]:
+    """Telemetry from the EXIF and DJI's XMP of a folder's photographs, see :func:`photo_telemetry`."""
+    return photo_telemetry([folder / name for name in PictureFolder(folder).names])[0]
 
 
 def photo_truth(folder: Path) -> list[Truth]:
@@ -189,9 +183,7 @@ def _capture_ns(exif: Mapping[int, Any]) -> int | None:
     except (KeyError, ValueError):
         return None
     fraction = re.match(r"[0-9]*", str(exif.get(0x9291, "")).strip())
-    nanoseconds = int(fraction.group().ljust(9, "0")[:9]) if fraction else 0
-    since = time - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + nanoseconds
+    return since_1970_ns(time, fraction.group() if fraction else "")
 
 
 def _finite(value: Any) -> float | None:
@@ -214,12 +206,10 @@ def _position(gps: Mapping[int, Any]) -> dict[str, float | None]:
 
 
 def _degrees(parts: Any, negative: bool) -> float | None:
-    values = [_finite(part) for part in parts or ()]
-    if len(values) != 3 or None in values:
+    known = [value for part in parts or () if (value := _finite(part)) is not None]
+    if len(known) != 3:
         return None
-    degrees = sum(
-        value / unit for value, unit in zip(values, (1.0, 60.0, 3600.0), strict=True) if value is not None
-    )
+    degrees = known[0] + known[1] / 60.0 + known[2] / 3600.0
     return -degrees if negative else degrees
 
 

@@ -9,7 +9,7 @@ Convention:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -53,26 +53,39 @@ class TimeSeries:
     values: Floats
 
 
-@dataclass(frozen=True)
 class FlightLog:
     """The contents of a flight log.
 
-    Attributes:
+    Args:
         path: the file.
-        series: time series by the column of telemetry.csv that they fill; none is empty.
-        heights: height above ground in metres by source, see :data:`HEIGHT_SOURCES`; the rangefinder's is along
-            the body's down axis.
+        series: time series by the column of telemetry.csv that they fill; None where the log has none.
+        heights: height above ground in metres by source, see :data:`HEIGHT_SOURCES`, or None; the rangefinder's is
+            along the body's down axis.
         captures_ns: (N,) times of camera triggers; empty if none were logged.
         utc_ns: offset that converts the log's clock to UTC; None if it is unknown.
         frame_numbers: numbers of a video's frames, the first is 1, over time; None except for a video's subtitles.
+
+    Raises:
+        TelemetryError: all series are None.
     """
 
-    path: Path
-    series: Mapping[str, TimeSeries]
-    heights: Mapping[str, TimeSeries] = field(default_factory=dict)
-    captures_ns: Stamps = field(default_factory=lambda: np.empty(0, np.int64))
-    utc_ns: int | None = None
-    frame_numbers: TimeSeries | None = None
+    def __init__(
+        self,
+        path: Path,
+        series: Mapping[str, TimeSeries | None],
+        heights: Mapping[str, TimeSeries | None],
+        captures_ns: ArrayLike = (),
+        utc_ns: int | None = None,
+        frame_numbers: TimeSeries | None = None,
+    ) -> None:
+        self.path, self.utc_ns, self.frame_numbers = path, utc_ns, frame_numbers
+        self.series = {name: one for name, one in series.items() if one is not None}
+        self.heights = {name: one for name, one in heights.items() if one is not None}
+        self.captures_ns: Stamps = np.unique(np.asarray(captures_ns, np.int64))
+        if not self.series and not self.heights:
+            raise TelemetryError(
+                f"{path}: expected attitude, height, velocity or position, got a log with none of them"
+            )
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -91,37 +104,6 @@ class FlightLog:
         if self.utc_ns is None:
             raise TelemetryError(f"{self.path}: expected GPS time, since the frames' timestamps are UTC, got none")
         return -self.utc_ns
-
-
-def make_log(
-    path: Path,
-    series: Mapping[str, TimeSeries | None],
-    heights: Mapping[str, TimeSeries | None],
-    captures_ns: ArrayLike = (),
-    utc_ns: int | None = None,
-    frame_numbers: TimeSeries | None = None,
-) -> FlightLog:
-    """Create a log from the series that are not None.
-
-    Args:
-        path: the file.
-        series: time series by column of telemetry.csv.
-        heights: height above ground in metres by source.
-        captures_ns: (N,) times of camera triggers.
-        utc_ns: offset that converts the log's clock to UTC, or None.
-        frame_numbers: numbers of a video's frames over time, or None.
-
-    Raises:
-        TelemetryError: all series are None.
-    """
-    known = {name: values for name, values in series.items() if values is not None}
-    known_heights = {name: values for name, values in heights.items() if values is not None}
-    if not known and not known_heights:
-        raise TelemetryError(
-            f"{path}: expected attitude, height, velocity or position, got a log with none of them"
-        )
-    captures = np.unique(np.asarray(captures_ns, np.int64))
-    return FlightLog(path, known, known_heights, captures, utc_ns, frame_numbers)
 
 
 def make_series(stamps_ns: ArrayLike, values: ArrayLike, valid: ArrayLike = True) -> TimeSeries | None:

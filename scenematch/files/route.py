@@ -14,7 +14,6 @@ from engine.errors import TelemetryError
 _WAYPOINT_COMMANDS = (16, 17, 18, 19, 21, 22, 31, 82)  # MAV_CMD_NAV_* that fly to a latitude and longitude
 _RETURN_COMMAND = 20
 _MAX_NUMBER = 1e9
-_MAX_FILE_BYTES = 64 << 20
 
 
 def read_route(path: str | Path) -> NDArray[np.float64]:
@@ -35,8 +34,6 @@ def read_route(path: str | Path) -> NDArray[np.float64]:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _MAX_FILE_BYTES:
-            raise TelemetryError(f"route: {path}: expected at most {_MAX_FILE_BYTES >> 20} MiB")
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise TelemetryError(f"route: no such file: {path}") from None

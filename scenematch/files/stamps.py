@@ -9,12 +9,11 @@ Convention:
 
 from __future__ import annotations
 
-import calendar
 import itertools
 import re
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
+from datetime import UTC, datetime
 from decimal import Decimal
 
 from engine.errors import TelemetryError
@@ -34,29 +33,20 @@ _USUAL_NS = (5 * 10**6, 20 * 10**9)  # between two frames, if the unit is unknow
 _UTC_NS = (10**18, 41 * 10**17)  # the years 2001 to 2099
 _NUMBER = re.compile(r"[+-]?[0-9]{1,19}(\.[0-9]{0,30})?([eE]\+?[0-9]{1,2})?")
 _DATE = re.compile(
-    r"([0-9]{4})[-/]([0-9]{2})[-/]([0-9]{2})[T ]([0-9]{2}):([0-9]{2}):([0-9]{2})(?:[.,]([0-9]{1,12}))?"
+    r"([0-9]{4}[-/][0-9]{2}[-/][0-9]{2})[T ]([0-9]{2}:[0-9]{2}:[0-9]{2})(?:[.,]([0-9]{1,12}))?"
     r" ?(Z|UTC|[+-][0-9]{2}:?[0-9]{2})?"
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Stamps:
-    """The stamps of a table.
-
-    Attributes:
-        ns: in nanoseconds, one per row, strictly increasing.
-        remark: how they were interpreted; None if the column's name says it.
-    """
-
-    ns: list[int]
-    remark: str | None = None
-
-
-def read_stamps(rows: Sequence[CsvRow]) -> Stamps:
+def read_stamps(rows: Sequence[CsvRow]) -> tuple[list[int], str | None]:
     """The stamps of rows.
 
     Args:
         rows: of a table with at least one of :data:`STAMP_COLUMNS`.
+
+    Returns:
+        Nanoseconds, one per row, strictly increasing; and how they were interpreted, None if the column's name
+        says it.
 
     Raises:
         TelemetryError: a timestamp is blank or invalid, does not increase, or has an unrecognisable unit.
@@ -76,13 +66,14 @@ def read_stamps(rows: Sequence[CsvRow]) -> Stamps:
     ]
     _check_increasing(rows, column, stamps_ns)
     if unit == column:
-        return Stamps(stamps_ns)
-    return Stamps(
-        stamps_ns, f"{rows[0].path.name}: {column} is taken as {_WORDS[unit]}: rows are {float(spacing):g} apart"
-    )
+        return stamps_ns, None
+    said = f"{column} is taken as {_WORDS[unit]}: rows are {float(spacing):g} apart"
+    return stamps_ns, f"{rows[0].path.name}: {said}"
 
 
-def _dated(rows: Sequence[CsvRow], column: str, dates: Sequence[re.Match[str] | None]) -> Stamps:
+def _dated(
+    rows: Sequence[CsvRow], column: str, dates: Sequence[re.Match[str] | None]
+) -> tuple[list[int], str | None]:
     stamps_ns = []
     for row, date in zip(rows, dates, strict=True):
         stamp_ns = None if date is None else _utc_ns(date)
@@ -90,25 +81,26 @@ def _dated(rows: Sequence[CsvRow], column: str, dates: Sequence[re.Match[str] | 
             raise row.error(column, "a date in UTC such as 2026-05-01T12:00:00.250Z")
         stamps_ns.append(stamp_ns)
     _check_increasing(rows, column, stamps_ns)
-    if all(date is not None and date[8] for date in dates) or column == "timestamp_utc":
-        return Stamps(stamps_ns)
-    return Stamps(stamps_ns, f"{rows[0].path.name}: {column} holds dates without a time zone, taken as UTC")
+    if all(date is not None and date[4] for date in dates) or column == "timestamp_utc":
+        return stamps_ns, None
+    return stamps_ns, f"{rows[0].path.name}: {column} holds dates without a time zone, taken as UTC"
 
 
 def _utc_ns(date: re.Match[str]) -> int | None:
     """Nanoseconds since 1970 of a date; None if there is no such date."""
-    year, month, day, hour, minute, second = (int(date[k]) for k in range(1, 7))
-    if not (1 <= month <= 12 and hour < 24 and minute < 60 and second <= 60 and year >= 1970):
+    zone = "+00:00" if date[4] in (None, "Z", "UTC") else date[4]
+    try:
+        time = datetime.fromisoformat(f"{date[1].replace('/', '-')}T{date[2]}{zone}")
+    except ValueError:
         return None
-    if not 1 <= day <= calendar.monthrange(year, month)[1]:
-        return None
-    seconds = calendar.timegm((year, month, day, hour, minute, second))
-    zone = date[8] or "Z"
-    if zone[0] in "+-":
-        ahead_s = int(zone[1:3]) * 3600 + int(zone[-2:]) * 60
-        seconds -= ahead_s if zone[0] == "+" else -ahead_s
-    stamp_ns = seconds * 10**9 + int((date[7] or "").ljust(9, "0")[:9])
-    return stamp_ns if stamp_ns < 2**63 else None
+    stamp_ns = since_1970_ns(time, date[3] or "")
+    return stamp_ns if 0 <= stamp_ns < 2**63 else None
+
+
+def since_1970_ns(time: datetime, fraction: str) -> int:
+    """Nanoseconds since 1970 of a time in whole seconds with a zone, and the decimals of its seconds."""
+    since = time - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + int(fraction.ljust(9, "0")[:9])
 
 
 def _number(row: CsvRow, column: str) -> Decimal:

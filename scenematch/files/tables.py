@@ -12,7 +12,7 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -178,11 +178,14 @@ def read_table(
                 if all(places[name] is None for name in (column, *instead.get(column, ()))):
                     its = f"its columns are {quoted(','.join(header))}{hint}"
                     raise TelemetryError(f"{path}: line 1: lacks the column {column}; {its}")
-            marks = None if delimiter == "," else _Marks(path)
+            marks: dict[str, str] = {}
             for row in reader:
                 if any(cell.strip() for cell in row):
                     _check_length(path, reader.line_num, row, len(header))
-                    yield CsvRow(path, reader.line_num, _cells(reader.line_num, row, places, marks), header)
+                    cells = {name: "" if i is None else row[i].strip() for name, i in places.items()}
+                    if delimiter != ",":
+                        cells = _pointed(path, reader.line_num, cells, marks)
+                    yield CsvRow(path, reader.line_num, cells, header)
     except FileNotFoundError:
         raise TelemetryError(f"{path}: no such file") from None
     except UnicodeDecodeError as error:
@@ -222,32 +225,16 @@ def _place(path: Path, header: Sequence[str], column: str, names: Mapping[str, s
     return header.index(name) if count else None
 
 
-@dataclass(slots=True)
-class _Marks:
-    """The decimal mark of a table without commas between its cells: one for all its numbers."""
-
-    path: Path
-    first: dict[str, str] = field(default_factory=dict)
-
-    def pointed(self, line: int, cell: str) -> str:
-        """A cell, with a decimal point if it is a number with a comma."""
-        found = _DECIMAL.fullmatch(cell)
-        if found is None:
-            return cell
-        self.first.setdefault(found[1], cell)
-        if len(self.first) > 1:
-            raise TelemetryError(
-                f"{self.path}: line {line}: expected one decimal mark, got {quoted(self.first[','])} and "
-                f"{quoted(self.first['.'])}"
-            )
-        return cell.replace(",", ".")
-
-
-def _cells(
-    line: int, row: Sequence[str], places: Mapping[str, int | None], marks: _Marks | None
-) -> dict[str, str]:
-    cells = {name: "" if i is None else row[i].strip() for name, i in places.items()}
-    return cells if marks is None else {name: marks.pointed(line, cell) for name, cell in cells.items()}
+def _pointed(path: Path, line: int, cells: Mapping[str, str], marks: dict[str, str]) -> dict[str, str]:
+    """Cells with a decimal point in place of a comma; ``marks`` keeps the first number with each of the two."""
+    for cell in cells.values():
+        if found := _DECIMAL.fullmatch(cell):
+            marks.setdefault(found[1], cell)
+    if len(marks) > 1:
+        raise TelemetryError(
+            f"{path}: line {line}: expected one decimal mark, got {quoted(marks[','])} and {quoted(marks['.'])}"
+        )
+    return {name: cell.replace(",", ".") if _DECIMAL.fullmatch(cell) else cell for name, cell in cells.items()}
 
 
 def _check_length(path: Path, line: int, row: Sequence[str], count: int) -> None:

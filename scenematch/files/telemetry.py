@@ -166,10 +166,10 @@ def open_telemetry(
     """
     optional = (*STAMP_COLUMNS[1:], *BOUNDS)
     csv_rows = list(read_table(path, _REQUIRED, optional, instead=OTHER_STAMPS, names=names, hint=_HINT))
-    stamps = read_stamps(csv_rows)
+    stamps_ns, remark = read_stamps(csv_rows)
     rows: list[TelemetryRow] = []
     line_of_frame: dict[str, int] = {}
-    for csv_row, stamp_ns in zip(csv_rows, stamps.ns, strict=True):
+    for csv_row, stamp_ns in zip(csv_rows, stamps_ns, strict=True):
         row = _telemetry_row(csv_row, stamp_ns)
         if frames is not None and row.frame not in frames:
             raise csv_row.error("frame", description)
@@ -181,8 +181,8 @@ def open_telemetry(
         raise TelemetryError(f"{path}: expected one row per frame, got a header and no rows")
     read = {names.get(ours, ours) for ours in COLUMNS}
     unread = ", ".join(name for name in csv_rows[0].header if name and name not in read)
-    remarks = [stamps.remark, unread and f"{Path(path).name}: columns that are not read: {unread}{_HINT}"]
-    return Telemetry(rows, [remark for remark in remarks if remark])
+    remarks = [remark, unread and f"{Path(path).name}: columns that are not read: {unread}{_HINT}"]
+    return Telemetry(rows, [each for each in remarks if each])
 
 
 def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:

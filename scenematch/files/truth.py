@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from engine.errors import TelemetryError
 from engine.geo import wrap_difference_deg, wrap_heading_deg
@@ -22,6 +23,7 @@ _REQUIRED = ("timestamp_ns", "lat_deg", "lon_deg")
 _OPTIONAL = {
     name: BOUNDS[name] for name in ("alt_amsl_m", "height_agl_m", "roll_deg", "pitch_deg", "heading_deg")
 } | {"height_agl_m": ANY}
+_WRAPPED = ("lon_deg", "heading_deg")
 _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg"), 5)
 
 
@@ -33,7 +35,7 @@ def read_truth(path: str | Path) -> list[Truth]:
     """
     rows: list[Truth] = []
     csv_rows = list(read_table(path, _REQUIRED, (*STAMP_COLUMNS[1:], *_OPTIONAL), instead=OTHER_STAMPS))
-    for csv_row, stamp_ns in zip(csv_rows, read_stamps(csv_rows).ns, strict=True):
+    for csv_row, stamp_ns in zip(csv_rows, read_stamps(csv_rows)[0], strict=True):
         values = {name: csv_row.number(name, bounds) for name, bounds in _OPTIONAL.items()}
         lat_deg, lon_deg = (csv_row.required(name, BOUNDS[name]) for name in ("lat_deg", "lon_deg"))
         rows.append(Truth(timestamp_ns=stamp_ns, lat_deg=lat_deg, lon_deg=lon_deg, **values))
@@ -77,22 +79,12 @@ def interpolate_truth(rows: Sequence[Truth], timestamp_ns: int) -> Truth | None:
     if gap_ns > MAX_TRUTH_GAP_NS:
         return None
     fraction = (timestamp_ns - a.timestamp_ns) / gap_ns
-    heading_deg = _between_angles(a.heading_deg, b.heading_deg, fraction)
-    return Truth(
-        timestamp_ns=timestamp_ns,
-        lat_deg=a.lat_deg + fraction * (b.lat_deg - a.lat_deg),
-        lon_deg=a.lon_deg + fraction * wrap_difference_deg(b.lon_deg - a.lon_deg),
-        alt_amsl_m=_between(a.alt_amsl_m, b.alt_amsl_m, fraction),
-        height_agl_m=_between(a.height_agl_m, b.height_agl_m, fraction),
-        roll_deg=_between(a.roll_deg, b.roll_deg, fraction),
-        pitch_deg=_between(a.pitch_deg, b.pitch_deg, fraction),
-        heading_deg=None if heading_deg is None else wrap_heading_deg(heading_deg),
-    )
-
-
-def _between(a: float | None, b: float | None, fraction: float) -> float | None:
-    return None if a is None or b is None else a + fraction * (b - a)
-
-
-def _between_angles(a_deg: float | None, b_deg: float | None, fraction: float) -> float | None:
-    return None if a_deg is None or b_deg is None else a_deg + fraction * wrap_difference_deg(b_deg - a_deg)
+    values: dict[str, Any] = {}
+    for name in ("lat_deg", "lon_deg", *_OPTIONAL):
+        begin, end = getattr(a, name), getattr(b, name)
+        if begin is not None and end is not None:
+            step = wrap_difference_deg(end - begin) if name in _WRAPPED else end - begin
+            values[name] = begin + fraction * step
+    if "heading_deg" in values:
+        values["heading_deg"] = wrap_heading_deg(values["heading_deg"])
+    return Truth(timestamp_ns=timestamp_ns, **values)

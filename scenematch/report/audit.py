@@ -30,7 +30,7 @@ _MARKS = {
 }
 
 
-def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None = None, *, title: str = "") -> Path:
+def draw_audit(path: Path, audit: Audit, route: RouteAvailability | None, *, title: str) -> None:
     """Draw an audit as an image file.
 
     Args:
@@ -38,9 +38,6 @@ def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None =
         audit: the result of the audit.
         route: drawn if given, with a heavier line where positions are not suitable.
         title: heading.
-
-    Returns:
-        The path of the file.
     """
     from matplotlib.figure import Figure
 
@@ -68,13 +65,11 @@ def draw_audit(path: str | Path, audit: Audit, route: RouteAvailability | None =
     ax.set(
         xlim=extent[:2], ylim=extent[2:], xlabel="metres from the map's left edge", ylabel="metres from its top"
     )
-    ax.set_title("\n".join(line for line in (title, _figures(audit, route)) if line), fontsize=10.5, loc="left")
+    ax.set_title(f"{title}\n{_figures(audit, route)}", fontsize=10.5, loc="left")
     ax.tick_params(labelsize=9)
     if ax.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    path = Path(path)
     figure.savefig(path, dpi=_DPI, facecolor="white")
-    return path
 
 
 def _background(site: OrthoMap, part: Window) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -72,20 +73,18 @@ class ChartArea:
         """A labelled horizontal line; empty if outside the limits."""
         if not self.y_limits[0] <= y <= self.y_limits[1]:
             return ""
-        at, above = float(self.y(y)), float(self.y(y)) > _TOP + 24
-        name = f'<text class="{kind}" x="{WIDTH - _RIGHT}" y="{at + (-5 if above else 17):.1f}" '
-        return f'{_segment(self.left, at, WIDTH - _RIGHT, at, kind)}{name}text-anchor="end">{escape(text)}</text>'
+        at, right = float(self.y(y)), WIDTH - _RIGHT
+        label = _text(right, at + (-5 if at > _TOP + 24 else 17), "end", text, kind)
+        return _segment(self.left, at, right, at, kind) + label
 
     def vertical(self, x: float, kind: str, text: str, row: int = 0) -> str:
         """A labelled vertical line, with its label in a row from the top; empty outside the limits."""
         if not self.x_limits[0] <= x <= self.x_limits[1]:
             return ""
         at = float(self.x(x))
-        right = at > 0.6 * WIDTH
-        name = f'<text class="{kind}" x="{at + (-6 if right else 6):.1f}" y="{_TOP + 14 + 20 * row}" '
-        anchor = "end" if right else "start"
-        segment = _segment(at, _TOP, at, HEIGHT - _BOTTOM, kind)
-        return f'{segment}{name}text-anchor="{anchor}">{escape(text)}</text>'
+        gap, anchor = (-6, "end") if at > 0.6 * WIDTH else (6, "start")
+        label = _text(at + gap, _TOP + 14 + 20 * row, anchor, text, kind)
+        return _segment(at, _TOP, at, HEIGHT - _BOTTOM, kind) + label
 
     def overflow(self, x: Array, y: Array, kind: str) -> str:
         """A stroke at the upper edge for each value above it."""
@@ -106,15 +105,12 @@ class ChartArea:
 
     def strip(self, x: Array, values: Sequence[str]) -> str:
         """A background in the CSS class of each x, up to the next x."""
-        parts, begin = [], 0
-        ends = np.append(x[1:], x[-1:])
-        for i in range(len(values)):
-            if i + 1 == len(values) or values[i + 1] != values[begin]:
-                left, right = float(self.x(float(x[begin]))), float(self.x(float(ends[i])))
-                size = f'width="{max(right - left, 0.8):.1f}" height="{HEIGHT - _BOTTOM - _TOP}"'
-                kind = escape(values[begin], quote=True)
-                parts.append(f'<rect class="{kind}" x="{left:.1f}" y="{_TOP}" {size}/>')
-                begin = i + 1
+        parts, edges = [], self.x(np.append(x, x[-1:])).tolist()
+        for kind, same in itertools.groupby(range(len(values)), key=values.__getitem__):
+            places = list(same)
+            left, right = edges[places[0]], edges[places[-1] + 1]
+            size = f'width="{max(right - left, 0.8):.1f}" height="{HEIGHT - _BOTTOM - _TOP}"'
+            parts.append(f'<rect class="{escape(kind)}" x="{left:.1f}" y="{_TOP}" {size}/>')
         return "".join(parts)
 
     def svg(
@@ -145,8 +141,7 @@ class ChartArea:
         if period is not None:
             y_ticks = [(value, f"{value % period:g}") for value, _ in y_ticks]
         y_grid = "".join(self._y_tick(v, t) for v, t in y_ticks)
-        middle = (self.left + right) / 2.0
-        name = f'<text x="{middle:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(x_label)}</text>'
+        name = _text((self.left + right) / 2.0, HEIGHT - 4, "middle", x_label)
         axis = _segment(self.left, foot, right, foot, "axis")
         place = f"{self.left:g} {_TOP:g} {right - self.left:g} {foot - _TOP:g}".split()
         at = " ".join(f'{key}="{v}"' for key, v in zip(("x", "y", "width", "height"), place, strict=True))
@@ -163,13 +158,12 @@ class ChartArea:
 
     def _x_tick(self, value: float, text: str, index: int) -> str:
         at, foot = float(self.x(value)), HEIGHT - _BOTTOM
-        place = f'x="{at:.1f}" y="{foot + 20}" text-anchor="middle"'
-        return _segment(at, _TOP, at, foot, "grid") + f'<text class="tick{index % 2}" {place}>{text}</text>'
+        label = _text(at, foot + 20, "middle", text, f"tick{index % 2}")
+        return _segment(at, _TOP, at, foot, "grid") + label
 
     def _y_tick(self, value: float, text: str) -> str:
         at = float(self.y(value))
-        place = f'x="{self.left - 7:g}" y="{at + 5:.1f}" text-anchor="end"'
-        return _segment(self.left, at, WIDTH - _RIGHT, at, "grid") + f"<text {place}>{escape(text)}</text>"
+        return _segment(self.left, at, WIDTH - _RIGHT, at, "grid") + _text(self.left - 7, at + 5, "end", text)
 
 
 def ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
@@ -222,3 +216,7 @@ def _joined(points: Array) -> str:
 
 def _segment(x0: float, y0: float, x1: float, y1: float, kind: str) -> str:
     return f'<line class="{kind}" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"/>'
+
+
+def _text(x: float, y: float, anchor: str, text: str, kind: str = "") -> str:
+    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'

@@ -17,7 +17,7 @@ from engine.matching.explanation import Explanation, PointMatches, ScoreSurface
 from engine.matching.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
 from engine.values import Frame, Window
-from engine.window import level_crop
+from engine.window import level_crop, level_for
 from scenematch.files.flight import Flight, FlightFrame
 from scenematch.files.notes import FrameNote
 from scenematch.files.track import TrackRow
@@ -128,8 +128,11 @@ def jpeg_bytes(image: Image, quality: int) -> bytes:
 def resized(image: Image, side_px: int) -> Image:
     """Resize an image so that its longer side is ``side_px``."""
     scale = side_px / max(image.shape[:2])
+    return _scaled(image, scale, cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST)
+
+
+def _scaled(image: Image, scale: float, interpolation: int) -> Image:
     size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    interpolation = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
     return np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
 
 
@@ -249,9 +252,7 @@ def draw_window(site: OrthoMap, window: Window) -> tuple[Image, float]:
         (H, W) grey image, and its pixels per pixel of the map.
     """
     per_px = SIDE_PX / max(window.width_px, window.height_px)
-    level = 0
-    while per_px * 2.0 ** (level + 1) <= 1.0 and level + 1 < site.levels:
-        level += 1
+    level = level_for(1.0, 1.0 / per_px, site.levels, coarser=0.0)  # the coarsest that is as fine as the drawing
     gray = site.gray(level_crop(site, window, level), level)
     size = (max(1, round(window.width_px * per_px)), max(1, round(window.height_px * per_px)))
     interpolation = cv2.INTER_AREA if per_px * 2.0**level < 1.0 else cv2.INTER_LINEAR
@@ -285,16 +286,14 @@ def draw_surface(surface: ScoreSurface) -> tuple[Image, Array]:
     Returns:
         (H, W, 3) RGB image of the correlation by the position of the template's centre, and (2,) its peak in that.
     """
-    high, rows, columns = surface.score, *surface.scores.shape
-    low = min_shown_score(surface)
+    low, high = min_shown_score(surface), surface.score
     levels = np.clip((surface.scores - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0).astype(np.uint8)
-    scale = SIDE_PX / max(rows, columns)
-    size = (max(1, round(columns * scale)), max(1, round(rows * scale)))
+    scale = SIDE_PX / max(levels.shape)
     if scale < 1.0:  # the maximum within each pixel: a mean would remove a narrow peak
         reach = math.ceil(1.0 / scale)
         levels = np.asarray(cv2.dilate(levels, np.ones((reach, reach), np.uint8)), np.uint8)
-    levels = np.asarray(cv2.resize(levels, size, interpolation=cv2.INTER_LINEAR), np.uint8)
-    coloured = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+    coloured = cv2.applyColorMap(_scaled(levels, scale, cv2.INTER_LINEAR), cv2.COLORMAP_VIRIDIS)
+    coloured = cv2.cvtColor(coloured, cv2.COLOR_BGR2RGB)
     return np.asarray(coloured, np.uint8), (np.array(surface.peak_px) + 0.5) * scale
 
 

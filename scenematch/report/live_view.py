@@ -13,8 +13,10 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from engine.errors import BackendError
 from engine.geo import Array
@@ -23,6 +25,7 @@ from engine.matching.matcher import SceneMatcher
 from engine.navigation.live import Answer
 from engine.navigation.navigator import Navigator
 from engine.navigation.state import NavigatorState
+from engine.orthomap import OrthoMap
 from engine.values import Fix, Frame, NoFix, Window
 from scenematch.files.notes import frame_note
 from scenematch.files.resampling import UTC_FROM_NS
@@ -33,21 +36,12 @@ from scenematch.report.explain import (
     draw_matches,
     draw_surface,
     draw_window,
+    jpeg_bytes,
+    level_within,
     match_again,
     resized,
     stretch_contrast,
     window_pixels,
-)
-from scenematch.report.live_shapes import (
-    FIX_RGB,
-    blueprint,
-    closed_polyline,
-    corners,
-    ellipsoid,
-    jpeg,
-    map_mesh,
-    outline,
-    padded,
 )
 
 PICTURES = ("rectified", "window", "window/found", "window/fix", "surface", "surface/peak", "matches")
@@ -63,6 +57,14 @@ STATE_RGB = {
 }
 """Colours of the navigator's states."""
 
+SIGMAS = 3.0
+"""Size of the ellipsoid about a fix, in standard deviations."""
+FIX_RGB = (0, 158, 115)
+"""Colour of fixes."""
+_MAX_MAP_PX = 1024  # longer side of the map's texture
+_MESH_SIDE = 17  # vertices per side of the map's mesh
+_OUTLINE_OFFSET_M = 1.0  # of outlines above the ground
+_PADDING_GREY = 238
 _FRAME_PX = 960  # longer side of a frame's picture
 _TIMEOUT_S = 2.0
 _SEEN_RGB, _DOUBT_RGB = (240, 228, 66), (213, 94, 0)
@@ -82,7 +84,7 @@ class LiveView:
         options = matcher.options
         self._matcher = SceneMatcher(matcher.site, matcher.camera, matcher.method, matcher.device, options)
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        stream.log("world/map", map_mesh(matcher.site), static=True)
+        stream.log("world/map", _map_mesh(matcher.site), static=True)
         words, colours = [state.value for state in STATE_RGB], list(STATE_RGB.values())
         stream.log("state", rr.StateConfiguration(values=words, colors=colours), static=True)
 
@@ -111,8 +113,8 @@ class LiveView:
         entities = self._match_entities(name, frame, result, word, latency_ms)
         for entity in (*PICTURES, *PLACES):
             stream.log(entity, entities.get(entity) or rr.Clear(recursive=False))
-        image = _pixels(frame)
-        stream.log("frame", jpeg(resized(image, min(_FRAME_PX, max(image.shape[:2])))))
+        image = np.asarray(frame.image, np.uint8)
+        stream.log("frame", _jpeg(resized(image, min(_FRAME_PX, max(image.shape[:2])))))
         stream.log("state", rr.StateChange(state=word))
         stream.log("plots/latency_ms", rr.Scalars(latency_ms))
         if result.score is not None:
@@ -155,29 +157,29 @@ class LiveView:
         if explained is None:
             return seen
         window, found = explained
-        seen["world/window"] = outline(site, corners(window), (255, 255, 255))
+        seen["world/window"] = _outline(site, _corners(window), (255, 255, 255))
         if found.rectified is not None:
-            seen["rectified"] = jpeg(padded(resized(stretch_contrast(found.rectified), SIDE_PX)))
+            seen["rectified"] = _jpeg(_padded(resized(stretch_contrast(found.rectified), SIDE_PX)))
         seen |= self._window_entities(window, found, result)
         if found.surface is not None:
             surface, peak = draw_surface(found.surface)
-            seen["surface"] = jpeg(padded(surface))
+            seen["surface"] = _jpeg(_padded(surface))
             seen["surface/peak"] = rr.Points2D([peak], colors=(255, 255, 255), radii=rr.Radius.ui_points(2.0))
         if found.matches is not None:
             both = draw_matches(found, found.matches, site, window)
-            seen["matches"] = jpeg(padded(both, width_px=2 * SIDE_PX + 8))
+            seen["matches"] = _jpeg(_padded(both, width_px=2 * SIDE_PX + 8))
         return seen
 
     def _window_entities(self, window: Window, found: Explanation, result: Fix | NoFix) -> dict[str, Any]:
         """Archetypes of the window with the matched outline and the fix, and of that outline on the ground."""
         site = self._matcher.site
         picture, per_px = draw_window(site, window)
-        seen: dict[str, Any] = {"window": jpeg(padded(picture))}
+        seen: dict[str, Any] = {"window": _jpeg(_padded(picture))}
         if found.outline_px is not None:
             colour = _SEEN_RGB if isinstance(result, Fix) else _DOUBT_RGB
-            strip = closed_polyline(window_pixels(found.outline_px, window, per_px))
+            strip = _closed_polyline(window_pixels(found.outline_px, window, per_px))
             seen["window/found"] = rr.LineStrips2D([strip], colors=colour, radii=rr.Radius.ui_points(1.0))
-            seen["world/seen"] = outline(site, found.outline_px, colour)
+            seen["world/seen"] = _outline(site, found.outline_px, colour)
         if isinstance(result, Fix):
             fix_px = window_pixels(np.array(result.map_xy_px), window, per_px)
             seen["window/fix"] = rr.Points2D([fix_px], colors=FIX_RGB, radii=rr.Radius.ui_points(5.0))
@@ -249,15 +251,10 @@ def open_live_view(matcher: SceneMatcher, recording: Path | None, address: str |
     stream = rr.RecordingStream("scenematch")
     try:
         files = [] if recording is None else [rr.FileSink(str(recording))]
-        stream.set_sinks(*sinks, *files, default_blueprint=blueprint(matcher.site))
+        stream.set_sinks(*sinks, *files, default_blueprint=_blueprint(matcher.site))
     except RuntimeError as error:
         raise BackendError(f"recording: {recording} cannot be written: {error}") from None
     return LiveView(stream, matcher)
-
-
-def _pixels(frame: Frame) -> Image:
-    image = frame.image
-    return np.asarray(image if isinstance(image, np.ndarray) else image.cpu().numpy(), np.uint8)
 
 
 def _line(name: str, result: Fix | NoFix) -> str:
@@ -265,3 +262,108 @@ def _line(name: str, result: Fix | NoFix) -> str:
     if isinstance(result, Fix):
         return f"{name}: fix, sigma {result.sigma_m:.2f} m, {result.method} {result.score:.2f}, {result.stage}"
     return f"{name}: refused, {result.reason.value}" + (f": {result.detail}" if result.detail else "")
+
+
+# ------------------------------------------------------------------------------------------ shapes of the viewer
+
+
+def _blueprint(site: OrthoMap) -> Any:
+    """Layout of the viewer: the world on the left, the newest frame on the right, time series below."""
+    all_times = rr.VisibleTimeRange(
+        "frame", start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
+    )
+    side_m = min(float(max(site.width_px, site.height_px)) * site.gsd_m_per_px, 3000.0)
+    eye = rrb.EyeControls3D(
+        position=(0.0, -0.8 * side_m, site.ground_m + 0.8 * side_m), look_target=(0.0, 0.0, site.ground_m)
+    )
+    world = rrb.Spatial3DView(
+        origin="world",
+        name="World",
+        eye_controls=eye,
+        line_grid=False,
+        overrides={"world/fixes": rrb.VisibleTimeRanges([all_times])},
+    )
+    names = {"frame": "Frame", "rectified": "Rectified", "window": "Window", "surface": "Correlation"}
+    pictures = [rrb.Spatial2DView(origin=origin, name=name) for origin, name in names.items()]
+    plots = [
+        rrb.TimeSeriesView(origin=f"plots/{name}", name=text)
+        for name, text in (("score", "Score"), ("sigma_m", "Sigma (m)"), ("latency_ms", "Latency (ms)"))
+    ]
+    state = rrb.StateTimelineView(origin="state", name="State")
+    matches, words = rrb.Spatial2DView(origin="matches", name="Matches"), rrb.TextLogView(origin="log", name="Log")
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(world, rrb.Horizontal(*plots), state, row_shares=[6, 3, 2]),
+            rrb.Vertical(rrb.Grid(*pictures, grid_columns=2), rrb.Tabs(words, matches), row_shares=[7, 4]),
+            column_shares=[3, 2],
+        ),
+        rrb.TimePanel(timeline="frame", state="collapsed"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+    )
+
+
+def _map_mesh(site: OrthoMap) -> Any:
+    """The map as a textured mesh on its ground, in metres east, north and up."""
+    level = level_within(site, max(site.level_shape(0)), _MAX_MAP_PX)
+    rows, columns = site.level_shape(level)
+    gray = site.gray(Window(0, 0, columns, rows), level)
+    u, v = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(0.0, 1.0, _MESH_SIDE)]))
+    at_px = site.full_from_level(np.stack([u * columns, v * rows], axis=-1) - 0.5, level)
+    heights = site.ground_m if not site.has_surface else [site.ground_at(xy) for xy in at_px]
+    vertices = np.column_stack([site.enu_from_pixel(at_px), np.broadcast_to(heights, len(at_px))])
+    first = np.arange(_MESH_SIDE * (_MESH_SIDE - 1)).reshape(_MESH_SIDE - 1, _MESH_SIDE)[:, :-1].ravel()
+    a, b, c, d = first, first + 1, first + _MESH_SIDE, first + _MESH_SIDE + 1
+    triangles = np.concatenate([np.stack([a, c, b], axis=-1), np.stack([b, c, d], axis=-1)])
+    texture = np.repeat(gray[:, :, None], 3, axis=2)
+    return rr.Mesh3D(
+        vertex_positions=vertices,
+        triangle_indices=triangles,
+        vertex_texcoords=np.stack([u, v], axis=-1),
+        albedo_texture=texture,
+    )
+
+
+def ellipsoid(center_m: Array, covariance_m2: Array) -> Any:
+    """The error ellipsoid of :data:`SIGMAS` about a position (3,), by its covariance (3, 3)."""
+    variances, axes = np.linalg.eigh(covariance_m2)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))  # a rotation, not a reflection
+    rotation = cv2.Rodrigues(axes)[0].ravel()
+    angle = float(np.linalg.norm(rotation))
+    axis = rotation / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
+    return rr.Ellipsoids3D(
+        half_sizes=[SIGMAS * np.sqrt(np.maximum(variances, 0.0))],
+        centers=[center_m],
+        rotation_axis_angles=[rr.RotationAxisAngle(axis=axis, radians=angle)],
+        colors=FIX_RGB,
+    )
+
+
+def _outline(site: OrthoMap, corners_px: Array, colour: tuple[int, int, int]) -> Any:
+    """A closed line above the surface through map pixels (4, 2)."""
+    strip = np.column_stack([site.enu_from_pixel(corners_px), site.surface_at(corners_px) + _OUTLINE_OFFSET_M])
+    return rr.LineStrips3D([_closed_polyline(strip)], colors=colour, radii=rr.Radius.ui_points(1.0))
+
+
+def _corners(window: Window) -> Array:
+    """Corners (4, 2) of a window in map pixels, at the outer edges of its pixels."""
+    width, height = window.width_px, window.height_px
+    sides = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float64)
+    return np.asarray(sides + np.array([window.x0, window.y0]) - 0.5, np.float64)
+
+
+def _closed_polyline(points: Array) -> Array:
+    """Points (N, ...) with the first appended, (N + 1, ...)."""
+    return np.asarray(np.concatenate([points, points[:1]]), np.float64)
+
+
+def _jpeg(image: Image) -> Any:
+    """An image (H, W) grey or (H, W, 3) RGB as JPEG."""
+    return rr.EncodedImage(contents=jpeg_bytes(image, 80), media_type="image/jpeg")
+
+
+def _padded(image: Image, width_px: int = SIDE_PX) -> Image:
+    """Pad an image below and on the right: the viewer requires one size for all images of an entity."""
+    down, right = max(0, SIDE_PX - image.shape[0]), max(0, width_px - image.shape[1])
+    full = cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_CONSTANT, value=3 * [_PADDING_GREY])
+    return np.asarray(full[:SIDE_PX, :width_px], np.uint8)

@@ -69,16 +69,11 @@ def read_loop_csv(path: Path) -> LoopRecord:
         TelemetryError: the file cannot be read, or a cell is not what its column holds.
     """
     rows = list(read_table(path, ("timestamp_ns", "healthy", *_PLACES, *_SIGMAS)))
+    stamps_ns = np.array([row.stamp() for row in rows], np.int64)
     places = np.array([[row.required(name) for name in _PLACES] for row in rows], np.float64).reshape(-1, 3, 3)
-    sigmas = np.array([[row.required(name) for name in _SIGMAS] for row in rows], np.float64).reshape(-1, 2)
-    return LoopRecord(
-        np.array([row.stamp() for row in rows], np.int64),
-        places[:, 0],
-        places[:, 1],
-        places[:, 2],
-        sigmas.max(axis=1, initial=0.0),
-        np.array([row.text("healthy") == "true" for row in rows], np.bool_),
-    )
+    sigma_m = np.array([max(map(row.required, _SIGMAS)) for row in rows], np.float64)
+    healthy = np.array([row.text("healthy") == "true" for row in rows], np.bool_)
+    return LoopRecord(stamps_ns, places[:, 0], places[:, 1], places[:, 2], sigma_m, healthy)
 
 
 def write_loop_csv(path: Path, result: LoopResult) -> None:

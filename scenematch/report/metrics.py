@@ -88,6 +88,12 @@ def column(records: Sequence[object], name: str) -> Array:
     return np.array([np.nan if value is None else value for value in values], np.float64)
 
 
+def percentiles(values: Array, shares: Mapping[str, float]) -> dict[str, float | None]:
+    """Percentiles of the known values by their names, None if no value is known."""
+    known = values[np.isfinite(values)]
+    return {name: float(np.percentile(known, share)) if known.size else None for name, share in shares.items()}
+
+
 def truth_per_row(rows: Sequence[TrackRow], truth: Sequence[Truth]) -> list[Truth | None]:
     """The truth interpolated at the time of each row, or None."""
     return [None if row.timestamp_ns is None else interpolate_truth(truth, row.timestamp_ns) for row in rows]
@@ -161,6 +167,7 @@ def summarise(
         ``height_bias_m``.
     """
     fixes = sum(row.fixed for row in rows)
+    sigmas_m = np.maximum(column(rows, "sigma_east_m"), column(rows, "sigma_north_m"))
     methods = Counter(row.method for row in rows if row.fixed and row.method is not None)
     summary: dict[str, Any] = {
         "frames": len(rows),
@@ -170,9 +177,9 @@ def summarise(
         "reasons": _counts(row.reason for row in rows if row.reason is not None),
         "method": "mixed" if len(methods) > 1 else next(iter(methods), None),
         "methods": _counts(methods.elements()),
-        "latency_ms": _latency(rows),
+        "latency_ms": percentiles(column(rows, "latency_ms"), {"p50": 50, "p95": 95, "p99": 99, "max": 100}),
         "deadlines_missed": sum(row.deadline_met is False for row in rows),
-        **_stated(rows),
+        **percentiles(sigmas_m, {"stated_sigma_median_m": 50, "stated_sigma_p95_m": 95}),
     }
     if truth:
         frame = frame or LocalFrame(truth[0].lat_deg, truth[0].lon_deg)
@@ -197,24 +204,9 @@ def _counts(values: Any) -> dict[str, int]:
     return dict(sorted(Counter(values).items(), key=lambda item: (-item[1], item[0])))
 
 
-def _stated(rows: Sequence[TrackRow]) -> dict[str, float | None]:
-    sigmas_m = np.maximum(column(rows, "sigma_east_m"), column(rows, "sigma_north_m"))
-    sigmas_m = sigmas_m[np.isfinite(sigmas_m)]
-    median_m, p95_m = map(float, np.percentile(sigmas_m, [50, 95])) if sigmas_m.size else (None, None)
-    return {"stated_sigma_median_m": median_m, "stated_sigma_p95_m": p95_m}
-
-
-def _latency(rows: Sequence[TrackRow]) -> dict[str, float | None]:
-    values = column(rows, "latency_ms")
-    known = values[np.isfinite(values)]
-    figures = np.percentile(known, [50, 95, 99, 100]).tolist() if known.size else [None] * 4
-    return dict(zip(("p50", "p95", "p99", "max"), figures, strict=True))
-
-
 def _accuracy(errors: TrackErrors) -> dict[str, Any]:
     scored = np.isfinite(errors.distance_m)
     distance, normalised_squared_errors = errors.distance_m[scored], errors.normalised_squared_errors[scored]
-    has_scores = distance.size > 0
     wrong = distance > WRONG_M
     # NaN, from a fix without sigma, is not within three sigmas: if wrong, the fix counts as false.
     false = wrong & ~(normalised_squared_errors <= FALSE_SIGMAS**2)
@@ -222,10 +214,8 @@ def _accuracy(errors: TrackErrors) -> dict[str, Any]:
     return {
         "frames_without_truth": int(np.isnan(errors.truth_en_m[:, 0]).sum()),
         "scored_fixes": int(distance.size),
-        "rms_m": float(np.sqrt(np.mean(distance**2))) if has_scores else None,
-        "median_m": float(np.median(distance)) if has_scores else None,
-        "r95_m": float(np.percentile(distance, 95)) if has_scores else None,
-        "max_m": float(distance.max()) if has_scores else None,
+        "rms_m": float(np.sqrt(np.mean(distance**2))) if distance.size else None,
+        **percentiles(distance, {"median_m": 50, "r95_m": 95, "max_m": 100}),
         "wrong_over_10m": int(wrong.sum()),
         "false_fixes": int(false.sum()),
         **{f"within_{n}_sigma": float((stated <= n**2).mean()) if stated.size else None for n in (1, 2, 3)},

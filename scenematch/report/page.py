@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from scenematch.report.explain import SliderFrame
+from scenematch.files.notes import FrameNote
+from scenematch.files.track import TrackRow
+from scenematch.report.explain import SliderFrame, run_window
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.loop_charts import LOOP_LEGEND, draw_loop_charts, loop_marks, loop_sentence
-from scenematch.report.motion_charts import draw_motion
 from scenematch.report.page_charts import draw_charts
-from scenematch.report.page_frames import draw_slider, frame_data
-from scenematch.report.page_map import TrackMap, draw_map, map_of_tracks, track_marks
+from scenematch.report.page_map import TrackMap, draw_map, loop_marks, map_of_tracks, track_marks
 from scenematch.report.page_parts import CROSS, charts_with_axis, fill_page, map_with_legend, section
 from scenematch.report.page_tables import draw_inputs, draw_refusals, draw_segments, draw_tiles
-from scenematch.report.verdict import verdict_of
+from scenematch.report.verdict import loop_sentence, metres, verdict_of
 
 Legend = list[tuple[str, str]]
 
@@ -40,7 +40,7 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
         section("When", _when(track)),
         *([section("Errors by segment", segments)] if segments else []),
         section("Refusals", draw_refusals(track, shown)),
-        section("Frame by frame", draw_slider(track, shown, why_not), "frames"),
+        section("Frame by frame", _slider(track, shown, why_not), "frames"),
         section("Inputs and versions", f'<div class="inputs">\n{draw_inputs(track.settings)}\n</div>'),
     ]
     subheading = f"{track.method}, {len(track.rows)} frames"
@@ -53,7 +53,7 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
         grade=verdict.grade,
         verdict="\n".join(f"<p>{escape(sentence)}</p>" for sentence in sentences),
         body=body,
-        data={"box": track_map.box, "frames": [frame_data(item, track, track_map) for item in shown]},
+        data={"box": track_map.box, "frames": [_frame_data(item, track, track_map) for item in shown]},
     )
 
 
@@ -83,45 +83,122 @@ def _where(track: FinishedTrack, track_map: TrackMap, slider: bool) -> str:
 
 
 def _map_legend(track: FinishedTrack, slider: bool) -> Legend:
-    has_truth = np.isfinite(track.errors.truth_en_m).any()
-    line, kind = ("truth", "truth") if has_truth else ("path of the fixes", "fix")
-    legend = [(line, f'<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="{kind}"/>')]
-    if track.loop is not None:
-        legend += LOOP_LEGEND
-    legend.append(("fix", '<path class="dots fix" d="M11 7h0"/>'))
-    if np.isfinite(track.errors.covariance_en_m2).any():
-        legend.append(("three stated sigmas, of some fixes", '<circle cx="11" cy="7" r="6" class="fix"/>'))
-    if not track.fixed.all():
-        legend.append(("refused", f'<path d="{CROSS}" class="refused"/>'))
-    if track.errors.beyond.any():
-        legend.append(("fix beyond three of its sigmas", f'<path d="{CROSS}" class="beyond"/>'))
-    if slider:
-        legend.append(
-            ("frame shown below and its window", '<rect class="now" x="2" y="1" width="18" height="12"/>')
-        )
-    return legend
+    errors, is_loop = track.errors, track.loop is not None
+    has_truth = np.isfinite(errors.truth_en_m).any()
+    path, kind = ("truth", "truth") if has_truth else ("path of the fixes", "fix")
+    marks = [
+        (True, path, f'<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="{kind}"/>'),
+        (is_loop, "plan", '<path d="M0 7h22" class="line plan"/>'),
+        (is_loop, "estimate", '<path d="M0 7h22" class="line estimate"/>'),
+        (True, "fix", '<path class="dots fix" d="M11 7h0"/>'),
+        (np.isfinite(errors.covariance_en_m2).any(), "three stated sigmas, of some fixes",
+         '<circle cx="11" cy="7" r="6" class="fix"/>'),
+        (not track.fixed.all(), "refused", f'<path d="{CROSS}" class="refused"/>'),
+        (errors.beyond.any(), "fix beyond three of its sigmas", f'<path d="{CROSS}" class="beyond"/>'),
+        (slider, "frame shown below and its window", '<rect class="now" x="2" y="1" width="18" height="12"/>'),
+    ]  # fmt: skip
+    return [(name, mark) for is_shown, name, mark in marks if is_shown]
 
 
 def _when(track: FinishedTrack) -> str:
     """The charts over time with their legend."""
     charts = draw_charts(track)
-    if track.loop is not None and charts:
-        charts[1:1] = draw_loop_charts(track.loop, track)
-    charts += draw_motion(track)
     if not charts:
         return "<p>There are no frames.</p>"
-    legend = [("fix", '<path class="dots fix" d="M11 7h0"/>')]
-    if track.errors.beyond.any():
-        legend.append(("fix beyond three of its sigmas", '<path class="dots beyond" d="M11 7h0"/>'))
-    if np.isfinite(track.errors.truth_en_m).any():
-        legend.append(("truth", '<path d="M0 7h22" class="line truth"/>'))
-    if track.telemetry:
-        legend.append(("telemetry", '<path d="M0 7h22" class="line telemetry"/>'))
-    states = {"coasting": "on dead reckoning", "searching": "searching for a first fix", "lost": "lost"}
-    seen = {note.state for note in track.notes or ()}
-    legend += [
-        (name, f'<rect class="{state}" width="22" height="14"/>')
-        for state, name in states.items()
-        if state in seen
+    errors, states = track.errors, {note.state for note in track.notes or ()}
+    marks = [
+        (True, "fix", '<path class="dots fix" d="M11 7h0"/>'),
+        (errors.beyond.any(), "fix beyond three of its sigmas", '<path class="dots beyond" d="M11 7h0"/>'),
+        (np.isfinite(errors.truth_en_m).any(), "truth", '<path d="M0 7h22" class="line truth"/>'),
+        (track.telemetry, "telemetry", '<path d="M0 7h22" class="line telemetry"/>'),
+        ("coasting" in states, "on dead reckoning", '<rect class="coasting" width="22" height="14"/>'),
+        ("searching" in states, "searching for a first fix", '<rect class="searching" width="22" height="14"/>'),
+        ("lost" in states, "lost", '<rect class="lost" width="22" height="14"/>'),
     ]
-    return charts_with_axis(charts, legend)
+    return charts_with_axis(charts, [(name, mark) for is_shown, name, mark in marks if is_shown])
+
+
+# ------------------------------------------------------------------------------------------------ frame by frame
+
+
+def shows_frames(page: Path) -> bool:
+    """Whether an existing page shows frames; False if there is no file."""
+    return page.is_file() and 'id="slider"' in page.read_text(encoding="utf-8", errors="replace")
+
+
+def _slider(track: FinishedTrack, shown: Sequence[SliderFrame], why_not: str) -> str:
+    """The slider, or the reason for its absence."""
+    if not shown:
+        return f"<p>{escape(why_not or 'No frames are shown.')}</p>"
+    text = f"{_choice(track, shown)} Move by the slider, the arrow keys, or a click on the map or a chart."
+    return (
+        f'<p class="sub">{text} Each was matched again for this page, in the window that the run used.</p>'
+        '<div class="slider"><button type="button" id="before" aria-label="Frame before">&#9664;</button>'
+        '<input type="range" id="slider" min="0" value="0" aria-label="Frame">'
+        '<button type="button" id="after" aria-label="Next frame">&#9654;</button><div class="strip" id="strip" '
+        'aria-hidden="true"></div></div>'
+        '<div class="facts" id="facts" aria-live="polite"></div><div class="pictures" id="pictures"></div>'
+        "<noscript><p>The slider needs JavaScript; the rest of the page does not.</p></noscript>"
+    )
+
+
+def _choice(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
+    """Describe which frames are shown."""
+    if len(shown) == len(track.rows):
+        return f"All {len(shown)} frames."
+    kinds = {"beyond three sigmas": np.flatnonzero(track.errors.beyond), "refused": np.flatnonzero(~track.fixed)}
+    there = {item.index for item in shown}
+    parts = [
+        f"{'' if there.issuperset(found) else f'{len(there.intersection(found))} of '}{len(found)} {kind}"
+        for kind, found in kinds.items()
+        if found.size
+    ]
+    parts.append("the others evenly spaced" if parts else "evenly spaced")
+    return f"{len(shown)} of {len(track.rows)} frames: {', '.join(parts)}."
+
+
+def _frame_data(shown: SliderFrame, track: FinishedTrack, track_map: TrackMap) -> dict[str, Any]:
+    """The data of one frame for the page's script."""
+    i = shown.index
+    row, note = track.rows[i], track.notes[i] if track.notes else None
+    beyond = bool(track.errors.beyond[i])
+    position_m = track.errors.fix_en_m[i] if row.fixed else track.refused_en_m[i]
+    window = None if note is None else run_window(row, note)
+    reason = (row.reason or "").replace("_", " ")
+    return {
+        "name": row.frame,
+        "kind": "beyond" if beyond else "fix" if row.fixed else "refused",
+        "answer": ("Fix beyond three of its sigmas" if beyond else "Fix") if row.fixed else f"Refused: {reason}",
+        "detail": None if note is None else note.detail,
+        "facts": _facts(i, row, note, track),
+        "t": round(float(track.time[i]), 3),
+        "xy": [round(float(v), 1) for v in track_map.drawing_xy(position_m)]
+        if np.isfinite(position_m).all()
+        else None,
+        "window": None if window is None else track_map.rectangle(window),
+        "pictures": [
+            {"s": p.src, "w": p.width_px, "h": p.height_px, "c": p.caption, "a": p.alt, "o": p.overlay}
+            for p in shown.images
+        ],
+    }
+
+
+def _facts(i: int, row: TrackRow, note: FrameNote | None, track: FinishedTrack) -> list[tuple[str, str]]:
+    """Figures of one frame by name."""
+    stated = None
+    if row.sigma_east_m is not None and row.sigma_north_m is not None:
+        stated = f"{row.sigma_east_m:.2f} m east, {row.sigma_north_m:.2f} m north"
+    error_m = float(track.errors.distance_m[i])
+    sigmas = float(np.sqrt(track.errors.normalised_squared_errors[i]))
+    facts = [
+        ("time", f"{track.time[i]:.2f} s") if track.is_timed else ("frame", f"{i}"),
+        ("error", metres(error_m) if np.isfinite(error_m) else None),
+        ("in its sigmas", f"{sigmas:.1f}" if np.isfinite(sigmas) else None),
+        ("stated sigma", stated),
+        ("score", None if row.score is None else f"{row.score:.3f}"),
+        ("confidence", None if note is None or note.confidence is None else f"{note.confidence:.3f}"),
+        ("method", f"{row.method or '-'}" + (f", {note.stage}" if note is not None and note.stage else "")),
+        ("navigator", None if note is None else note.state),
+        ("latency", None if row.latency_ms is None else f"{row.latency_ms:.1f} ms"),
+    ]
+    return [(name, value) for name, value in facts if value is not None]

@@ -17,6 +17,7 @@ from engine.window import level_crop
 from scenematch.report.charts import crosses, dots, line, ticks
 from scenematch.report.explain import jpeg_data_uri, level_within
 from scenematch.report.finished_track import FinishedTrack
+from scenematch.report.loop_record import LoopRecord
 from scenematch.report.metrics import TrackErrors
 
 _MAX_MAP_PX = 1500  # longer side as drawn
@@ -126,6 +127,12 @@ def track_marks(track_map: TrackMap, track: FinishedTrack) -> list[str]:
         crosses(fixes[beyond], "beyond", arm),
         '<rect class="now-window" id="now-window" width="0" height="0"/><path class="dots now" id="now" d=""/>',
     ]
+
+
+def loop_marks(track_map: TrackMap, loop: LoopRecord) -> list[str]:
+    """Plan and estimate as lines on the map."""
+    plan, estimate = (connected(track_map, places[:, :2]) for places in (loop.plan_m, loop.estimate_m))
+    return [line(estimate, "estimate"), line(plan, "plan")]
 
 
 def _ground(track_map: TrackMap) -> NDArray[np.uint8]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from engine.values import Reason
+from scenematch.report.loop_record import LoopRecord, rms
 from scenematch.report.metrics import WRONG_M
 
 MEANINGS = {
@@ -58,6 +59,16 @@ def verdict_of(summary: Mapping[str, Any]) -> Verdict:
     verdict, found = _judged(summary, settings.get("budget_ms")), settings.get("diagnosis") or {}
     said = [f"{sentence[:1].upper()}{sentence[1:]}." for sentence in found.values()]
     return replace(verdict, accuracy=" ".join([*said, verdict.accuracy]))
+
+
+def loop_sentence(loop: LoopRecord) -> str:
+    """The verdict on a closed loop in one sentence."""
+    off = loop.off_plan_m
+    rms_m, estimate_m = rms(off), rms(loop.estimate_error_m[loop.settled])
+    return (
+        f"Closed loop: steered by the fixes, the vehicle was {metres(rms_m)} RMS and at most "
+        f"{metres(float(off.max()))} from its plan, with an estimate that was {metres(estimate_m)} RMS off."
+    )
 
 
 def _judged(summary: Mapping[str, Any], budget_ms: float | None) -> Verdict:

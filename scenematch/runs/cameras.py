@@ -100,12 +100,12 @@ class CameraInput:
                 "camera: expected a calibration, or `hfov_deg`: only photographs contain theirs"
             )
         try:
-            found = photo_camera([frames.path / name for name in names or frames.names])
+            camera, source = photo_camera([frames.path / name for name in names or frames.names])
         except CalibrationError as error:
             raise CalibrationError(f"camera: expected a calibration, or that of photographs: {error}") from None
-        wide_deg = math.degrees(2.0 * math.atan(found.camera.width_px / (2.0 * found.camera.matrix[0, 0])))
-        progress.message(f"camera, by {found.source} of the photographs: {wide_deg:.1f} degrees wide")
-        return self.mounted(found.camera)
+        wide_deg = math.degrees(2.0 * math.atan(camera.width_px / (2.0 * camera.matrix[0, 0])))
+        progress.message(f"camera, by {source} of the photographs: {wide_deg:.1f} degrees wide")
+        return self.mounted(camera)
 
     def with_field_of_view(self, shape: tuple[int, ...]) -> Camera:
         """The camera from ``hfov_deg`` and the shape (H, W, ...) of a picture."""

@@ -12,7 +12,7 @@ from engine.orthomap import OrthoMap
 from scenematch.files.corrections import Corrections
 from scenematch.files.settings import nested, options_from_mapping
 from scenematch.files.track import TrackRow, read_track
-from scenematch.report.page_frames import shows_frames
+from scenematch.report.page import shows_frames
 from scenematch.runs.cameras import CameraInput
 from scenematch.runs.folders import StrPath
 from scenematch.runs.inputs import FlightFiles, open_run_truth

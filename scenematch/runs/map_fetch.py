@@ -14,13 +14,11 @@ from engine.errors import OptionError
 from engine.geo import LocalFrame
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.values import MAX_SIGMA_M
-from scenematch.fetch.grid import FINE_ENOUGH, Access, Grid
+from scenematch.fetch.grid import FINE_ENOUGH, Bounds, Grid, Place, Wanted
 from scenematch.fetch.heights import GLO30, GLO30_SLOPE_SIGMA_DEG, Heights, files_for, read_part, write_heights
 from scenematch.fetch.pictures import fetch_pictures, kept_pictures, remove_pictures
-from scenematch.fetch.place import Bounds, Place, Wanted
-from scenematch.fetch.servers import plan
+from scenematch.fetch.servers import is_template, plan
 from scenematch.fetch.urls import check_url, shown
-from scenematch.fetch.xyz import is_template
 from scenematch.files.photos import exif_telemetry
 from scenematch.runs.arguments import check_above, check_between, check_unused, parse_place
 from scenematch.runs.folders import StrPath, check_file
@@ -102,12 +100,12 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
     """
     out = Path(out)
     surface_out = out.with_name(f"{out.stem}-surface.tif")
-    wanted = _checked(settings, progress)
+    folder = out.with_name(f"{out.name}.tiles")
+    wanted = _checked(settings, folder, progress)
     for file in (out, surface_out) if settings.surface else (out,):
         check_file(file, settings.force)
     progress.message(f"note: {NOTE}")
-    folder = out.with_name(f"{out.name}.tiles")
-    grid = plan(settings.source, wanted, settings.tile_px, Access(settings.timeout_s, folder))
+    grid = plan(settings.source, wanted)
     files = [] if settings.surface is None else files_for(settings.surface, _bounds_deg(grid))
     _check_surface_stays(files, (out, surface_out))
     _say_what_comes(grid, settings, wanted, progress)
@@ -157,14 +155,14 @@ def _write(
     return {"nodata_share": nodata_share, "file_mb": out.stat().st_size / 1e6}
 
 
-def _checked(settings: FetchSettings, progress: Progress) -> Wanted:
+def _checked(settings: FetchSettings, folder: Path, progress: Progress) -> Wanted:
     """The request that the settings describe.
 
     Raises:
         OptionError: a setting is invalid.
         TelemetryError: the folder of photographs cannot be read.
     """
-    wanted = _wanted(settings, progress)
+    wanted = _wanted(settings, folder, progress)
     check_above("radius_m", wanted.place.radius_m, 0.0, _MAX_RADIUS_M)
     check_above("gsd_m_per_px", wanted.gsd_m_per_px, 0.0, 1e3)
     check_above("timeout_s", settings.timeout_s, 0.0, 3600.0)
@@ -184,7 +182,7 @@ def _checked(settings: FetchSettings, progress: Progress) -> Wanted:
     return wanted
 
 
-def _wanted(settings: FetchSettings, progress: Progress) -> Wanted:
+def _wanted(settings: FetchSettings, folder: Path, progress: Progress) -> Wanted:
     """The given place, or that of the photographs, and the request for it.
 
     Raises:
@@ -205,8 +203,9 @@ def _wanted(settings: FetchSettings, progress: Progress) -> Wanted:
     else:
         place = Place(*_place(settings.around), radius_m)
     gsd_m_per_px = GSD_M_PER_PX if gsd_m_per_px is None else gsd_m_per_px
-    server = {name: getattr(settings, name) for name in ("max_tiles", "layer", "crs", "image_format")}
-    return Wanted(place=place, gsd_m_per_px=gsd_m_per_px, **server)
+    names = ("max_tiles", "layer", "crs", "image_format", "tile_px", "timeout_s")
+    server = {name: getattr(settings, name) for name in names}
+    return Wanted(place=place, gsd_m_per_px=gsd_m_per_px, cache=folder, **server)
 
 
 def _place(around: str) -> tuple[float, float]:

@@ -15,13 +15,12 @@ from scenematch.files.flight import Flight
 from scenematch.files.notes import read_notes
 from scenematch.files.resampling import UTC_FROM_NS
 from scenematch.files.track import TrackRow
-from scenematch.report.consistency import motion_consistency
 from scenematch.report.explain import explain_frames
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.loop_record import read_loop_csv
 from scenematch.report.metrics import Ground, errors_en_m, summarise
 from scenematch.report.page import write_page
-from scenematch.report.segments import segment_errors
+from scenematch.report.segments import motion_consistency, segment_errors
 from scenematch.runs.folders import write_json
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.record import RunRecord

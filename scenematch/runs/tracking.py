@@ -125,7 +125,7 @@ def _record(
     given |= {
         "log_offset_s": files.log_offset_s if files.has_clock else None,
         "every": files.every if files.every > 1 else None,
-        "corrections": None if files.corrections.changes_nothing else files.corrections.facts(),
+        "corrections": None if files.corrections.changes_nothing else asdict(files.corrections),
     }
     return RunRecord(
         **given,

@@ -333,7 +333,7 @@ def test_where_nothing_stamps_the_frames_the_message_says_how(pictures, tmp_path
 def test_exif_times_stamp_photographs(monkeypatch, pictures, tmp_path):
     log = open_log(dataflash_flight(tmp_path / "1.BIN"))
     rows = [SimpleNamespace(timestamp_ns=UTC_NS + k * S, frame=f"{k}.png") for k in (1, 2)]
-    monkeypatch.setattr("scenematch.files.logs.readers.exif_telemetry", lambda _: rows)
+    monkeypatch.setattr("scenematch.files.logs.readers.photo_telemetry", lambda _: (rows, []))
     source = SimpleNamespace(path=pictures, names=["1.png", "2.png"])
     stamps_ns, names = stamp_frames(source, log, LogClock(offset_s=-0.5))
     assert (stamps_ns, names) == ([UTC_NS + S // 2, UTC_NS + 3 * S // 2], ["1.png", "2.png"])

@@ -38,7 +38,7 @@ def test_exif_heading_counts_only_from_true_north(tmp_path):
 
 def test_exif_without_a_fix_or_below_the_sea(tmp_path):
     nowhere = {1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0), 5: b"\1", 6: 3.0, 31: 2.5}
-    (row,) = exif_telemetry([photograph(tmp_path / "a.jpg", gps=nowhere)])
+    (row,), _ = photo_telemetry([photograph(tmp_path / "a.jpg", gps=nowhere)])
     assert row.prior is None
     assert row.alt_amsl_m == -3.0
 
@@ -102,9 +102,9 @@ def test_a_photograph_that_a_viewer_turned_has_no_heading(tmp_path):
 
 
 def focal_px(tmp_path, size_px, tags=(), xmp=""):
-    found = photo_camera([photograph(tmp_path / "a.jpg", tags=dict(tags), xmp=xmp, size_px=size_px)])
-    assert (found.camera.width_px, found.camera.height_px) == size_px
-    return found.camera.focal_px
+    camera, _ = photo_camera([photograph(tmp_path / "a.jpg", tags=dict(tags), xmp=xmp, size_px=size_px)])
+    assert (camera.width_px, camera.height_px) == size_px
+    return camera.focal_px
 
 
 # Pixels of cameras whose sensors are published: width of the sensor, focal length, its 35 mm equivalent.
@@ -146,7 +146,7 @@ def test_djis_own_calibration_counts_first(tmp_path):
     xmp += f' drone-dji:DewarpFlag="{{}}" drone-dji:DewarpData="2018-09-04;{numbers}"'
     for flag, distortion in ((0, [-0.27, 0.11, 1e-5, -4e-5, -0.03]), (1, [0.0] * 5)):
         path = photograph(tmp_path / "b.jpg", tags=tags, xmp=xmp.format(flag), size_px=(640, 480))
-        camera = photo_camera([path]).camera
+        camera, _ = photo_camera([path])
         assert np.allclose(camera.matrix, [[610.0, 0.0, 322.5], [0.0, 611.0, 235.5], [0.0, 0.0, 1.0]])
         assert camera.distortion.tolist() == distortion
 
@@ -179,7 +179,7 @@ def test_a_real_survey_says_camera_place_height_and_heading_itself():
     if not (folder / "photos").is_dir():
         pytest.skip(NO_SHARED)
     flight = open_flight(folder / "photos")
-    camera = photo_camera([flight.source.path / name for name in flight.names]).camera
+    camera, _ = photo_camera([flight.source.path / name for name in flight.names])
     assert (camera.width_px, camera.height_px) == (4000, 2250)
     assert camera.focal_px == pytest.approx(3.61 / (6.17 / 4000), rel=0.02)
     assert flight.has_gimbal

@@ -8,8 +8,8 @@ from pyproj import CRS
 
 from engine.errors import OptionError
 from scenematch.fetch.crs import chosen_crs
+from scenematch.fetch.grid import Place
 from scenematch.fetch.heights import files_for
-from scenematch.fetch.place import Place
 from scenematch.fetch.urls import shown
 from scenematch.fetch.wmts import _extra_query
 from scenematch.runs.map_fetch import FetchSettings, fetch_map

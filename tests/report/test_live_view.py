@@ -31,7 +31,7 @@ from rerun.chunk import RrdReader
 from rosbags.typesys import Stores, get_typestore
 
 from scenematch.report import live_view
-from scenematch.report.live_shapes import FIX_RGB, SIGMAS, ellipsoid
+from scenematch.report.live_view import FIX_RGB, SIGMAS, ellipsoid
 from tests.support import browser
 from tests.support.commands import refusal
 from tests.support.dark_flight import DARK, FRAMES, dark_flight

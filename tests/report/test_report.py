@@ -12,7 +12,7 @@ from engine.geo import LocalFrame
 from engine.values import Truth
 from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
-from scenematch.report.consistency import motion_consistency
+from scenematch.report.segments import motion_consistency
 from scenematch.report.metrics import Ground, TrackErrors, errors_en_m, summarise
 from scenematch.report.segments import segment_ends, segment_errors
 

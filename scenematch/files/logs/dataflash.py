@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
-from scenematch.files.resampling import FlightLog, TimeSeries, make_log, make_position_series, make_series
+from scenematch.files.resampling import FlightLog, TimeSeries, make_position_series, make_series
 
 _HEAD, _FMT = b"\xa3\x95", 0x80  # the first two bytes of each message; the type that defines the others
 _MAX_US = 1e13  # a third of a year: a larger stamp is corrupt
@@ -76,7 +76,7 @@ def _log(path: Path, found: Mapping[str, Columns]) -> FlightLog:
         fixed = at["Status"] >= _FIX_3D if position == "GPS" else True
         series |= make_position_series(stamps[position], at["Lat"], at["Lng"], fixed)
     captures = next((stamps[name] for name in ("CAM", "TRIG") if name in found), ())
-    return make_log(path, series, _heights(found), captures, _utc_ns(found.get("GPS")))
+    return FlightLog(path, series, _heights(found), captures, _utc_ns(found.get("GPS")))
 
 
 def _messages(data: bytes) -> dict[str, Columns]:

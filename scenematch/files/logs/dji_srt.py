@@ -19,7 +19,7 @@ from pathlib import Path
 
 from engine.errors import TelemetryError
 from scenematch.files.photos import gimbal_columns
-from scenematch.files.resampling import FlightLog, TimeSeries, make_log, make_position_series, make_series
+from scenematch.files.resampling import FlightLog, TimeSeries, make_position_series, make_series
 
 _NUMBER = r"([+-]?[0-9]{1,18}(?:\.[0-9]{1,18})?)"
 _TIME = r"([0-9]{1,3}):([0-9]{2}):([0-9]{2})[,.]([0-9]{3})"
@@ -64,7 +64,7 @@ def read_srt(path: Path) -> FlightLog:
     known = angles | {"alt_amsl_m": series("abs_alt")} | positions
     frame_numbers = _frame_numbers(stamps_ns, [cue.get("framecnt") for cue in cues])
     captures_ns = stamps_ns if frame_numbers is None else []
-    return make_log(path, known, {"take-off": series("rel_alt")}, captures_ns, frame_numbers=frame_numbers)
+    return FlightLog(path, known, {"take-off": series("rel_alt")}, captures_ns, frame_numbers=frame_numbers)
 
 
 def _frame_numbers(stamps_ns: list[int], counts: list[float | None]) -> TimeSeries | None:

@@ -16,7 +16,7 @@ from scenematch.files.frames import FrameSource, VideoFile
 from scenematch.files.logs.dataflash import read_dataflash
 from scenematch.files.logs.dji_srt import read_srt
 from scenematch.files.logs.ulog import read_ulog
-from scenematch.files.photos import exif_telemetry, photo_truth
+from scenematch.files.photos import photo_telemetry, photo_truth
 from scenematch.files.resampling import UTC_FROM_NS, FlightLog, TimeSeries, truth_from_log
 from scenematch.files.ros.bags import BagFrames, is_bag, read_bag
 from scenematch.files.telemetry import read_telemetry
@@ -124,7 +124,7 @@ def _unshifted_stamps(source: FrameSource, log: FlightLog, clock: LogClock) -> t
                 f"{log.captures_ns.size}; give their times with `frame_stamps`"
             )
         return [int(stamp_ns) for stamp_ns in log.captures_ns], list(source.names)
-    rows = exif_telemetry([source.path / name for name in source.names])
+    rows, _ = photo_telemetry([source.path / name for name in source.names])
     if not rows:
         raise TelemetryError(
             f"{log.path}: expected to know when the pictures were taken: it has no camera messages, they have no "

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError, require
-from scenematch.files.resampling import FlightLog, TimeSeries, make_log, make_position_series, make_series
+from scenematch.files.resampling import FlightLog, TimeSeries, make_position_series, make_series
 
 HEAD = b"ULog\x01\x12\x35"
 """The first bytes of a ULog file."""
@@ -61,7 +61,7 @@ def read_ulog(path: Path) -> FlightLog:
             series = _attitude(topics) | _velocity(topics) | _position(topics)
             cameras = (topics[name] for name in ("camera_capture", "camera_trigger") if name in topics)
             captures = next(map(_stamps_ns, cameras), ())
-            return make_log(path, series, _heights(topics), captures, _utc_ns(topics))
+            return FlightLog(path, series, _heights(topics), captures, _utc_ns(topics))
     except KeyError as error:
         raise TelemetryError(f"{path}: expected a PX4 topic with the field {error}, got one without") from None
 

@@ -27,7 +27,6 @@ from scenematch.files.resampling import (
     Stamps,
     TimeSeries,
     interpolate,
-    make_log,
     make_position_series,
     make_series,
 )
@@ -238,7 +237,7 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
     if odometry_topic is not None:
         series |= _odometry_series(path, odometry_topic, known["odometry"], series)
     heights = {"rangefinder": series_of("range"), "take-off": series_of("height")}
-    return make_log(path, series, heights)
+    return FlightLog(path, series, heights)
 
 
 _SUFFIXES = {
