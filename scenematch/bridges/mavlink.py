@@ -20,6 +20,7 @@ from engine.navigation.live import Answer, Live, LiveOptions
 from engine.navigation.motion import position_of
 from engine.navigation.navigator import Navigator
 from engine.navigation.track_guard import TrackGuard
+from engine.options import NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.realtime import start_thread
 from engine.values import Fix, Prior
@@ -74,6 +75,7 @@ class MavlinkBridge:
         options: which message to send, and which fixes to withhold.
         start: prior position at the start of the flight.
         live: deadlines of the frames.
+        navigator: options of the navigators, by which it is also decided what contradicts the track.
         origin: NED origin to set on an autopilot that reports none; None sets none, so local positions are not
             sent.
         use_velocity: whether to use the autopilot's velocity for dead reckoning between fixes.
@@ -100,6 +102,7 @@ class MavlinkBridge:
         start: Prior | None = None,
         live: LiveOptions | None = None,
         *,
+        navigator: NavigatorOptions | None = None,
         origin: NedOrigin | None = None,
         use_velocity: bool = True,
         site: OrthoMap | None = None,
@@ -119,7 +122,8 @@ class MavlinkBridge:
         self._make_navigator, self._use_velocity = make_navigator, use_velocity
         self._system_id, self._component_id, self._key = system_id, component_id, key
         self._site, self._check_gnss, self._resumed = site, check_gnss, resumed
-        self._guard = TrackGuard(None if start is None or site is None else position_of(start, site))
+        begin = None if start is None or site is None else position_of(start, site)
+        self._guard = TrackGuard(begin, navigator)
         self._notices = PilotNotices()
         self._encoder = PacketEncoder(system_id, key, component_id)
         self._sending = threading.Lock()

@@ -176,7 +176,8 @@ class BridgeSettings:
     def live_options(self, deadline_ms: float = 121.0) -> LiveOptions:
         """The deadlines of the frames, or the default ones."""
         deadline_ms = deadline_ms if self.deadline_ms is None else self.deadline_ms
-        return LiveOptions(deadline_ms=deadline_ms, realtime=self.scheduling())
+        speed_mps = self.navigator.max_speed_mps
+        return LiveOptions(deadline_ms=deadline_ms, max_speed_mps=speed_mps, realtime=self.scheduling())
 
 
 def run_mavlink_bridge(
@@ -216,19 +217,19 @@ def run_mavlink_bridge(
     outgoing = link.outgoing()
     start = parse_position("start", settings.start)
     key = None if link.key is None else read_key(Path(link.key))
+    speed_mps = settings.navigator.max_speed_mps
     # With a camera the bridge may start in the air; a replayed flight begins at its start.
     resumes = files.camera_source is not None
     last_fix = LastFix(
         last_fix_file(link.connect, link.system_id, Path(files.map.map).absolute()) if resumes else None
     )
-    max_speed_mps = settings.live_options().max_speed_mps
-    matcher = _loaded(files, settings, start, progress, brief=last_fix.prior(max_speed_mps) is not None)
+    matcher = _loaded(files, settings, start, progress, brief=last_fix.prior(speed_mps) is not None)
     site, camera = matcher.site, matcher.camera
     end_on_sigterm()  # before the fork, so that the worker has it from its first instruction
     if supervise:
         check_supervision(matcher.device)
         become_worker(progress)
-    resumed = _resumed(last_fix.prior(max_speed_mps), site, progress)
+    resumed = _resumed(last_fix.prior(speed_mps), site, progress)
     start = resumed or start
 
     # Before the link: a bench autopilot takes off as soon as the bridge listens.
@@ -237,8 +238,8 @@ def run_mavlink_bridge(
         try:
             bridge = MavlinkBridge(
                 connection, make_navigator, outgoing, start, settings.live_options(MAX_DELAY_MS),
-                origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
-                check_gnss=link.check_gnss, resumed=resumed is not None, system_id=link.system_id,
+                navigator=settings.navigator, origin=link.origin(site, start), use_velocity=link.use_velocity,
+                site=site, check_gnss=link.check_gnss, resumed=resumed is not None, system_id=link.system_id,
                 component_id=link.component_id, key=key, watch=watcher, on_sent=last_fix.keep,
                 gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip

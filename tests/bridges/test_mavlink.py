@@ -26,6 +26,7 @@ from pymavlink.quaternion import Quaternion
 from engine.camera import mount_rotation
 from engine.errors import OptionError, TelemetryError
 from engine.geo import LocalFrame
+from engine.options import NavigatorOptions
 from engine.values import Attitude, NoFix, Prior, Reason
 from scenematch.bridges import mavlink_requests
 from scenematch.bridges.fix_velocity import GroundVelocity, VelocityFromFixes
@@ -1119,6 +1120,14 @@ def test_only_a_first_fix_waits_for_the_autopilots_word_on_its_receiver(loop, re
     else:
         fly(made.bridge, lambda: made.bridge.status.withheld.get("receiver not heard yet", 0) > 5)
         assert not pilot.of("VISION_POSITION_ESTIMATE")
+
+
+def test_the_navigators_options_decide_what_contradicts_the_track(loop):
+    made, pilot = loop(navigator=NavigatorOptions(gate=1e9))
+    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
+    made.navigator.result = fix(east_m=40.0)
+    fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE")[-1][0].y > 30.0)
+    assert "contradicts the track" not in made.bridge.status.withheld
 
 
 def test_reset_counter_steps_once_per_relocalisation(loop):
