@@ -22,8 +22,8 @@ from engine.geo import LocalFrame
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
 from scenematch.bridges.links import Connection
 from scenematch.bridges.mavlink import MavlinkBridge
-from scenematch.bridges.mavlink_out import MavlinkOptions
 from scenematch.bridges.mavlink_status import MIN_RATE_HZ
+from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
 PAGE = RESULTS / "mavlink.md"

@@ -29,7 +29,6 @@ from scenematch.bridges.links import Connection, Link, PeerAddress, parse_connec
 from scenematch.bridges.mavlink_in import HANDLED_MESSAGES, MAV_AUTOPILOTS, MavlinkTelemetry
 from scenematch.bridges.mavlink_out import (
     FixReport,
-    MavlinkOptions,
     acknowledgement_message,
     fix_message,
     heartbeat_message,
@@ -44,6 +43,7 @@ from scenematch.bridges.mavlink_requests import AutopilotRequests
 from scenematch.bridges.mavlink_status import MavlinkCounters, MavlinkStatus
 from scenematch.bridges.notices import INFO, Notice, PilotNotices
 from scenematch.bridges.packets import BRIDGE_COMPONENT, PacketDecoder, PacketEncoder
+from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
 __all__ = [

@@ -7,7 +7,8 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from scenematch.bridges.mavlink_in import GIMBAL_RATES_HZ, REQUESTED_RATES_HZ, MavlinkTelemetry
-from scenematch.bridges.mavlink_out import MavlinkOptions, command_message, set_origin_message
+from scenematch.bridges.mavlink_out import command_message, set_origin_message
+from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
 _ORIGIN_TIMEOUT_NS = 3_000_000_000  # after which an origin is set on an autopilot that reports none

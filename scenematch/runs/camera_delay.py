@@ -58,7 +58,7 @@ def measure_camera_delay(
         TelemetryError: the camera does not open, or its pictures do not agree with the attitude.
     """
     require("pymavlink", "mavlink")
-    from scenematch.bridges.mavlink import MavlinkBridge, MavlinkOptions
+    from scenematch.bridges.mavlink import MavlinkBridge
     from scenematch.bridges.packets import read_key
 
     seconds = 20.0 if seconds is None else seconds
@@ -67,14 +67,11 @@ def measure_camera_delay(
     if camera.camera is None and camera.hfov_deg is None:
         raise OptionError("camera: expected a calibration, or `hfov_deg`")
     model = camera.load_live(camera_source, progress=progress)
-    options, secret = (
-        MavlinkOptions(firmware=link.firmware),
-        None if link.key is None else read_key(Path(link.key)),
-    )
+    secret = None if link.key is None else read_key(Path(link.key))
     connection = parse_connection(link.connect, listen_anywhere=link.listen_anywhere)
     try:
         idle: Any = _Idle()
-        bridge = MavlinkBridge(connection, lambda _: idle, options, system_id=link.system_id, key=secret)
+        bridge = MavlinkBridge(connection, lambda _: idle, link, system_id=link.system_id, key=secret)
     except OSError as error:
         raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
     progress.message(f"tilt the vehicle to and fro by some 10 degrees for {seconds:g} s, over textured ground")

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import require
-from scenematch.bridges.parameters import parameter_file
+from scenematch.bridges.parameters import MavlinkOptions, parameter_file
 from scenematch.runs.folders import StrPath, check_file
 from scenematch.runs.last_fix import measured_delay_ms
-from scenematch.runs.mavlink_bridge import MavlinkSettings
 
 _DEFAULT_DELAY_MS = 100
 
@@ -41,7 +40,7 @@ class ParameterSettings:
 
 
 def write_parameter_file(
-    out: StrPath, link: MavlinkSettings, settings: ParameterSettings | None = None, *, force: bool = False
+    out: StrPath, link: MavlinkOptions, settings: ParameterSettings | None = None, *, force: bool = False
 ) -> WrittenParameters:
     """Write the parameters with which an autopilot uses the bridge's fixes.
 
@@ -55,9 +54,9 @@ def write_parameter_file(
         The delay written, and its source.
     """
     require("pymavlink", "mavlink")
-    out, outgoing, settings = Path(out), link.outgoing(), settings or ParameterSettings()
+    out, settings = Path(out), settings or ParameterSettings()
     written = _delay(settings.delay_ms)
-    text = parameter_file(outgoing, settings.takeoff, written.delay_ms)
+    text = parameter_file(link, settings.takeoff, written.delay_ms)
     check_file(out, force)
     out.write_text(text, encoding="utf-8")
     return written

@@ -34,9 +34,7 @@ from scenematch.bridges.links import Connection, parse_connection
 from scenematch.bridges.mavlink import CONFIRM_COMMAND, MavlinkBridge
 from scenematch.bridges.mavlink_in import HANDLED_MESSAGES, REQUESTED_RATES_HZ, AutopilotClock, MavlinkTelemetry
 from scenematch.bridges.mavlink_out import (
-    MESSAGES,
     FixReport,
-    MavlinkOptions,
     command_message,
     fix_message,
     heartbeat_message,
@@ -56,7 +54,7 @@ from scenematch.bridges.packets import (
     read_key,
     signing_time,
 )
-from scenematch.bridges.parameters import parameter_file
+from scenematch.bridges.parameters import MESSAGES, MavlinkOptions, parameter_file
 from scenematch.bridges.pictures import replay
 from scenematch.bridges.vehicle import NedOrigin, VehicleState, north_east_m
 from scenematch.cli.app import run as main

@@ -242,7 +242,7 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
     if bridge == "mavlink":
         mavlink = pytest.importorskip("scenematch.bridges.mavlink", reason="pymavlink is not installed")
         from scenematch.bridges.links import Connection
-        from scenematch.bridges.mavlink_out import MavlinkOptions
+        from scenematch.bridges.parameters import MavlinkOptions
 
         made = mavlink.MavlinkBridge(
             Connection("udpin", "127.0.0.1", 0), quiet, MavlinkOptions(), watch=stated.append

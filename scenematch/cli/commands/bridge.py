@@ -171,7 +171,7 @@ def _bridge(
     )
     link, how = autopilot.link(given), _bridge_settings(matching, given)
     status = run_mavlink_bridge(files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS)
-    console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {link.connect}")
+    console.facts(asdict(status), as_json, title=f"{link.kind} to {link.connect}")
     flown = console.options(
         map=site.map, surface=site.surface, camera=pictures.camera, hfov_deg=pictures.hfov_deg,
         frames=pictures.frames, telemetry=pictures.telemetry,
