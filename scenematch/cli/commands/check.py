@@ -4,26 +4,17 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from scenematch.cli import console
-from scenematch.cli.options import (
-    CorrectOption,
-    FlightOptions,
-    JsonOption,
-    SettingsOption,
-    StartOption,
-    flight_options,
-    read_settings,
-    with_options,
-)
+from scenematch.cli import console, options
+from scenematch.cli.options import with_options
 
 
 @with_options
 def check(
-    flight: FlightOptions,
-    correct: CorrectOption = None,
-    start: StartOption = None,
-    settings: SettingsOption = None,
-    as_json: JsonOption = False,
+    flight: options.FlightOptions,
+    correct: options.CorrectOption = None,
+    start: options.StartOption = None,
+    settings: options.SettingsOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Find errors in a flight's inputs.
 
@@ -32,7 +23,7 @@ def check(
     """
     from scenematch.runs.checking import as_rows, diagnose_flight
 
-    given = read_settings(settings)
+    given = options.read_settings(settings)
     files = flight.files(given, correct)
     names = given.track().telemetry_columns
     found = diagnose_flight(files, start, columns=names, progress=console.PROGRESS)
@@ -41,5 +32,5 @@ def check(
     else:
         rows = as_rows(found, corrected=not files.corrections.changes_nothing)
         console.print_pairs(f"check of {flight.frames}", rows)
-    following = flight_options(files, settings=settings, start=start)
+    following = options.flight_options(files, settings=settings, start=start)
     console.next_step(f"track {following} --out out", as_json=as_json)

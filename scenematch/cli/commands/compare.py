@@ -4,30 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from scenematch.cli import console, tables
-from scenematch.cli.options import (
-    FlightOptions,
-    ForceOption,
-    JsonOption,
-    OutOption,
-    SettingsOption,
-    StartOption,
-    flight_options,
-    option,
-    read_settings,
-    with_options,
-)
+from scenematch.cli import console, options, tables
+from scenematch.cli.options import option, with_options
 
 
 @with_options
 def compare(
-    flight: FlightOptions,
-    out: OutOption,
+    flight: options.FlightOptions,
+    out: options.OutOption,
     runs: Annotated[list[str] | None, option("--run", "METHOD[/PROFILE]|FILE")] = None,
-    start: StartOption = None,
-    settings: SettingsOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    start: options.StartOption = None,
+    settings: options.SettingsOption = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Compare methods or settings on one flight.
 
@@ -41,7 +30,7 @@ def compare(
     from scenematch.runs.comparison import parse_runs
     from scenematch.runs.reporting import COMPARISON
 
-    given = read_settings(settings)
+    given = options.read_settings(settings)
     parsed = parse_runs(runs or [], settings=settings or (), start=start)
     files = flight.files(given)
     results = compare_runs(files, out, parsed, force=force, progress=console.PROGRESS)
@@ -51,5 +40,5 @@ def compare(
         tables.print_comparison(results, str(flight.frames))
         console.say(f"written to {out}")
     drawn = out / COMPARISON if (out / COMPARISON).is_file() else out
-    following = f"track {flight_options(files, settings=settings, start=start)} --out out"
+    following = f"track {options.flight_options(files, settings=settings, start=start)} --out out"
     console.next_step(following, as_json=as_json, hint=f"open {console.quoted(drawn)}")

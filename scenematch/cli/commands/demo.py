@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from scenematch.cli import console, tables
-from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, option, use_threads, with_options
+from scenematch.cli import console, options, tables
+from scenematch.cli.options import OUTPUT, option, with_options
 
 
 @with_options
@@ -14,8 +14,8 @@ def demo(
     out: Annotated[Path, option("--out", "DIR", OUTPUT)] = Path("demo-report"),
     frames: Annotated[int | None, option("--frames", "N", min=2)] = None,
     seed: Annotated[int, option("--seed", "N", min=0)] = 1,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Track a built-in flight with both methods.
 
@@ -29,7 +29,7 @@ def demo(
     """
     from scenematch.runs.demo import run_demo
 
-    use_threads()
+    options.use_threads()
     results = run_demo(out, frames=frames, seed=seed, force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json(results)

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from engine.errors import OptionError
-from scenematch.cli import console, tables
-from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, after_track, option, with_options
+from scenematch.cli import console, options, tables
+from scenematch.cli.options import OUTPUT, option, with_options
 
 
 @with_options
@@ -17,8 +17,8 @@ def evaluate(
     runs: Annotated[list[Path], typer.Argument(metavar="DIR")],
     truth: Annotated[Path | None, option("--truth", "FILE")] = None,
     out: Annotated[Path | None, option("--out", "FILE", OUTPUT)] = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Score finished tracks and redraw their reports.
 
@@ -40,7 +40,7 @@ def evaluate(
         summary = evaluate_track(runs[0], truth, force=force, progress=console.PROGRESS)
         tables.print_summary(summary, as_json, title=f"track in {runs[0]}", out=runs[0])
         record = read_record(runs[0] / SUMMARY)
-        following = after_track(recorded_files(record), runs[0], summary["fixes"], start=record.start)
+        following = options.after_track(recorded_files(record), runs[0], summary["fixes"], start=record.start)
         console.next_step(following, as_json=as_json, hint=f"open {runs[0] / PAGE}")
         return
     if truth is not None:

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from scenematch.cli import console
-from scenematch.cli.options import OUTPUT, ForceOption, JsonOption, option, with_options
+from scenematch.cli import console, options
+from scenematch.cli.options import OUTPUT, option, with_options
 
 
 @with_options
@@ -17,8 +17,8 @@ def export(
     kind: Annotated[str, option("--format", "gpx|geojson|tum")],
     out: Annotated[Path | None, option("--out", "FILE", OUTPUT)] = None,
     truth: Annotated[Path | None, option("--truth", "FILE")] = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Export a finished track as GPX, GeoJSON or TUM.
 

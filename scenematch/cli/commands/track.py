@@ -4,41 +4,24 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from scenematch.cli import console, tables
-from scenematch.cli.options import (
-    EXPERT,
-    CorrectOption,
-    DeviceOption,
-    FlightOptions,
-    ForceOption,
-    JsonOption,
-    MethodOption,
-    OutOption,
-    RerunOption,
-    SettingsOption,
-    StartOption,
-    after_track,
-    live_view,
-    option,
-    read_settings,
-    with_options,
-)
+from scenematch.cli import console, options, tables
+from scenematch.cli.options import EXPERT, option, with_options
 
 
 @with_options
 def track(
-    flight: FlightOptions,
-    out: OutOption,
-    correct: CorrectOption = None,
-    start: StartOption = None,
-    method: MethodOption = None,
+    flight: options.FlightOptions,
+    out: options.OutOption,
+    correct: options.CorrectOption = None,
+    start: options.StartOption = None,
+    method: options.MethodOption = None,
     profile: Annotated[str | None, option("--profile", "engine|paper", EXPERT)] = None,
-    device: DeviceOption = None,
+    device: options.DeviceOption = None,
     budget_ms: Annotated[float | None, option("--budget-ms", "MS", EXPERT)] = None,
-    settings: SettingsOption = None,
-    rerun: RerunOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    settings: options.SettingsOption = None,
+    rerun: options.RerunOption = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Track a flight; write track.csv and a report.
 
@@ -51,11 +34,12 @@ def track(
     """
     from scenematch.runs.tracking import track as track_flight
 
-    given = read_settings(settings)
+    given = options.read_settings(settings)
     files = flight.files(given, correct)
     how = given.track(method=method, profile=profile, device=device, start=start, budget_ms=budget_ms)
-    summary = track_flight(files, out, how, force=force, live_view=live_view(rerun), progress=console.PROGRESS)
+    shown = options.live_view(rerun)
+    summary = track_flight(files, out, how, force=force, live_view=shown, progress=console.PROGRESS)
     title = f"{how.method} ({how.profile} profile) on {flight.frames}"
     tables.print_summary(summary, as_json, title=title, out=out)
-    following = after_track(files, out, summary["fixes"], settings=settings, start=start)
+    following = options.after_track(files, out, summary["fixes"], settings=settings, start=start)
     console.next_step(following, as_json=as_json, hint=f"open {out / 'report.html'}")
