@@ -24,21 +24,10 @@ from engine.options import NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.realtime import start_thread
 from engine.values import Fix, Prior
+from scenematch.bridges import mavlink_out
 from scenematch.bridges.fix_velocity import VelocityFromFixes
 from scenematch.bridges.links import Connection, Link, PeerAddress, parse_connection
 from scenematch.bridges.mavlink_in import HANDLED_MESSAGES, MAV_AUTOPILOTS, MavlinkTelemetry
-from scenematch.bridges.mavlink_out import (
-    FixReport,
-    acknowledgement_message,
-    fix_message,
-    heartbeat_message,
-    no_position_message,
-    notice_message,
-    receiver_message,
-    stamp_on_ground_ns,
-    timesync_message,
-    withhold_reason,
-)
 from scenematch.bridges.mavlink_requests import AutopilotRequests
 from scenematch.bridges.mavlink_status import MavlinkCounters, MavlinkStatus
 from scenematch.bridges.notices import INFO, Notice, PilotNotices
@@ -121,7 +110,7 @@ class MavlinkBridge:
         self._connection, self._options, self._origin = connection, options, origin
         self._make_navigator, self._use_velocity = make_navigator, use_velocity
         self._system_id, self._component_id, self._key = system_id, component_id, key
-        self._site, self._check_gnss, self._resumed = site, check_gnss, resumed
+        self._checked_on, self._resumed = site if check_gnss else None, resumed
         begin = None if start is None or site is None else position_of(start, site)
         self._guard = TrackGuard(begin, navigator)
         self._notices = PilotNotices()
@@ -202,11 +191,11 @@ class MavlinkBridge:
         """Send what ArduPilot requires before arming: a live camera, or a fix from every receiver."""
         now_ns, gnss, gps_id = time.monotonic_ns(), self.telemetry.gnss, self._options.gps_id
         if self._options.needs_origin:
-            self._send(no_position_message(now_ns))
+            self._send(mavlink_out.no_position_message(now_ns))
         elif gps_id and gnss is not None and now_ns - gnss.time_ns < _GNSS_STALE_NS:
-            stamp_ns = stamp_on_ground_ns(now_ns)
+            stamp_ns = mavlink_out.stamp_on_ground_ns(now_ns)
             times_ns = stamp_ns, self.telemetry.unix_ns(stamp_ns)
-            self._send(receiver_message(gnss, self.telemetry.vehicle(now_ns), gps_id, times_ns))
+            self._send(mavlink_out.receiver_message(gnss, self.telemetry.vehicle(now_ns), gps_id, times_ns))
 
     def _is_trusted(self, answer: Answer, now_s: float) -> bool:
         """Whether a fix continues the track sent to the autopilot or, before the first fix, its GNSS."""
@@ -216,14 +205,10 @@ class MavlinkBridge:
             self._guard.confirm()
             self._confirmed = False
         self._guard.advance(answer.frame, stamp_ns)
-        if (
-            self._site is not None
-            and self._check_gnss
-            and gnss is not None
-            and abs(stamp_ns - gnss.time_ns) < _GNSS_STALE_NS
-        ):
+        site = self._checked_on
+        if site is not None and gnss is not None and abs(stamp_ns - gnss.time_ns) < _GNSS_STALE_NS:
             prior = Prior(lat_deg=gnss.lat_deg, lon_deg=gnss.lon_deg, sigma_m=gnss.sigma_m)
-            self._guard.anchor(position_of(prior, self._site))
+            self._guard.anchor(position_of(prior, site))
         trusted = self._guard.trusts(answer.result)
         if self._guard.is_disputed:
             self._tell(self._notices.doubted(self._guard.distance_m, now_s))
@@ -232,14 +217,14 @@ class MavlinkBridge:
     def _send_fix(self, fix: Fix, captured_ns: int, *, trusted: bool) -> str | None:
         """Send a fix; returns the cause if it is withheld."""
         report = self._compose(fix, captured_ns)
-        cause = withhold_reason(report, self._options) if self.connected else "no autopilot"
+        cause = mavlink_out.withhold_reason(report, self._options) if self.connected else "no autopilot"
         if cause is None and self.telemetry.firmware != MAV_AUTOPILOTS[self._options.firmware]:
             cause = "other firmware"
         if cause is None and not trusted:
             cause = "contradicts the track"
         if cause is None and self._awaits_receiver():
             cause = "receiver not heard yet"
-        if cause is None and not self._send(fix_message(report, self._options)):
+        if cause is None and not self._send(mavlink_out.fix_message(report, self._options)):
             cause = "link down"
         if cause is not None:
             self._counters.withheld[cause] += 1
@@ -253,13 +238,13 @@ class MavlinkBridge:
     def _awaits_receiver(self) -> bool:
         """Whether the first fix must wait for the autopilot's report on its receiver, which is requested."""
         is_first = not (self._guard.has_fix or self._resumed)
-        checked = self._site is not None and self._check_gnss and is_first
+        checked = self._checked_on is not None and is_first
         recent = time.monotonic_ns() - self._connected_ns < _GNSS_STALE_NS
         return checked and recent and self.telemetry.has_receiver is None
 
     def _tell(self, notices: list[Notice]) -> None:
         for severity, text in notices:
-            self._send(notice_message(severity, text))
+            self._send(mavlink_out.notice_message(severity, text))
 
     def _new_navigator(self, start: Prior | None) -> Navigator:
         """Create a navigator; replacing one counts as a reset because the new one acquires the position again."""
@@ -269,13 +254,13 @@ class MavlinkBridge:
         self._navigator = navigator
         return navigator
 
-    def _compose(self, fix: Fix, captured_ns: int) -> FixReport:
+    def _compose(self, fix: Fix, captured_ns: int) -> mavlink_out.FixReport:
         resets = self._resets_before + (0 if self._navigator is None else self._navigator.reset_count)
         origin, vehicle = self.telemetry.origin, self.telemetry.vehicle(captured_ns)
         if origin is None and self._origin is not None and vehicle.down_m is not None:
             # An autopilot without a position reports a height above sea level of 0.
             vehicle = replace(vehicle, alt_amsl_m=self._origin.alt_amsl_m - vehicle.down_m)
-        return FixReport(
+        return mavlink_out.FixReport(
             fix,
             captured_ns,
             (time.monotonic_ns() - captured_ns) * 1e-6,
@@ -321,7 +306,7 @@ class MavlinkBridge:
                 self._obey(message)
                 continue
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                self._send(timesync_message(time.monotonic_ns(), message.ts1))
+                self._send(mavlink_out.timesync_message(time.monotonic_ns(), message.ts1))
             self.telemetry.update(message, now_ns)
 
     def _obey(self, message: Any) -> None:
@@ -332,7 +317,7 @@ class MavlinkBridge:
         if accepted:
             self._confirmed = True
             self._tell([(INFO, "Scenematch: position confirmed")])
-        self._send(acknowledgement_message(message.command, accepted=accepted))
+        self._send(mavlink_out.acknowledgement_message(message.command, accepted=accepted))
 
     def _on_connected(self, now_ns: int) -> None:
         """Start over with a vehicle that is heard for the first time or again."""
@@ -346,13 +331,13 @@ class MavlinkBridge:
         """Send periodic messages: heartbeats always, requests while the vehicle is connected."""
         now_ns = time.monotonic_ns()
         if self._is_due("heartbeat", now_ns, 1.0):
-            self._send(heartbeat_message())
+            self._send(mavlink_out.heartbeat_message())
         if not self.connected:
             return
         self._tell(self._notices.due(now_ns * 1e-9))
         if self._is_due("timesync", now_ns, 0.5):
             self.telemetry.add_timesync_request(now_ns)
-            self._send(timesync_message(now_ns))
+            self._send(mavlink_out.timesync_message(now_ns))
         for request in self._requests.due(self.telemetry, now_ns):
             self._send(request)
 
