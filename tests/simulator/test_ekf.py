@@ -21,6 +21,7 @@ from scenematch.simulator.ekf import (
     TURN,
     VELOCITY,
     FilterState,
+    History,
     correct,
     fix_chi_square,
     fuse_fix,
@@ -29,7 +30,6 @@ from scenematch.simulator.ekf import (
     initial_state,
     predict,
 )
-from scenematch.simulator.history import History
 from scenematch.simulator.quadrotor import STEP_S, Airframe, IdealImu, Wind, WindField, advance, hovering, shaken
 from scenematch.simulator.rotations import rotation, rotation_vector
 from scenematch.simulator.sensors import Instruments, SensorSuite
