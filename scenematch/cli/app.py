@@ -20,7 +20,7 @@ from scenematch.cli.argument_names import (
     typed_name,
     urls_as_typed,
 )
-from scenematch.cli.commands import bridge, check, compare, demo, doctor, evaluate, export, locate, simulate, track
+from scenematch.cli.commands import bridge, doctor, flight, locate, simulate
 from scenematch.cli.commands import map as map_commands
 
 app = typer.Typer(
@@ -35,8 +35,8 @@ bridge_app = typer.Typer(help="Send live fixes to an autopilot or to ROS.")
 
 # In the order of the help.
 _COMMANDS: tuple[tuple[typer.Typer, tuple[Callable[..., None], ...]], ...] = (
-    (app, (demo.demo, check.check, track.track, compare.compare, locate.locate)),
-    (app, (simulate.simulate, evaluate.evaluate, export.export, doctor.doctor)),
+    (app, (simulate.demo, flight.check, flight.track, flight.compare, locate.locate)),
+    (app, (simulate.simulate, flight.evaluate, flight.export, doctor.doctor)),
     (map_app, (map_commands.info, map_commands.audit, map_commands.fetch)),
     (bridge_app, (bridge.mavlink, bridge.ros)),
 )
