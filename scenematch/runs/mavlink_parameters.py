@@ -55,17 +55,12 @@ def write_parameter_file(
     """
     require("pymavlink", "mavlink")
     out, settings = Path(out), settings or ParameterSettings()
-    written = _delay(settings.delay_ms)
-    text = parameter_file(link, settings.takeoff, written.delay_ms)
+    delay_ms, source = settings.delay_ms, "given"
+    if delay_ms is None:
+        delay_ms, source = measured_delay_ms(), "measured by the last bridge"
+        if not delay_ms:
+            delay_ms, source = _DEFAULT_DELAY_MS, "assumed; not measured yet"
+    text = parameter_file(link, settings.takeoff, delay_ms)
     check_file(out, force)
     out.write_text(text, encoding="utf-8")
-    return written
-
-
-def _delay(given_ms: int | None) -> WrittenParameters:
-    if given_ms is not None:
-        return WrittenParameters(given_ms, "given")
-    measured_ms = measured_delay_ms()
-    if measured_ms:
-        return WrittenParameters(measured_ms, "measured by the last bridge")
-    return WrittenParameters(_DEFAULT_DELAY_MS, "assumed; not measured yet")
+    return WrittenParameters(delay_ms, source)
