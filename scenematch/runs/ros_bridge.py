@@ -15,9 +15,8 @@ from scenematch.bridges.vehicle import NedOrigin
 from scenematch.files.ros.messages import camera_from_message, image_from_message
 from scenematch.runs.arguments import parse_position
 from scenematch.runs.cameras import CameraInput
-from scenematch.runs.checks import check_position
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
-from scenematch.runs.map_input import MapInput
+from scenematch.runs.map_input import MapInput, check_position
 from scenematch.runs.mavlink_bridge import BridgeSettings
 from scenematch.runs.progress import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
