@@ -27,7 +27,6 @@ from engine.navigation.navigator import Matcher, Navigator
 from engine.navigation.state import NavigatorState
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
 from scenematch.simulator import ekf
-from scenematch.simulator.ekf import FilterState
 from scenematch.simulator.faults import Fault, ShiftedMap
 from scenematch.simulator.light import Image
 from scenematch.simulator.pilot import Gains, Pilot, Route, Setpoint
@@ -118,7 +117,7 @@ class LoopSample:
 
     time_s: float
     truth: State
-    estimate: FilterState
+    estimate: ekf.FilterState
     plan_m: Array
     mode: Mode
     healthy: bool
@@ -240,7 +239,7 @@ class ClosedLoop:
         self._mode = Mode.FOLLOW
         self.flown = LoopResult([], [], [], self._history.now.position_m)
 
-    def _initial_estimate(self, rng: np.random.Generator) -> FilterState:
+    def _initial_estimate(self, rng: np.random.Generator) -> ekf.FilterState:
         """The state at rest, with errors drawn from the filter's own covariance."""
         sigma, white = self.options.start_sigma_m, rng.standard_normal(5)
         heading = self._instruments.heading_deg(self._state)
