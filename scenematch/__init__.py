@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         run_mavlink_bridge,
     )
     from scenematch.runs.mavlink_parameters import write_parameter_file
-    from scenematch.runs.progress import Progress
+    from scenematch.runs.output import Progress
     from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
     from scenematch.runs.settings import TrackSettings, load_settings
     from scenematch.runs.simulation import WorldSettings, simulate
@@ -97,7 +97,7 @@ _NAMES = {
     "scenematch.runs.bridge_files": "BridgeFiles",
     "scenematch.runs.mavlink_bridge": "BridgeSettings MavlinkSettings run_mavlink_bridge",
     "scenematch.runs.mavlink_parameters": "write_parameter_file",
-    "scenematch.runs.progress": "Progress",
+    "scenematch.runs.output": "Progress",
     "scenematch.runs.ros_bridge": "RosSettings run_ros_bridge",
     "scenematch.runs.settings": "TrackSettings load_settings",
     "scenematch.runs.simulation": "WorldSettings simulate",

@@ -19,7 +19,7 @@ from scenematch.bridges.links import parse_connection
 from scenematch.bridges.pictures import CapturedImage, capture
 from scenematch.runs.cameras import CameraInput
 from scenematch.runs.mavlink_bridge import MavlinkSettings
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress
 
 if TYPE_CHECKING:
     from scenematch.bridges.mavlink_in import MavlinkTelemetry

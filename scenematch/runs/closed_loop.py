@@ -20,10 +20,9 @@ from scenematch.files.track import track_row, write_track
 from scenematch.report.loop_record import summarise_loop, write_loop_csv
 from scenematch.runs.arguments import check_between, check_choice
 from scenematch.runs.evaluation import evaluate
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.inputs import FOLDER_LAYOUT
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.record import RunRecord
 from scenematch.runs.results import LOOP, NOTES, SUMMARY, TRACK
 from scenematch.runs.simulation import FOLDER_OWNED, LOOP_OWNED, WorldSettings, picture_name, write_folder

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from scenematch.runs.comparison import TABLE, compare, parse_runs
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder
 from scenematch.runs.simulation import write_flight
 from scenematch.simulator import plan_flight
 

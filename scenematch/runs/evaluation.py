@@ -17,10 +17,9 @@ from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.page_frames import shows_frames
 from scenematch.report.runs_page import MAX_RUNS, write_runs_page
 from scenematch.runs.cameras import CameraInput
-from scenematch.runs.folders import StrPath, check_file
 from scenematch.runs.inputs import FlightFiles, open_run_truth
 from scenematch.runs.map_input import MapInput
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath, check_file
 from scenematch.runs.record import RunRecord, read_record
 from scenematch.runs.results import PAGE, SUMMARY, TRACK, ReportFrames, figures_of, write_results
 from scenematch.runs.settings import TrackSettings

@@ -22,9 +22,8 @@ from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
 from scenematch.runs.arguments import check_every, parse_position
 from scenematch.runs.cameras import CameraInput, check_size
-from scenematch.runs.folders import StrPath
 from scenematch.runs.map_input import MapInput, check_position
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath
 from scenematch.runs.renaming import renamed_in_errors
 from scenematch.runs.settings import TrackSettings
 

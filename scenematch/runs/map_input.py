@@ -10,8 +10,7 @@ from engine.errors import MapError, OptionError, TelemetryError
 from engine.orthomap import OrthoMap
 from engine.values import MAX_SIGMA_M, Prior
 from scenematch.runs.arguments import check_above, is_in_degrees, parse_bounds
-from scenematch.runs.folders import StrPath
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath
 from scenematch.runs.renaming import renamed_in_errors
 
 

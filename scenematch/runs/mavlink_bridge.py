@@ -29,7 +29,7 @@ from scenematch.runs.bridge_files import BridgeFiles
 from scenematch.runs.last_fix import LastFix, last_fix_file, remember_delay
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from scenematch.runs.map_input import check_position
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
 from scenematch.runs.supervisor import become_worker, check_supervision, end_on_sigterm
 

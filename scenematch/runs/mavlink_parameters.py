@@ -7,8 +7,8 @@ from pathlib import Path
 
 from engine.errors import require
 from scenematch.bridges.parameters import MavlinkOptions, parameter_file
-from scenematch.runs.folders import StrPath, check_file
 from scenematch.runs.last_fix import measured_delay_ms
+from scenematch.runs.output import StrPath, check_file
 
 _DEFAULT_DELAY_MS = 100
 

@@ -18,7 +18,7 @@ from scenematch.runs.cameras import CameraInput
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from scenematch.runs.map_input import MapInput, check_position
 from scenematch.runs.mavlink_bridge import BridgeSettings
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
 from scenematch.runs.supervisor import end_on_sigterm
 

@@ -21,7 +21,7 @@ from scenematch.files.settings import (
 )
 from scenematch.files.telemetry import COLUMNS
 from scenematch.runs.arguments import check_choice, check_device, parse_budget, parse_position
-from scenematch.runs.folders import StrPath
+from scenematch.runs.output import StrPath
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

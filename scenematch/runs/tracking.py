@@ -22,10 +22,9 @@ from scenematch.files.track import TrackRow, TrackWriter, read_track, track_row
 from scenematch.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
 from scenematch.runs.arguments import parse_budget, parse_position
 from scenematch.runs.checking import as_rows, diagnose_flight
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder
 from scenematch.runs.inputs import FlightFiles, FlightInputs, open_inputs
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder
 from scenematch.runs.record import PATHS, RunRecord
 from scenematch.runs.results import NOTES, OWNED, TRACK, ReportFrames, write_results
 from scenematch.runs.settings import TrackSettings
