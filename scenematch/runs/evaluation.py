@@ -81,8 +81,8 @@ def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> R
         recorded = [row.timestamp_ns for row in rows if row.timestamp_ns is not None]
         if (stamps, flight.names) != (recorded, [row.frame for row in rows]):
             return ReportFrames(why_missing="the frames or their telemetry have changed since the run.")
-        camera, options = files.load_camera(flight), settings.matcher_options()
-        return ReportFrames(flight, SceneMatcher(site, camera, settings.method, settings.device, options))
+        camera = files.load_camera(flight)
+        return ReportFrames(flight, SceneMatcher(site, camera, settings.method, settings.device, settings))
     except (EngineError, OSError) as error:
         return ReportFrames(why_missing=f"{error}.")
 

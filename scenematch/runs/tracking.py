@@ -75,7 +75,7 @@ def track(
     start, budget = parse_position("start", settings.start), parse_budget("budget_ms", settings.budget_ms)
     inputs = inputs or open_inputs(files, [settings], progress=progress)
     site, flight = inputs.site, inputs.flight
-    matcher = SceneMatcher(site, inputs.camera, settings.method, settings.device, settings.matcher_options())
+    matcher = SceneMatcher(site, inputs.camera, settings.method, settings.device, settings)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
     prepare_folder(out, force, OWNED)

@@ -73,9 +73,8 @@ class OptionalMapOptions:
 def _bridge_settings(matching: options.MatchingOptions, settings: Settings) -> BridgeSettings:
     """How a bridge matches frames: the options combined with the settings."""
     how = matching.track_settings(settings)
-    matcher = how.matcher_options()
     same = {name: getattr(how, name) for name in ("method", "device", "start", "navigator")}
-    made: BridgeSettings = table(settings, "bridge", **same, matcher=matcher)
+    made: BridgeSettings = table(settings, "bridge", **same, matcher=how)
     return made
 
 

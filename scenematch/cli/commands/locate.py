@@ -56,7 +56,7 @@ def locate(
         start=how.start,
         method=how.method,
         device=how.device,
-        options=how.matcher_options(),
+        options=how,
         progress=console.PROGRESS,
     )
     facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)
