@@ -31,7 +31,7 @@ from scenematch.bridges.mavlink_in import HANDLED_MESSAGES, MAV_AUTOPILOTS, Mavl
 from scenematch.bridges.mavlink_requests import AutopilotRequests
 from scenematch.bridges.mavlink_status import MavlinkCounters, MavlinkStatus
 from scenematch.bridges.notices import INFO, Notice, PilotNotices
-from scenematch.bridges.packets import BRIDGE_COMPONENT, PacketDecoder, PacketEncoder
+from scenematch.bridges.packets import PacketDecoder, PacketEncoder
 from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
@@ -67,14 +67,10 @@ class MavlinkBridge:
         navigator: options of the navigators, by which it is also decided what contradicts the track.
         origin: NED origin to set on an autopilot that reports none; None sets none, so local positions are not
             sent.
-        use_velocity: whether to use the autopilot's velocity for dead reckoning between fixes.
         site: the map; None checks the first fixes against neither the start nor a receiver.
-        check_gnss: whether to check the first fixes against the autopilot's GNSS receiver, if it has a fix.
         resumed: whether ``start`` is the last fix sent to this autopilot, by an earlier bridge: the next one must
             agree with it, and does not wait for the autopilot's report on its receiver.
         gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None for a fixed camera.
-        system_id: MAVLink system id of the vehicle; messages of other systems are ignored.
-        component_id: component id of the bridge on the vehicle.
         key: 32-byte key of MAVLink signing; None sends and accepts unsigned packets.
         watch: called with every answer; must return quickly.
         on_sent: called with every fix that was sent; must return quickly.
@@ -93,28 +89,23 @@ class MavlinkBridge:
         *,
         navigator: NavigatorOptions | None = None,
         origin: NedOrigin | None = None,
-        use_velocity: bool = True,
         site: OrthoMap | None = None,
-        check_gnss: bool = True,
         resumed: bool = False,
         gimbal_mount: NDArray[np.float64] | None = None,
-        system_id: int = 1,
-        component_id: int = BRIDGE_COMPONENT,
         key: bytes | None = None,
         watch: Callable[[Answer], None] | None = None,
         on_sent: Callable[[Fix], None] | None = None,
     ) -> None:
-        self.telemetry = MavlinkTelemetry(gimbal_mount, component_id)
-        self._requests = AutopilotRequests(system_id, options, origin, with_gimbal=gimbal_mount is not None)
+        self.telemetry = MavlinkTelemetry(gimbal_mount, options.component_id)
+        self._requests = AutopilotRequests(options, origin, with_gimbal=gimbal_mount is not None)
         self._watch, self._on_sent = watch, on_sent
         self._connection, self._options, self._origin = connection, options, origin
-        self._make_navigator, self._use_velocity = make_navigator, use_velocity
-        self._system_id, self._component_id, self._key = system_id, component_id, key
-        self._checked_on, self._resumed = site if check_gnss else None, resumed
+        self._make_navigator, self._key = make_navigator, key
+        self._checked_on, self._resumed = site if options.check_gnss else None, resumed
         begin = None if start is None or site is None else position_of(start, site)
         self._guard = TrackGuard(begin, navigator)
         self._notices = PilotNotices()
-        self._encoder = PacketEncoder(system_id, key, component_id)
+        self._encoder = PacketEncoder(options.system_id, key, options.component_id)
         self._sending = threading.Lock()
         self._navigator: Navigator | None = None
         self._resets_before = 0  # of navigators that have been replaced
@@ -165,7 +156,7 @@ class MavlinkBridge:
         Raises:
             StateError: the bridge has been closed.
         """
-        vehicle = self.telemetry.vehicle(captured_ns, own_velocity=self._use_velocity)
+        vehicle = self.telemetry.vehicle(captured_ns, own_velocity=self._options.use_velocity)
         frame = vehicle.frame(image, captured_ns)
         self._live.submit(frame, captured_ns=captured_ns)
 
@@ -311,7 +302,8 @@ class MavlinkBridge:
 
     def _obey(self, message: Any) -> None:
         """Handle an operator's command to trust the fixes that contradict the track."""
-        if (message.target_system, message.target_component) != (self._system_id, self._component_id):
+        own = self._options
+        if (message.target_system, message.target_component) != (own.system_id, own.component_id):
             return
         accepted = message.command == CONFIRM_COMMAND
         if accepted:
@@ -361,7 +353,7 @@ class MavlinkBridge:
 
     def _new_decoder(self, link: Link) -> PacketDecoder:
         numbers = HANDLED_MESSAGES | {mavlink.MAVLINK_MSG_ID_COMMAND_LONG}
-        return PacketDecoder(self._system_id, numbers, is_stream=link.is_stream, key=self._key)
+        return PacketDecoder(self._options.system_id, numbers, is_stream=link.is_stream, key=self._key)
 
     def _drop_link(self) -> None:
         with self._sending:

@@ -21,16 +21,13 @@ class AutopilotRequests:
     """Schedules the requests to one autopilot.
 
     Args:
-        system_id: MAVLink system id of the vehicle.
-        options: which message to send to which firmware.
+        options: which message to send to which autopilot.
         origin: NED origin to set on an autopilot that reports none; None sets none.
         with_gimbal: whether to request its gimbal's attitude too.
     """
 
-    def __init__(
-        self, system_id: int, options: MavlinkOptions, origin: NedOrigin | None, *, with_gimbal: bool
-    ) -> None:
-        self._system_id, self._options, self._origin = system_id, options, origin
+    def __init__(self, options: MavlinkOptions, origin: NedOrigin | None, *, with_gimbal: bool) -> None:
+        self._system_id, self._options, self._origin = options.system_id, options, origin
         self._rates_hz = REQUESTED_RATES_HZ[options.firmware]
         if with_gimbal:
             self._rates_hz = self._rates_hz | GIMBAL_RATES_HZ[options.firmware]

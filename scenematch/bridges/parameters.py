@@ -24,25 +24,35 @@ Parameter = tuple[str, float, str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MavlinkOptions:
-    """Which MAVLink message carries the fixes, and which fixes are withheld.
+    """The autopilot, which MAVLink message carries the fixes to it, and which fixes are withheld.
 
     Attributes:
+        system_id: system id of the vehicle; others are ignored.
+        component_id: component id of the bridge on the vehicle.
         firmware: ardupilot or px4.
         message: one of the firmware's :data:`MESSAGES`; empty for its default.
         max_sigma_m: upper bound of a fix's sigma; ArduPilot would clamp a larger one and trust the fix too much.
+        use_velocity: use the autopilot's velocity for dead reckoning between fixes.
+        check_gnss: check the first fixes against the autopilot's GNSS receiver, if it has a fix.
         gps_id: number of the receiver that GPS_INPUT emulates; 0 is the autopilot's first, 1 its second.
 
     Raises:
         OptionError: a name is unknown, or a number is out of range.
     """
 
+    system_id: int = 1
+    component_id: int = 197
     firmware: str = "ardupilot"
     message: str = ""
     max_sigma_m: float = 10.0
+    use_velocity: bool = True
+    check_gnss: bool = True
     gps_id: int = 0
 
     def __post_init__(self) -> None:
         check_positive(self, "max_sigma_m")
+        if not 2 <= self.component_id <= 255:
+            raise OptionError(f"component_id: expected 2 to 255 (1 is the autopilot), got {self.component_id}")
         if self.firmware not in MESSAGES:
             raise OptionError(f"firmware: expected one of {', '.join(MESSAGES)}, got {self.firmware!r}")
         if self.message and self.message not in MESSAGES[self.firmware]:

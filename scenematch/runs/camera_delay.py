@@ -71,7 +71,7 @@ def measure_camera_delay(
     connection = parse_connection(link.connect, listen_anywhere=link.listen_anywhere)
     try:
         idle: Any = _Idle()
-        bridge = MavlinkBridge(connection, lambda _: idle, link, system_id=link.system_id, key=secret)
+        bridge = MavlinkBridge(connection, lambda _: idle, link, key=secret)
     except OSError as error:
         raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
     progress.message(f"tilt the vehicle to and fro by some 10 degrees for {seconds:g} s, over textured ground")

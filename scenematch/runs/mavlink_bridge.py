@@ -62,26 +62,20 @@ class MavlinkSettings(MavlinkOptions):
 
     Raises:
         OptionError: see :class:`scenematch.bridges.parameters.MavlinkOptions`; or the height of the origin is
-            impossible or given without ``set_origin``, or the component id is invalid or the autopilot's.
+            impossible or given without ``set_origin``.
     """
 
     connect: str
     listen_anywhere: bool = False
-    system_id: int = 1
-    component_id: int = 197
     key: str | None = None
     set_origin: bool = True
     origin_alt_m: float | None = None
-    use_velocity: bool = True
-    check_gnss: bool = True
 
     def __post_init__(self) -> None:
         MavlinkOptions.__post_init__(self)  # super() would be the class before its slots
         if not self.set_origin:
             check_unused({"origin_alt_m": self.origin_alt_m}, "set_origin")
         check_between("origin_alt_m", self.origin_alt_m, -_MAX_ALT_M, _MAX_ALT_M)
-        if not 2 <= self.component_id <= 255:
-            raise OptionError(f"component_id: expected 2 to 255 (1 is the autopilot), got {self.component_id}")
 
     def origin(self, site: OrthoMap, start: Prior | None) -> NedOrigin | None:
         """The start of the flight, or the map's centre; None if no origin should be set.
@@ -221,9 +215,8 @@ def run_mavlink_bridge(
         try:
             bridge = MavlinkBridge(
                 connection, make_navigator, link, start, settings.live_options(MAX_DELAY_MS),
-                navigator=settings.navigator, origin=link.origin(site, start), use_velocity=link.use_velocity,
-                site=site, check_gnss=link.check_gnss, resumed=resumed is not None, system_id=link.system_id,
-                component_id=link.component_id, key=key, watch=watcher, on_sent=last_fix.keep,
+                navigator=settings.navigator, origin=link.origin(site, start), site=site,
+                resumed=resumed is not None, key=key, watch=watcher, on_sent=last_fix.keep,
                 gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip
         except OSError as error:

@@ -955,7 +955,7 @@ def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(loop, m
 )
 def test_an_origin_is_set_when_no_receiver_will_set_a_better_one(begin_s, armed, receiver, expected_s):
     """By a clock of the test's own, asked every 0.1 s: how long after the vehicle is first heard."""
-    requests, telemetry = AutopilotRequests(1, MavlinkOptions(), ORIGIN, with_gimbal=False), MavlinkTelemetry()
+    requests, telemetry = AutopilotRequests(MavlinkOptions(), ORIGIN, with_gimbal=False), MavlinkTelemetry()
     now_ns = 10**15
     requests.restart(now_ns)
     telemetry.update(mavlink.MAVLink_gps_raw_int_message(0, receiver, 0, 0, 0, 0, 0, 0, 0, 0), now_ns)
@@ -969,7 +969,7 @@ def test_an_origin_is_set_when_no_receiver_will_set_a_better_one(begin_s, armed,
 
 
 def test_an_origin_that_is_lost_is_set_again_only_after_the_wait():
-    requests = AutopilotRequests(1, MavlinkOptions(), ORIGIN, with_gimbal=False)
+    requests = AutopilotRequests(MavlinkOptions(), ORIGIN, with_gimbal=False)
     requests.restart(0)
     for second in range(60):
         known = ORIGIN if second < 40 else None
@@ -1068,7 +1068,7 @@ def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(loop
 
 
 def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(loop):
-    made, pilot = loop(component_id=194, use_velocity=False)
+    made, pilot = loop(MavlinkOptions(component_id=194, use_velocity=False))
     camera, station = autopilot(component=197), autopilot(system=255, component=190)
     for number in (197, 194):
         word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
@@ -1089,7 +1089,7 @@ def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(loo
 
 @pytest.mark.parametrize(("use_velocity", "expected"), [(True, 0.0), (False, None)])
 def test_the_autopilots_velocity_is_used_if_the_bridge_is_told_so(loop, use_velocity, expected):
-    made, _ = loop(use_velocity=use_velocity, pilot={})
+    made, _ = loop(MavlinkOptions(use_velocity=use_velocity), pilot={})
     frames = made.navigator.frames
     fly(made.bridge, lambda: len(frames) > 10 and frames[-1].heading_deg is not None)
     assert (frames[-1].east_velocity_mps, frames[-1].north_velocity_mps) == (expected, expected)
