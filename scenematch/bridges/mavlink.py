@@ -20,7 +20,6 @@ from engine.navigation.live import Answer, Live, LiveOptions
 from engine.navigation.motion import position_of
 from engine.navigation.navigator import Navigator
 from engine.navigation.track_guard import TrackGuard
-from engine.options import NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.realtime import start_thread
 from engine.values import Fix, Prior
@@ -64,7 +63,6 @@ class MavlinkBridge:
         options: which message to send, and which fixes to withhold.
         start: prior position at the start of the flight.
         live: deadlines of the frames.
-        navigator: options of the navigators, by which it is also decided what contradicts the track.
         origin: NED origin to set on an autopilot that reports none; None sets none, so local positions are not
             sent.
         site: the map; None checks the first fixes against neither the start nor a receiver.
@@ -87,7 +85,6 @@ class MavlinkBridge:
         start: Prior | None = None,
         live: LiveOptions | None = None,
         *,
-        navigator: NavigatorOptions | None = None,
         origin: NedOrigin | None = None,
         site: OrthoMap | None = None,
         resumed: bool = False,
@@ -102,8 +99,7 @@ class MavlinkBridge:
         self._connection, self._options, self._origin = connection, options, origin
         self._make_navigator, self._key = make_navigator, key
         self._checked_on, self._resumed = site if options.check_gnss else None, resumed
-        begin = None if start is None or site is None else position_of(start, site)
-        self._guard = TrackGuard(begin, navigator)
+        self._begin = None if start is None or site is None else position_of(start, site)
         self._notices = PilotNotices()
         self._encoder = PacketEncoder(options.system_id, key, options.component_id)
         self._sending = threading.Lock()
@@ -238,9 +234,14 @@ class MavlinkBridge:
             self._send(mavlink_out.notice_message(severity, text))
 
     def _new_navigator(self, start: Prior | None) -> Navigator:
-        """Create a navigator; replacing one counts as a reset because the new one acquires the position again."""
+        """Create a navigator, and with the first its guard.
+
+        Replacing one counts as a reset because the new one acquires the position again.
+        """
         navigator = self._make_navigator(start)
-        if self._navigator is not None:
+        if self._navigator is None:
+            self._guard = TrackGuard(self._begin, navigator.options)
+        else:
             self._resets_before += self._navigator.reset_count + 1
         self._navigator = navigator
         return navigator

@@ -14,6 +14,7 @@ import numpy as np
 
 from engine.errors import BackendError, OptionError, TelemetryError, require
 from engine.navigation.lag import Lag, camera_lag, turn_between
+from engine.options import NavigatorOptions
 from engine.values import Frame, NoFix, Reason
 from scenematch.bridges.links import parse_connection
 from scenematch.bridges.pictures import CapturedImage, capture
@@ -30,6 +31,8 @@ _SETTLED_NS = 200_000_000  # after which no older attitude arrives
 
 class _Idle:
     """A navigator that does nothing: the bridge is opened only for its telemetry."""
+
+    options = NavigatorOptions()
 
     def update(self, frame: Frame, prior: object = None, budget: object = None) -> NoFix:
         return NoFix(reason=Reason.NO_TEXTURE, timestamp_ns=frame.timestamp_ns)

@@ -154,8 +154,7 @@ class BridgeSettings:
     def live_options(self, deadline_ms: float = 121.0) -> LiveOptions:
         """The deadlines of the frames, or the default ones."""
         deadline_ms = deadline_ms if self.deadline_ms is None else self.deadline_ms
-        speed_mps = self.navigator.max_speed_mps
-        return LiveOptions(deadline_ms=deadline_ms, max_speed_mps=speed_mps, realtime=self.scheduling())
+        return LiveOptions(deadline_ms=deadline_ms, realtime=self.scheduling())
 
 
 def run_mavlink_bridge(
@@ -215,9 +214,8 @@ def run_mavlink_bridge(
         try:
             bridge = MavlinkBridge(
                 connection, make_navigator, link, start, settings.live_options(MAX_DELAY_MS),
-                navigator=settings.navigator, origin=link.origin(site, start), site=site,
-                resumed=resumed is not None, key=key, watch=watcher, on_sent=last_fix.keep,
-                gimbal_mount=camera.mount if files.gimbal else None,
+                origin=link.origin(site, start), site=site, resumed=resumed is not None, key=key,
+                watch=watcher, on_sent=last_fix.keep, gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None

@@ -812,6 +812,8 @@ class Standin:
 class Matched:
     """A navigator whose every frame is a fix; it re-localises when asked to."""
 
+    options = NavigatorOptions()
+
     def __init__(self):
         self.reset_count, self.frames, self.result = 0, [], None
 
@@ -1120,8 +1122,9 @@ def test_only_a_first_fix_waits_for_the_autopilots_word_on_its_receiver(loop, re
         assert not pilot.of("VISION_POSITION_ESTIMATE")
 
 
-def test_the_navigators_options_decide_what_contradicts_the_track(loop):
-    made, pilot = loop(navigator=NavigatorOptions(gate=1e9))
+def test_the_navigators_options_decide_what_contradicts_the_track(loop, monkeypatch):
+    monkeypatch.setattr(Matched, "options", NavigatorOptions(gate=1e9))
+    made, pilot = loop()
     fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
     made.navigator.result = fix(east_m=40.0)
     fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE")[-1][0].y > 30.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import scenematch.runs
-from engine import NavigatorOptions, OptionError, TelemetryError
+from engine import OptionError, TelemetryError
 from engine.errors import BackendError, MissingExtraError
 from scenematch import (
     BridgeFiles,
@@ -165,11 +165,6 @@ def test_the_library_imports_nothing_optional_and_no_command_line():
     )
     done = subprocess.run([sys.executable, "-c", script + loaded], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
-
-
-def test_a_bridge_resumes_at_the_speed_of_its_navigator():
-    settings = BridgeSettings(navigator=NavigatorOptions(max_speed_mps=40.0))
-    assert settings.live_options().max_speed_mps == 40.0
 
 
 # ------------------------------------------------------------------------------------- extras that are missing
