@@ -164,12 +164,12 @@ def draw_together(page: Path, runs: dict[str, Path], *, progress: Progress = SIL
         if records[other].map != records[first].map:
             progress.message(f"{other} used another map, {records[other].map}; it is drawn on that of {first}")
     site = open_recorded_map(records[first], progress)
-    write_runs_page(page, {name: _finished(folder, site) for name, folder in runs.items()})
+    write_runs_page(page, {name: _finished(folder, site, records[name]) for name, folder in runs.items()})
 
 
-def _finished(folder: Path, site: OrthoMap) -> FinishedTrack:
+def _finished(folder: Path, site: OrthoMap, record: RunRecord) -> FinishedTrack:
     """A finished run on a map, with its figures recomputed."""
-    rows, record = read_track(folder / TRACK), read_record(folder / SUMMARY)
+    rows = read_track(folder / TRACK)
     truth = open_run_truth(record.truth, rows)
     summary = figures_of(rows, truth, site, record.ground) | {"settings": record.facts()}
     return FinishedTrack(rows, truth, site, record.ground, summary, None)
