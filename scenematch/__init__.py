@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
     from scenematch.runs.comparison import compare, parse_runs
     from scenematch.runs.demo import run_demo
-    from scenematch.runs.evaluation import evaluate
+    from scenematch.runs.evaluation import evaluate, report
     from scenematch.runs.inputs import FlightFiles
     from scenematch.runs.live_viewing import LiveViewTarget
     from scenematch.runs.map_audit import AuditFiles, MapAudit, audit_map
@@ -35,8 +35,7 @@ if TYPE_CHECKING:
         run_mavlink_bridge,
     )
     from scenematch.runs.mavlink_parameters import write_parameter_file
-    from scenematch.runs.progress import Progress
-    from scenematch.runs.reporting import report
+    from scenematch.runs.output import Progress
     from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
     from scenematch.runs.settings import TrackSettings, load_settings
     from scenematch.runs.simulation import WorldSettings, simulate
@@ -89,7 +88,7 @@ _NAMES = {
     "scenematch.runs.closed_loop": "ClosedLoopSettings fly_closed_loop",
     "scenematch.runs.comparison": "compare parse_runs",
     "scenematch.runs.demo": "run_demo",
-    "scenematch.runs.evaluation": "evaluate",
+    "scenematch.runs.evaluation": "evaluate report",
     "scenematch.runs.inputs": "FlightFiles",
     "scenematch.runs.live_viewing": "LiveViewTarget",
     "scenematch.runs.map_audit": "AuditFiles MapAudit audit_map",
@@ -98,8 +97,7 @@ _NAMES = {
     "scenematch.runs.bridge_files": "BridgeFiles",
     "scenematch.runs.mavlink_bridge": "BridgeSettings MavlinkSettings run_mavlink_bridge",
     "scenematch.runs.mavlink_parameters": "write_parameter_file",
-    "scenematch.runs.progress": "Progress",
-    "scenematch.runs.reporting": "report",
+    "scenematch.runs.output": "Progress",
     "scenematch.runs.ros_bridge": "RosSettings run_ros_bridge",
     "scenematch.runs.settings": "TrackSettings load_settings",
     "scenematch.runs.simulation": "WorldSettings simulate",

@@ -114,7 +114,7 @@ def _middles(inputs: FlightInputs, settings: TrackSettings) -> list[TrackRow]:
 
     A fix with a pose is the vehicle's position, and the file of a track does not hold the pose's attitude.
     """
-    matcher = SceneMatcher(inputs.site, inputs.camera, settings.method, "cpu", settings.matcher_options())
+    matcher = SceneMatcher(inputs.site, inputs.camera, settings.method, "cpu", settings)
     matcher.warmup()
     options = ACCEPT_ALL if settings.profile == "paper" else settings.navigator
     navigator = Navigator(matcher, parse_position("start", settings.start), None, options)

@@ -19,11 +19,12 @@ from bench.live.bridge_counts import RATE_NS, SAMPLE, Growth, Received, free_por
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
 from bench.pages.text import paragraph, rewrite, table
 from engine.geo import LocalFrame
+from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
 from scenematch.bridges.links import Connection
 from scenematch.bridges.mavlink import MavlinkBridge
-from scenematch.bridges.mavlink_out import MavlinkOptions
 from scenematch.bridges.mavlink_status import MIN_RATE_HZ
+from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
 PAGE = RESULTS / "mavlink.md"
@@ -83,6 +84,7 @@ class Script:
 class Scripted:
     """A navigator that knows the truth, or refuses as its script says; and holds the frame against the truth."""
 
+    options = NavigatorOptions()
     reset_count = 0
     heading_off_deg = height_off_m = 0.0  # of all that the script makes, one after the other
 

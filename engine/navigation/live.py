@@ -36,17 +36,15 @@ class LiveOptions:
         deadline_ms: age since capture by which a frame is answered.
         patience_ms: time beyond the deadline after which a worker counts as hanging and is replaced. A worker that
             creates its navigator has this long from its start, doubled after each that hung while creating one.
-        max_speed_mps: of the vehicle; the position uncertainty of a new worker's start grows at this speed.
         realtime: how to schedule the worker and the watchdog; None leaves scheduling unchanged.
     """
 
     deadline_ms: float = 121.0
     patience_ms: float = 1000.0
-    max_speed_mps: float = 15.0
     realtime: Realtime | None = None
 
     def __post_init__(self) -> None:
-        check_positive(self, "deadline_ms", "patience_ms", "max_speed_mps")
+        check_positive(self, "deadline_ms", "patience_ms")
         for name in ("deadline_ms", "patience_ms"):
             if getattr(self, name) > _MAX_MS:
                 raise OptionError(f"{name}: expected at most {_MAX_MS:g}, got {getattr(self, name):g}")
@@ -119,7 +117,7 @@ class Live:
         self._make_navigator, self._deliver = make_navigator, deliver
         self._options, self._clock_ns = options or LiveOptions(), clock_ns or time.monotonic_ns
         self._machine_ns = machine_ns or time.monotonic_ns
-        self._last: tuple[Fix, int] | None = None
+        self._last: tuple[Fix, int, Navigator] | None = None  # its capture, and whose it is
         self._changed = threading.Condition()
         self._delivering = threading.Lock()
         self._waiting: _Job | None = None
@@ -210,7 +208,7 @@ class Live:
                 self._working = None
                 self._changed.notify_all()
                 if isinstance(result, Fix):
-                    self._last = (result, job.captured_ns)
+                    self._last = (result, job.captured_ns, navigator)
             self._answer(job, result)
             if not alive:
                 self._replace(number)
@@ -318,8 +316,8 @@ class Live:
             last = self._last
         if last is None:
             return None
-        fix, captured_ns = last
-        moved_m = self._options.max_speed_mps * max(self._clock_ns() - captured_ns, 0) * 1e-9
+        fix, captured_ns, navigator = last
+        moved_m = navigator.options.max_speed_mps * max(self._clock_ns() - captured_ns, 0) * 1e-9
         return Prior(east_m=fix.east_m, north_m=fix.north_m, sigma_m=fix.sigma_m + moved_m)
 
     def _count(self, *names: str) -> None:

@@ -101,6 +101,11 @@ class Navigator:
         self._resets = 0
 
     @property
+    def options(self) -> NavigatorOptions:
+        """The settings."""
+        return self._options
+
+    @property
     def state(self) -> NavigatorState:
         """How well the position is known after the last frame."""
         if self._accepted is None:

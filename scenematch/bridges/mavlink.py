@@ -23,26 +23,15 @@ from engine.navigation.track_guard import TrackGuard
 from engine.orthomap import OrthoMap
 from engine.runtime.realtime import start_thread
 from engine.values import Fix, Prior
+from scenematch.bridges import mavlink_out
 from scenematch.bridges.fix_velocity import VelocityFromFixes
 from scenematch.bridges.links import Connection, Link, PeerAddress, parse_connection
 from scenematch.bridges.mavlink_in import HANDLED_MESSAGES, MAV_AUTOPILOTS, MavlinkTelemetry
-from scenematch.bridges.mavlink_out import (
-    FixReport,
-    MavlinkOptions,
-    acknowledgement_message,
-    fix_message,
-    heartbeat_message,
-    no_position_message,
-    notice_message,
-    receiver_message,
-    stamp_on_ground_ns,
-    timesync_message,
-    withhold_reason,
-)
 from scenematch.bridges.mavlink_requests import AutopilotRequests
 from scenematch.bridges.mavlink_status import MavlinkCounters, MavlinkStatus
 from scenematch.bridges.notices import INFO, Notice, PilotNotices
-from scenematch.bridges.packets import BRIDGE_COMPONENT, PacketDecoder, PacketEncoder
+from scenematch.bridges.packets import PacketDecoder, PacketEncoder
+from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
 __all__ = [
@@ -76,14 +65,10 @@ class MavlinkBridge:
         live: deadlines of the frames.
         origin: NED origin to set on an autopilot that reports none; None sets none, so local positions are not
             sent.
-        use_velocity: whether to use the autopilot's velocity for dead reckoning between fixes.
         site: the map; None checks the first fixes against neither the start nor a receiver.
-        check_gnss: whether to check the first fixes against the autopilot's GNSS receiver, if it has a fix.
         resumed: whether ``start`` is the last fix sent to this autopilot, by an earlier bridge: the next one must
             agree with it, and does not wait for the autopilot's report on its receiver.
         gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None for a fixed camera.
-        system_id: MAVLink system id of the vehicle; messages of other systems are ignored.
-        component_id: component id of the bridge on the vehicle.
         key: 32-byte key of MAVLink signing; None sends and accepts unsigned packets.
         watch: called with every answer; must return quickly.
         on_sent: called with every fix that was sent; must return quickly.
@@ -101,27 +86,22 @@ class MavlinkBridge:
         live: LiveOptions | None = None,
         *,
         origin: NedOrigin | None = None,
-        use_velocity: bool = True,
         site: OrthoMap | None = None,
-        check_gnss: bool = True,
         resumed: bool = False,
         gimbal_mount: NDArray[np.float64] | None = None,
-        system_id: int = 1,
-        component_id: int = BRIDGE_COMPONENT,
         key: bytes | None = None,
         watch: Callable[[Answer], None] | None = None,
         on_sent: Callable[[Fix], None] | None = None,
     ) -> None:
-        self.telemetry = MavlinkTelemetry(gimbal_mount, component_id)
-        self._requests = AutopilotRequests(system_id, options, origin, with_gimbal=gimbal_mount is not None)
+        self.telemetry = MavlinkTelemetry(gimbal_mount, options.component_id)
+        self._requests = AutopilotRequests(options, origin, with_gimbal=gimbal_mount is not None)
         self._watch, self._on_sent = watch, on_sent
         self._connection, self._options, self._origin = connection, options, origin
-        self._make_navigator, self._use_velocity = make_navigator, use_velocity
-        self._system_id, self._component_id, self._key = system_id, component_id, key
-        self._site, self._check_gnss, self._resumed = site, check_gnss, resumed
-        self._guard = TrackGuard(None if start is None or site is None else position_of(start, site))
+        self._make_navigator, self._key = make_navigator, key
+        self._checked_on, self._resumed = site if options.check_gnss else None, resumed
+        self._begin = None if start is None or site is None else position_of(start, site)
         self._notices = PilotNotices()
-        self._encoder = PacketEncoder(system_id, key, component_id)
+        self._encoder = PacketEncoder(options.system_id, key, options.component_id)
         self._sending = threading.Lock()
         self._navigator: Navigator | None = None
         self._resets_before = 0  # of navigators that have been replaced
@@ -172,7 +152,7 @@ class MavlinkBridge:
         Raises:
             StateError: the bridge has been closed.
         """
-        vehicle = self.telemetry.vehicle(captured_ns, own_velocity=self._use_velocity)
+        vehicle = self.telemetry.vehicle(captured_ns, own_velocity=self._options.use_velocity)
         frame = vehicle.frame(image, captured_ns)
         self._live.submit(frame, captured_ns=captured_ns)
 
@@ -198,11 +178,11 @@ class MavlinkBridge:
         """Send what ArduPilot requires before arming: a live camera, or a fix from every receiver."""
         now_ns, gnss, gps_id = time.monotonic_ns(), self.telemetry.gnss, self._options.gps_id
         if self._options.needs_origin:
-            self._send(no_position_message(now_ns))
+            self._send(mavlink_out.no_position_message(now_ns))
         elif gps_id and gnss is not None and now_ns - gnss.time_ns < _GNSS_STALE_NS:
-            stamp_ns = stamp_on_ground_ns(now_ns)
+            stamp_ns = mavlink_out.stamp_on_ground_ns(now_ns)
             times_ns = stamp_ns, self.telemetry.unix_ns(stamp_ns)
-            self._send(receiver_message(gnss, self.telemetry.vehicle(now_ns), gps_id, times_ns))
+            self._send(mavlink_out.receiver_message(gnss, self.telemetry.vehicle(now_ns), gps_id, times_ns))
 
     def _is_trusted(self, answer: Answer, now_s: float) -> bool:
         """Whether a fix continues the track sent to the autopilot or, before the first fix, its GNSS."""
@@ -212,14 +192,10 @@ class MavlinkBridge:
             self._guard.confirm()
             self._confirmed = False
         self._guard.advance(answer.frame, stamp_ns)
-        if (
-            self._site is not None
-            and self._check_gnss
-            and gnss is not None
-            and abs(stamp_ns - gnss.time_ns) < _GNSS_STALE_NS
-        ):
+        site = self._checked_on
+        if site is not None and gnss is not None and abs(stamp_ns - gnss.time_ns) < _GNSS_STALE_NS:
             prior = Prior(lat_deg=gnss.lat_deg, lon_deg=gnss.lon_deg, sigma_m=gnss.sigma_m)
-            self._guard.anchor(position_of(prior, self._site))
+            self._guard.anchor(position_of(prior, site))
         trusted = self._guard.trusts(answer.result)
         if self._guard.is_disputed:
             self._tell(self._notices.doubted(self._guard.distance_m, now_s))
@@ -228,14 +204,14 @@ class MavlinkBridge:
     def _send_fix(self, fix: Fix, captured_ns: int, *, trusted: bool) -> str | None:
         """Send a fix; returns the cause if it is withheld."""
         report = self._compose(fix, captured_ns)
-        cause = withhold_reason(report, self._options) if self.connected else "no autopilot"
+        cause = mavlink_out.withhold_reason(report, self._options) if self.connected else "no autopilot"
         if cause is None and self.telemetry.firmware != MAV_AUTOPILOTS[self._options.firmware]:
             cause = "other firmware"
         if cause is None and not trusted:
             cause = "contradicts the track"
         if cause is None and self._awaits_receiver():
             cause = "receiver not heard yet"
-        if cause is None and not self._send(fix_message(report, self._options)):
+        if cause is None and not self._send(mavlink_out.fix_message(report, self._options)):
             cause = "link down"
         if cause is not None:
             self._counters.withheld[cause] += 1
@@ -249,29 +225,34 @@ class MavlinkBridge:
     def _awaits_receiver(self) -> bool:
         """Whether the first fix must wait for the autopilot's report on its receiver, which is requested."""
         is_first = not (self._guard.has_fix or self._resumed)
-        checked = self._site is not None and self._check_gnss and is_first
+        checked = self._checked_on is not None and is_first
         recent = time.monotonic_ns() - self._connected_ns < _GNSS_STALE_NS
         return checked and recent and self.telemetry.has_receiver is None
 
     def _tell(self, notices: list[Notice]) -> None:
         for severity, text in notices:
-            self._send(notice_message(severity, text))
+            self._send(mavlink_out.notice_message(severity, text))
 
     def _new_navigator(self, start: Prior | None) -> Navigator:
-        """Create a navigator; replacing one counts as a reset because the new one acquires the position again."""
+        """Create a navigator, and with the first its guard.
+
+        Replacing one counts as a reset because the new one acquires the position again.
+        """
         navigator = self._make_navigator(start)
-        if self._navigator is not None:
+        if self._navigator is None:
+            self._guard = TrackGuard(self._begin, navigator.options)
+        else:
             self._resets_before += self._navigator.reset_count + 1
         self._navigator = navigator
         return navigator
 
-    def _compose(self, fix: Fix, captured_ns: int) -> FixReport:
+    def _compose(self, fix: Fix, captured_ns: int) -> mavlink_out.FixReport:
         resets = self._resets_before + (0 if self._navigator is None else self._navigator.reset_count)
         origin, vehicle = self.telemetry.origin, self.telemetry.vehicle(captured_ns)
         if origin is None and self._origin is not None and vehicle.down_m is not None:
             # An autopilot without a position reports a height above sea level of 0.
             vehicle = replace(vehicle, alt_amsl_m=self._origin.alt_amsl_m - vehicle.down_m)
-        return FixReport(
+        return mavlink_out.FixReport(
             fix,
             captured_ns,
             (time.monotonic_ns() - captured_ns) * 1e-6,
@@ -317,18 +298,19 @@ class MavlinkBridge:
                 self._obey(message)
                 continue
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                self._send(timesync_message(time.monotonic_ns(), message.ts1))
+                self._send(mavlink_out.timesync_message(time.monotonic_ns(), message.ts1))
             self.telemetry.update(message, now_ns)
 
     def _obey(self, message: Any) -> None:
         """Handle an operator's command to trust the fixes that contradict the track."""
-        if (message.target_system, message.target_component) != (self._system_id, self._component_id):
+        own = self._options
+        if (message.target_system, message.target_component) != (own.system_id, own.component_id):
             return
         accepted = message.command == CONFIRM_COMMAND
         if accepted:
             self._confirmed = True
             self._tell([(INFO, "Scenematch: position confirmed")])
-        self._send(acknowledgement_message(message.command, accepted=accepted))
+        self._send(mavlink_out.acknowledgement_message(message.command, accepted=accepted))
 
     def _on_connected(self, now_ns: int) -> None:
         """Start over with a vehicle that is heard for the first time or again."""
@@ -342,13 +324,13 @@ class MavlinkBridge:
         """Send periodic messages: heartbeats always, requests while the vehicle is connected."""
         now_ns = time.monotonic_ns()
         if self._is_due("heartbeat", now_ns, 1.0):
-            self._send(heartbeat_message())
+            self._send(mavlink_out.heartbeat_message())
         if not self.connected:
             return
         self._tell(self._notices.due(now_ns * 1e-9))
         if self._is_due("timesync", now_ns, 0.5):
             self.telemetry.add_timesync_request(now_ns)
-            self._send(timesync_message(now_ns))
+            self._send(mavlink_out.timesync_message(now_ns))
         for request in self._requests.due(self.telemetry, now_ns):
             self._send(request)
 
@@ -372,7 +354,7 @@ class MavlinkBridge:
 
     def _new_decoder(self, link: Link) -> PacketDecoder:
         numbers = HANDLED_MESSAGES | {mavlink.MAVLINK_MSG_ID_COMMAND_LONG}
-        return PacketDecoder(self._system_id, numbers, is_stream=link.is_stream, key=self._key)
+        return PacketDecoder(self._options.system_id, numbers, is_stream=link.is_stream, key=self._key)
 
     def _drop_link(self) -> None:
         with self._sending:

@@ -171,36 +171,32 @@ class MavlinkTelemetry:
         self, gimbal_mount: NDArray[np.float64] | None = None, bridge_component: int = BRIDGE_COMPONENT
     ) -> None:
         self._bridge_component, self._gimbal_mount = bridge_component, gimbal_mount
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self.armed = False
         self.firmware: int | None = None
         self.heard_ns: int | None = None
-        self._reset()
+        self.reset()
 
-    def _reset(self) -> None:
+    def reset(self) -> None:
         """Discard everything but the last heartbeat: the autopilot may have rebooted."""
-        self._clock, self._stale_stamps = AutopilotClock(), 0
-        self._attitude, self._holder = RecentValues(ANGLES), RecentValues(ANGLES)
-        self._velocity, self._vision, self._down = RecentValues(), RecentValues(), RecentValues()
-        self._range, self._clearance, self._relative = RecentValues(), RecentValues(), RecentValues()
-        self._alt_amsl = RecentValues()
-        self._unix_offset_ns: int | None = None
-        self._has_velocity = True
-        self._home_down_m = 0.0  # how far its home is below its origin
-        self.origin: NedOrigin | None = None
-        self.has_receiver: bool | None = None
-        self.uptime_ms: int | None = None
-        self.gnss: GnssFix | None = None
+        with self._lock:
+            self._clock, self._stale_stamps = AutopilotClock(), 0
+            self._attitude, self._holder = RecentValues(ANGLES), RecentValues(ANGLES)
+            self._velocity, self._vision, self._down = RecentValues(), RecentValues(), RecentValues()
+            self._range, self._clearance, self._relative = RecentValues(), RecentValues(), RecentValues()
+            self._alt_amsl = RecentValues()
+            self._unix_offset_ns: int | None = None
+            self._has_velocity = True
+            self._home_down_m = 0.0  # how far its home is below its origin
+            self.origin: NedOrigin | None = None
+            self.has_receiver: bool | None = None
+            self.uptime_ms: int | None = None
+            self.gnss: GnssFix | None = None
 
     def update(self, message: Any, arrival_ns: int) -> None:
         """Process one message."""
         with self._lock:
             self._update(message, arrival_ns)
-
-    def reset(self) -> None:
-        """Discard everything but the last heartbeat."""
-        with self._lock:
-            self._reset()
 
     def add_timesync_request(self, now_ns: int) -> None:
         """Remember the stamp of a TIMESYNC request that is about to be sent."""
@@ -259,7 +255,7 @@ class MavlinkTelemetry:
                 self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         elif kind == "TIMESYNC":
             if message.tc1 != 0 and not self._clock.accept_response(message.ts1, message.tc1, arrival_ns):
-                self._reset()
+                self.reset()
         elif kind == "GPS_GLOBAL_ORIGIN":
             self._set_origin(message)
         elif kind == "RANGEFINDER":  # has no stamp
@@ -283,7 +279,7 @@ class MavlinkTelemetry:
         time_ns = self._clock.local_ns(remote_ns, arrival_ns)
         self._stale_stamps = 0 if time_ns is not None else self._stale_stamps + 1
         if self._stale_stamps > _MAX_STALE_STAMPS:
-            self._reset()
+            self.reset()
             time_ns = self._clock.local_ns(remote_ns, arrival_ns)
         return time_ns
 

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from engine.errors import OptionError
 from engine.geo import enu_from_body
-from engine.values import Attitude, Fix, check_positive
+from engine.values import Attitude, Fix
 from scenematch.bridges.fix_velocity import GroundVelocity
-from scenematch.bridges.mavlink_in import MAV_AUTOPILOTS, GnssFix
+from scenematch.bridges.mavlink_in import GnssFix
 from scenematch.bridges.packets import AUTOPILOT_COMPONENT
-from scenematch.bridges.parameters import MAX_DELAY_MS
+from scenematch.bridges.parameters import MAX_DELAY_MS, MavlinkOptions
 from scenematch.bridges.vehicle import (
     ANGLE_VARIANCE,
     MOUNT_VARIANCE,
@@ -29,12 +28,6 @@ from scenematch.bridges.vehicle import (
 )
 from scenematch.files.quaternions import quaternion_wxyz
 
-MESSAGES = {
-    "ardupilot": ("vision_position_estimate", "odometry", "gps_input"),
-    "px4": ("global_position_sensor", "odometry"),
-}
-"""Messages that each firmware accepts; the first is the default."""
-
 SENSOR_ID = 1
 """Sensor id in GLOBAL_POSITION_SENSOR; PX4 fuses the one that EKF2_AGP0_ID names, and 0 means none."""
 
@@ -42,54 +35,7 @@ _GPS_EPOCH_S, _LEAP_S, _WEEK_MS = 315964800, 18, 604_800_000
 # A fix has no satellites, and the message no value for unknown. The fields that arming checks and estimators read
 # express the accuracy: a metre of sigma becomes a dilution of 1 and 10 satellites.
 _DILUTION_PER_M, _MIN_DILUTION = 1.0, 0.5
-_MAX_GPS_ID = 3
 _NO_VELOCITY = mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MavlinkOptions:
-    """Which MAVLink message carries the fixes, and which fixes are withheld.
-
-    Attributes:
-        firmware: ardupilot or px4.
-        message: one of the firmware's :data:`MESSAGES`; empty for its default.
-        max_sigma_m: upper bound of a fix's sigma; ArduPilot would clamp a larger one and trust the fix too much.
-        gps_id: number of the receiver that GPS_INPUT emulates; 0 is the autopilot's first, 1 its second.
-
-    Raises:
-        OptionError: a name is unknown, or a number is out of range.
-    """
-
-    firmware: str = "ardupilot"
-    message: str = ""
-    max_sigma_m: float = 10.0
-    gps_id: int = 0
-
-    def __post_init__(self) -> None:
-        check_positive(self, "max_sigma_m")
-        if self.firmware not in MAV_AUTOPILOTS:
-            raise OptionError(f"firmware: expected one of {', '.join(MAV_AUTOPILOTS)}, got {self.firmware!r}")
-        if self.message and self.message not in MESSAGES[self.firmware]:
-            known = ", ".join(MESSAGES[self.firmware])
-            raise OptionError(f"message: expected one of {known} for {self.firmware}, got {self.message!r}")
-        if not 0 <= self.gps_id <= _MAX_GPS_ID:
-            raise OptionError(f"gps_id: expected 0 to {_MAX_GPS_ID}, got {self.gps_id}")
-        if self.gps_id and self.kind != "gps_input":
-            raise OptionError(f"gps_id: expected with gps_input only, got {self.kind}")
-        if self.max_sigma_m > 100.0:
-            raise OptionError(
-                f"max_sigma_m: expected at most 100 (ArduPilot clamps there), got {self.max_sigma_m:g}"
-            )
-
-    @property
-    def kind(self) -> str:
-        """Name of the message that is sent, in lower case."""
-        return self.message or MESSAGES[self.firmware][0]
-
-    @property
-    def needs_origin(self) -> bool:
-        """Whether the message carries positions relative to the autopilot's origin."""
-        return self.kind in ("vision_position_estimate", "odometry")
 
 
 @dataclass(frozen=True, slots=True)

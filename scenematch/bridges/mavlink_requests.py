@@ -7,7 +7,8 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from scenematch.bridges.mavlink_in import GIMBAL_RATES_HZ, REQUESTED_RATES_HZ, MavlinkTelemetry
-from scenematch.bridges.mavlink_out import MavlinkOptions, command_message, set_origin_message
+from scenematch.bridges.mavlink_out import command_message, set_origin_message
+from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
 _ORIGIN_TIMEOUT_NS = 3_000_000_000  # after which an origin is set on an autopilot that reports none
@@ -20,16 +21,13 @@ class AutopilotRequests:
     """Schedules the requests to one autopilot.
 
     Args:
-        system_id: MAVLink system id of the vehicle.
-        options: which message to send to which firmware.
+        options: which message to send to which autopilot.
         origin: NED origin to set on an autopilot that reports none; None sets none.
         with_gimbal: whether to request its gimbal's attitude too.
     """
 
-    def __init__(
-        self, system_id: int, options: MavlinkOptions, origin: NedOrigin | None, *, with_gimbal: bool
-    ) -> None:
-        self._system_id, self._options, self._origin = system_id, options, origin
+    def __init__(self, options: MavlinkOptions, origin: NedOrigin | None, *, with_gimbal: bool) -> None:
+        self._system_id, self._options, self._origin = options.system_id, options, origin
         self._rates_hz = REQUESTED_RATES_HZ[options.firmware]
         if with_gimbal:
             self._rates_hz = self._rates_hz | GIMBAL_RATES_HZ[options.firmware]

@@ -118,7 +118,7 @@ class PacketDecoder:
                 at += 1  # no packet begins here, or one of unknown length
                 continue
             at += size
-            if self._is_addressed(packet):
+            if self._is_addressed(message):
                 if self._key is None or self._is_signed(packet, self._key):
                     messages.append(message)
                 else:
@@ -140,13 +140,10 @@ class PacketDecoder:
             return 8 + payload
         return 12 + payload + (_SIGNATURE_BYTES if self._buffer[at + 2] & _SIGNED else 0)
 
-    def _is_addressed(self, packet: bytes) -> bool:
-        if packet[0] == V1:
-            system, component, number = packet[3], packet[4], packet[5]
-        else:
-            system, component, number = packet[5], packet[6], int.from_bytes(packet[7:10], "little")
-        from_vehicle = component == AUTOPILOT_COMPONENT or number in _FROM_ANY_COMPONENT
-        from_vehicle = from_vehicle and system == self._system_id
+    def _is_addressed(self, message: Any) -> bool:
+        number = message.get_msgId()
+        from_vehicle = message.get_srcComponent() == AUTOPILOT_COMPONENT or number in _FROM_ANY_COMPONENT
+        from_vehicle = from_vehicle and message.get_srcSystem() == self._system_id
         # An operator's command comes from the ground station, on the autopilot's link.
         return number in self._message_ids and (from_vehicle or number == mavlink.MAVLINK_MSG_ID_COMMAND_LONG)
 

@@ -1,20 +1,81 @@
-"""Parameter files that configure ArduPilot and PX4 to use the bridge's fixes."""
+"""What is sent to ArduPilot and PX4, and the parameter files that configure them to use it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 from engine.errors import OptionError
-
-if TYPE_CHECKING:
-    from scenematch.bridges.mavlink_out import MavlinkOptions
+from engine.values import check_positive
 
 MAX_DELAY_MS = 250.0
 """Upper bound of ArduPilot's VISO_DELAY_MS."""
 
+MESSAGES = {
+    "ardupilot": ("vision_position_estimate", "odometry", "gps_input"),
+    "px4": ("global_position_sensor", "odometry"),
+}
+"""Messages that each firmware accepts; the first is the default."""
+
+_MAX_GPS_ID = 3
 _INT, _FLOAT = 6, 9  # MAV_PARAM_TYPE, as QGroundControl writes it
 Parameter = tuple[str, float, str]
 """Name, value, purpose."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MavlinkOptions:
+    """The autopilot, which MAVLink message carries the fixes to it, and which fixes are withheld.
+
+    Attributes:
+        system_id: system id of the vehicle; others are ignored.
+        component_id: component id of the bridge on the vehicle.
+        firmware: ardupilot or px4.
+        message: one of the firmware's :data:`MESSAGES`; empty for its default.
+        max_sigma_m: upper bound of a fix's sigma; ArduPilot would clamp a larger one and trust the fix too much.
+        use_velocity: use the autopilot's velocity for dead reckoning between fixes.
+        check_gnss: check the first fixes against the autopilot's GNSS receiver, if it has a fix.
+        gps_id: number of the receiver that GPS_INPUT emulates; 0 is the autopilot's first, 1 its second.
+
+    Raises:
+        OptionError: a name is unknown, or a number is out of range.
+    """
+
+    system_id: int = 1
+    component_id: int = 197
+    firmware: str = "ardupilot"
+    message: str = ""
+    max_sigma_m: float = 10.0
+    use_velocity: bool = True
+    check_gnss: bool = True
+    gps_id: int = 0
+
+    def __post_init__(self) -> None:
+        check_positive(self, "max_sigma_m")
+        if not 2 <= self.component_id <= 255:
+            raise OptionError(f"component_id: expected 2 to 255 (1 is the autopilot), got {self.component_id}")
+        if self.firmware not in MESSAGES:
+            raise OptionError(f"firmware: expected one of {', '.join(MESSAGES)}, got {self.firmware!r}")
+        if self.message and self.message not in MESSAGES[self.firmware]:
+            known = ", ".join(MESSAGES[self.firmware])
+            raise OptionError(f"message: expected one of {known} for {self.firmware}, got {self.message!r}")
+        if not 0 <= self.gps_id <= _MAX_GPS_ID:
+            raise OptionError(f"gps_id: expected 0 to {_MAX_GPS_ID}, got {self.gps_id}")
+        if self.gps_id and self.kind != "gps_input":
+            raise OptionError(f"gps_id: expected with gps_input only, got {self.kind}")
+        if self.max_sigma_m > 100.0:
+            raise OptionError(
+                f"max_sigma_m: expected at most 100 (ArduPilot clamps there), got {self.max_sigma_m:g}"
+            )
+
+    @property
+    def kind(self) -> str:
+        """Name of the message that is sent, in lower case."""
+        return self.message or MESSAGES[self.firmware][0]
+
+    @property
+    def needs_origin(self) -> bool:
+        """Whether the message carries positions relative to the autopilot's origin."""
+        return self.kind in ("vision_position_estimate", "odometry")
 
 
 def parameter_file(sent: MavlinkOptions, takeoff: str = "none", delay_ms: int = 100) -> str:

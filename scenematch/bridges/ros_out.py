@@ -62,10 +62,8 @@ def pose(
     candidates_m = [None if vehicle.down_m is None else -vehicle.down_m, vehicle.height_agl_m,
                     None if fix.up_m is None else fix.up_m - site.ground_m]  # fmt: skip
     up_m = next((height_m for height_m in candidates_m if height_m is not None), None)
-    angles = vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg
-    if fix.attitude is not None:
-        angles = fix.attitude.roll_deg, fix.attitude.pitch_deg, fix.attitude.heading_deg
-    roll_deg, pitch_deg, heading_deg = angles
+    attitude = fix.attitude or vehicle
+    roll_deg, pitch_deg, heading_deg = angles = attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg
     east_m, north_m = position_en_m(fix, site.frame, options)
     covariance = pose_covariance(fix, options.firmware, knows_up=up_m is not None, angles=angles)
     point = messages.make("geometry_msgs/msg/Point", x=east_m, y=north_m, z=up_m or 0.0)

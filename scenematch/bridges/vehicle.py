@@ -69,13 +69,14 @@ class VehicleState:
 
     def frame(self, image: NDArray[np.uint8], captured_ns: int) -> Frame:
         """The frame for an image (H, W, 3) or (H, W) uint8 captured at this time."""
-        own = (self.heading_deg, self.roll_deg, self.pitch_deg)
-        held = self.holder
+        body = self.holder or self
         return Frame(
             image,
             captured_ns,
             self.height_agl_m,
-            *(own if held is None else (held.heading_deg, held.roll_deg, held.pitch_deg)),
+            body.heading_deg,
+            body.roll_deg,
+            body.pitch_deg,
             self.east_velocity_mps,
             self.north_velocity_mps,
             velocity_sigma_mps=self.velocity_sigma_mps,

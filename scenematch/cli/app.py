@@ -11,16 +11,8 @@ import typer
 from typer.main import get_command
 
 from engine.errors import EngineError, OptionError
-from scenematch.cli import console
-from scenematch.cli.argument_names import (
-    Command,
-    argument_of,
-    error_as_typed,
-    ros_arguments_last,
-    typed_name,
-    urls_as_typed,
-)
-from scenematch.cli.commands import bridge, check, compare, demo, doctor, evaluate, export, locate, simulate, track
+from scenematch.cli import argument_names, console
+from scenematch.cli.commands import bridge, doctor, flight, locate, simulate
 from scenematch.cli.commands import map as map_commands
 
 app = typer.Typer(
@@ -35,14 +27,14 @@ bridge_app = typer.Typer(help="Send live fixes to an autopilot or to ROS.")
 
 # In the order of the help.
 _COMMANDS: tuple[tuple[typer.Typer, tuple[Callable[..., None], ...]], ...] = (
-    (app, (demo.demo, check.check, track.track, compare.compare, locate.locate)),
-    (app, (simulate.simulate, evaluate.evaluate, export.export, doctor.doctor)),
+    (app, (simulate.demo, flight.check, flight.track, flight.compare, locate.locate)),
+    (app, (simulate.simulate, flight.evaluate, flight.export, doctor.doctor)),
     (map_app, (map_commands.info, map_commands.audit, map_commands.fetch)),
     (bridge_app, (bridge.mavlink, bridge.ros)),
 )
 for group, functions in _COMMANDS:
     for function in functions:
-        group.command(cls=Command)(function)
+        group.command(cls=argument_names.Command)(function)
 app.add_typer(map_app, name="map")
 app.add_typer(bridge_app, name="bridge")
 
@@ -64,17 +56,17 @@ def run(arguments: list[str]) -> int:
     """
     given = arguments
     if arguments[:2] == ["bridge", "ros"]:
-        arguments = [*arguments[:2], *ros_arguments_last(arguments[2:])]
+        arguments = [*arguments[:2], *argument_names.ros_arguments_last(arguments[2:])]
     try:
         result = command().main(args=arguments or ["--help"], prog_name="scenematch", standalone_mode=False)
     except _UsageError as error:
         return _fail(_usage(error), 2, given, _usage_argument(error))
     except EngineError as error:
-        text = error_as_typed(error)
-        return _fail(text, 2 if isinstance(error, OptionError) else 1, given, argument_of(text))
+        text = argument_names.error_as_typed(error)
+        return _fail(text, 2 if isinstance(error, OptionError) else 1, given, argument_names.argument_of(text))
     except OSError as error:
         text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        return _fail(text, 1, given, argument_of(text))
+        return _fail(text, 1, given, argument_names.argument_of(text))
     except (KeyboardInterrupt, typer.Abort):
         result = INTERRUPTED
     if result == INTERRUPTED:
@@ -93,11 +85,11 @@ def _usage(error: Any) -> str:
 def _usage_argument(error: Any) -> str | None:
     """The argument that is wrong, missing or unknown; None if something else is wrong."""
     parameter = getattr(error, "param", None)
-    return getattr(error, "option_name", None) if parameter is None else typed_name(parameter)
+    return getattr(error, "option_name", None) if parameter is None else argument_names.typed_name(parameter)
 
 
 def _fail(text: str, code: int, given: list[str], argument: str | None = None) -> int:
-    text = urls_as_typed(text, given)
+    text = argument_names.urls_as_typed(text, given)
     console.say(f"scenematch: {text}")
     if "--json" in given:
         with suppress(OSError):  # standard output may be what failed

@@ -15,7 +15,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from scenematch.cli.argument_names import as_typed
-from scenematch.runs.progress import Progress
+from scenematch.runs.output import Progress
 
 if TYPE_CHECKING:
     from rich.console import Console

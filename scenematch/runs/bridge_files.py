@@ -14,9 +14,8 @@ from scenematch.files.flight import open_flight
 from scenematch.files.frames import VIDEO_SUFFIXES
 from scenematch.runs.arguments import check_between, check_every, check_unused
 from scenematch.runs.cameras import CameraInput
-from scenematch.runs.folders import StrPath
 from scenematch.runs.map_input import MapInput
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath
 
 _MAX_GRAB_MS = 10_000.0
 

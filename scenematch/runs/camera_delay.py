@@ -14,12 +14,13 @@ import numpy as np
 
 from engine.errors import BackendError, OptionError, TelemetryError, require
 from engine.navigation.lag import Lag, camera_lag, turn_between
+from engine.options import NavigatorOptions
 from engine.values import Frame, NoFix, Reason
 from scenematch.bridges.links import parse_connection
 from scenematch.bridges.pictures import CapturedImage, capture
 from scenematch.runs.cameras import CameraInput
 from scenematch.runs.mavlink_bridge import MavlinkSettings
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress
 
 if TYPE_CHECKING:
     from scenematch.bridges.mavlink_in import MavlinkTelemetry
@@ -30,6 +31,8 @@ _SETTLED_NS = 200_000_000  # after which no older attitude arrives
 
 class _Idle:
     """A navigator that does nothing: the bridge is opened only for its telemetry."""
+
+    options = NavigatorOptions()
 
     def update(self, frame: Frame, prior: object = None, budget: object = None) -> NoFix:
         return NoFix(reason=Reason.NO_TEXTURE, timestamp_ns=frame.timestamp_ns)
@@ -58,7 +61,7 @@ def measure_camera_delay(
         TelemetryError: the camera does not open, or its pictures do not agree with the attitude.
     """
     require("pymavlink", "mavlink")
-    from scenematch.bridges.mavlink import MavlinkBridge, MavlinkOptions
+    from scenematch.bridges.mavlink import MavlinkBridge
     from scenematch.bridges.packets import read_key
 
     seconds = 20.0 if seconds is None else seconds
@@ -67,14 +70,11 @@ def measure_camera_delay(
     if camera.camera is None and camera.hfov_deg is None:
         raise OptionError("camera: expected a calibration, or `hfov_deg`")
     model = camera.load_live(camera_source, progress=progress)
-    options, secret = (
-        MavlinkOptions(firmware=link.firmware),
-        None if link.key is None else read_key(Path(link.key)),
-    )
+    secret = None if link.key is None else read_key(Path(link.key))
     connection = parse_connection(link.connect, listen_anywhere=link.listen_anywhere)
     try:
         idle: Any = _Idle()
-        bridge = MavlinkBridge(connection, lambda _: idle, options, system_id=link.system_id, key=secret)
+        bridge = MavlinkBridge(connection, lambda _: idle, link, key=secret)
     except OSError as error:
         raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
     progress.message(f"tilt the vehicle to and fro by some 10 degrees for {seconds:g} s, over textured ground")

@@ -13,8 +13,7 @@ from scenematch.bridges.pictures import first_picture
 from scenematch.files.frames import FrameSource, PictureFolder
 from scenematch.files.photo_camera import photo_camera
 from scenematch.files.ros.bags import is_bag, read_bag_camera
-from scenematch.runs.folders import StrPath
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from scenematch.check.causes import IN_CALIBRATION
 from scenematch.files.truth import interpolate_truth
 from scenematch.runs.arguments import parse_position
 from scenematch.runs.inputs import FlightFiles, FlightInputs, open_inputs
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress
 from scenematch.runs.settings import TrackSettings
 
 _TRUTH_SIGMA_M = 1.0

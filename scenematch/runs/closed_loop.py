@@ -18,12 +18,11 @@ from engine.values import Frame, Truth
 from scenematch.files.notes import frame_note, write_notes
 from scenematch.files.track import track_row, write_track
 from scenematch.report.loop_record import summarise_loop, write_loop_csv
-from scenematch.runs.arguments import check_between, check_choice, check_device
+from scenematch.runs.arguments import check_between, check_choice
 from scenematch.runs.evaluation import evaluate
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.inputs import FOLDER_LAYOUT
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.record import RunRecord
 from scenematch.runs.results import LOOP, NOTES, SUMMARY, TRACK
 from scenematch.runs.simulation import FOLDER_OWNED, LOOP_OWNED, WorldSettings, picture_name, write_folder
@@ -54,23 +53,19 @@ class ClosedLoopSettings:
         minutes: of flight.
         method: "auto", "ncc" or "sift".
         fault: fault to inject: "none", "killed", "shifted" or "frozen".
-        device: to compute on.
 
     Raises:
         OptionError: a word or a number is invalid.
-        DeviceError: the device is missing.
     """
 
     minutes: float = 5.0
     method: str = "auto"
     fault: str = "none"
-    device: str = "auto"
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, CLASSICAL)
         check_choice("fault", self.fault, FAULT_KINDS)
         check_between("minutes", self.minutes, 0.1, 120.0)
-        check_device(self.device)
 
     def planned_fault(self) -> Fault:
         """The fault with its times: ten seconds, but a shifted map stays shifted."""
@@ -108,7 +103,7 @@ def fly_closed_loop(
     progress.message("drawing the world")
     town, camera = world.build(), world.camera()
     site = town.site()
-    matcher = SceneMatcher(site, camera, loop.method, loop.device)
+    matcher = SceneMatcher(site, camera, loop.method)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
     flight = plan_closed_loop(town, camera, matcher, world.seed, loop)

@@ -9,10 +9,9 @@ from typing import Any
 from engine.errors import OptionError
 from engine.matching import METHODS
 from scenematch.report.runs_page import MAX_RUNS
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder, write_json
+from scenematch.runs.evaluation import COMPARISON, draw_together
 from scenematch.runs.inputs import FlightFiles, open_inputs
-from scenematch.runs.progress import SILENT, Progress
-from scenematch.runs.reporting import COMPARISON, draw_together
+from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.settings import TrackSettings, load_settings
 from scenematch.runs.tracking import track
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from scenematch.runs.arguments import check_device
 from scenematch.runs.comparison import TABLE, compare, parse_runs
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder
 from scenematch.runs.simulation import write_flight
 from scenematch.simulator import plan_flight
 
@@ -22,7 +20,6 @@ def run_demo(
     *,
     frames: int | None = None,
     seed: int = 1,
-    device: str = "auto",
     force: bool = False,
     progress: Progress = SILENT,
 ) -> dict[str, dict[str, Any]]:
@@ -32,7 +29,6 @@ def run_demo(
         out: the folder.
         frames: number of frames to fly; None is all.
         seed: of town, path, sensors and camera.
-        device: to compute on.
         force: whether the folder may already exist.
         progress: receives progress and messages.
 
@@ -40,10 +36,9 @@ def run_demo(
         The summaries by the name of their run, such as "ncc-paper".
     """
     out = Path(out)
-    check_device(device)
     check_folder(out, force)
     progress.message("drawing the town and the flight over it")
     plan = plan_flight(seed, frames=frames)
     prepare_folder(out, force, OWNED)
     files = write_flight(out / "flight", plan, progress=progress)
-    return compare(files, out, parse_runs(device=device), force=True, progress=progress)
+    return compare(files, out, parse_runs(), force=True, progress=progress)

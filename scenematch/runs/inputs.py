@@ -7,23 +7,23 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from engine.camera import Camera
-from engine.errors import OptionError, TelemetryError
+import numpy as np
+
+from engine.camera import Camera, mount_rotation
+from engine.errors import CalibrationError, OptionError, TelemetryError
 from engine.orthomap import OrthoMap
-from engine.values import Truth
+from engine.values import Prior, Truth
 from scenematch.files.corrections import Corrections
 from scenematch.files.flight import Flight, open_flight, subtitles_beside
-from scenematch.files.frames import VIDEO_SUFFIXES
+from scenematch.files.frames import VIDEO_SUFFIXES, PictureFolder
 from scenematch.files.logs.readers import LogClock, is_log, is_photographs, open_truth
 from scenematch.files.ros.bags import is_bag
 from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
 from scenematch.runs.arguments import check_every, parse_position
-from scenematch.runs.cameras import CameraInput
-from scenematch.runs.checks import check_gimbal, check_needs, check_pictures, check_position, check_start
-from scenematch.runs.folders import StrPath
-from scenematch.runs.map_input import MapInput
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.cameras import CameraInput, check_size
+from scenematch.runs.map_input import MapInput, check_position
+from scenematch.runs.output import SILENT, Progress, StrPath
 from scenematch.runs.renaming import renamed_in_errors
 from scenematch.runs.settings import TrackSettings
 
@@ -148,7 +148,7 @@ class FlightFiles:
     def load_camera(self, flight: Flight, progress: Progress = SILENT) -> Camera:
         """The calibration from a file, a bag or the photographs of the flight."""
         camera = self.camera.load(flight.source, flight.names, image_topic=self.image_topic, progress=progress)
-        check_gimbal(flight, camera)
+        _check_gimbal(flight, camera)
         return camera
 
     def open_flight(self, columns: Mapping[str, str] = {}) -> Flight:
@@ -202,7 +202,7 @@ def open_inputs(files: FlightFiles, runs: Sequence[TrackSettings], *, progress: 
     truth_path = files.find_truth()
     truth = open_run_truth(truth_path, flight.rows, progress)
     for settings in runs:
-        check_needs(flight, settings.method, settings.profile, progress)
+        _check_needs(flight, settings.method, settings.profile, progress)
         if settings.method == "learned":
             from engine.learned import load_matcher
 
@@ -253,3 +253,88 @@ def _columns(runs: Sequence[TrackSettings]) -> Mapping[str, str]:
         if settings.telemetry_columns != runs[0].telemetry_columns:
             raise OptionError("telemetry_columns: expected the same of all runs of a flight, got others")
     return runs[0].telemetry_columns if runs else {}
+
+
+def check_pictures(flight: Flight, camera: Camera, progress: Progress = SILENT) -> None:
+    """Check that every picture decodes and has the camera's size; of a video only the first frame is checked.
+
+    Raises:
+        TelemetryError: a picture is empty, truncated or not a picture.
+        CalibrationError: a picture has another size.
+    """
+    source = flight.source
+    if not isinstance(source, PictureFolder):
+        check_size(camera, source.read(flight.names[0]).shape)
+        return
+    for name in progress.track(flight.names, len(flight), "checking pictures"):
+        path = source.path / name
+        size = _decoded_size(str(path))
+        try:
+            check_size(camera, (size[1], size[0]))
+        except CalibrationError as error:
+            raise CalibrationError(f"{path}: {error}") from None
+
+
+def _decoded_size(path: str) -> tuple[int, int]:
+    """Width and height; a JPEG is decoded at 1/8 scale, of a PNG the checksums are read, others are decoded."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as picture:
+            size = picture.size
+            if picture.format == "PNG":
+                picture.verify()
+            else:
+                picture.draft("L", (1, 1))
+                picture.load()
+            return size
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        reason = "it is no picture" if isinstance(error, UnidentifiedImageError) else str(error)
+        raise TelemetryError(f"{path}: expected a readable picture: {' '.join(reason.split())}") from None
+
+
+def _check_gimbal(flight: Flight, camera: Camera) -> None:
+    """Refuse a mount in addition to a gimbal's angles, which already state where the camera looks.
+
+    Raises:
+        CalibrationError: the camera would be turned twice.
+    """
+    if flight.has_gimbal and not np.allclose(camera.mount, mount_rotation(), atol=1e-3):
+        raise CalibrationError(
+            "mount: expected nadir, since the telemetry's gimbal angles already state where the camera looks"
+        )
+
+
+def _needs(method: str, profile: str) -> list[str]:
+    """Telemetry that a method requires."""
+    needs = ["height_agl_m"] if profile == "paper" or method == "ncc" else []
+    return [*needs, "heading_deg"] if method == "ncc" else needs
+
+
+def _check_needs(flight: Flight, method: str, profile: str, progress: Progress) -> None:
+    """Report how many frames the method will certainly refuse for lack of telemetry, and which method would not.
+
+    Raises:
+        TelemetryError: every frame would be refused.
+    """
+    needs, other = _needs(method, profile), "" if profile == "paper" else "; sift and auto do not need it"
+    if needs and not any(all(getattr(row, name) is not None for name in needs) for row in flight.rows):
+        asked, doubts = " and ".join(needs), "".join(f"; {remark}" for remark in flight.remarks)
+        raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}{doubts}")
+    for name in needs:
+        lacking = sum(getattr(row, name) is None for row in flight.rows)
+        if lacking:
+            progress.message(f"{lacking} of {len(flight)} frames lack {name}, so {method} will refuse them{other}")
+
+
+def check_start(start: Prior | None, site: OrthoMap) -> None:
+    """Refuse a flight without a start if the map is too large to search.
+
+    Raises:
+        OptionError: no position is known.
+    """
+    if start is None and not site.is_searchable:
+        raise OptionError(
+            f"start: expected LAT,LON or LAT,LON,SIGMA_M: the map of {site.size_km} is too large to search, "
+            "and the telemetry has no position"
+        )

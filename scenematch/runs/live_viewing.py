@@ -15,7 +15,7 @@ from engine.matching.matcher import SceneMatcher
 from engine.navigation.navigator import Navigator
 from engine.options import NavigatorOptions
 from engine.values import Prior
-from scenematch.runs.folders import StrPath
+from scenematch.runs.output import StrPath
 
 if TYPE_CHECKING:  # rerun is optional
     from scenematch.report.live_view import LiveView, Watcher

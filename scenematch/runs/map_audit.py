@@ -18,9 +18,8 @@ from scenematch.check.self_match import SelfMatchStatistics, measure_self_match
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.route import read_route
 from scenematch.runs.arguments import parse_circle
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.map_input import MapInput
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder, write_json
 from scenematch.runs.renaming import renamed_in_errors
 
 OWNED = ("matchability.tif", "audit.png", "summary.json")

@@ -21,8 +21,7 @@ from scenematch.fetch.servers import is_template, plan
 from scenematch.fetch.urls import check_url, shown
 from scenematch.files.photos import exif_telemetry
 from scenematch.runs.arguments import check_above, check_between, check_unused, parse_place
-from scenematch.runs.folders import StrPath, check_file
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath, check_file
 
 MAX_TILES = 2000
 NOTE = "you named this server: its terms decide what may be fetched, kept and used, and whom to credit"

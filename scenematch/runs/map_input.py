@@ -1,16 +1,16 @@
-"""The map of a run: its files, and what they do not state themselves."""
+"""The map of a run: its files, what they do not state themselves, and whether a position lies on it."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
-from engine.errors import MapError, OptionError
+from engine.errors import MapError, OptionError, TelemetryError
 from engine.orthomap import OrthoMap
-from engine.values import MAX_SIGMA_M
+from engine.values import MAX_SIGMA_M, Prior
 from scenematch.runs.arguments import check_above, is_in_degrees, parse_bounds
-from scenematch.runs.folders import StrPath
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath
 from scenematch.runs.renaming import renamed_in_errors
 
 
@@ -75,3 +75,32 @@ class MapInput:
             if str(error).startswith(("map_bounds:", "map_crs:")):
                 raise OptionError(str(error)) from None
             raise
+
+
+def check_position(
+    name: str, position: Prior | None, site: OrthoMap, error: type[OptionError | TelemetryError]
+) -> None:
+    """Refuse a latitude and longitude far off the map.
+
+    Raises:
+        OptionError, TelemetryError: as requested; it is further away than the map is wide.
+    """
+    from pyproj import Geod
+
+    if position is None or position.lat_deg is None or position.lon_deg is None:
+        return
+    middle = site.frame
+
+    def off_m(lat_deg: float, lon_deg: float) -> float:
+        return float(Geod(ellps="WGS84").inv(middle.lon_deg, middle.lat_deg, lon_deg, lat_deg)[2])
+
+    distance_m = off_m(position.lat_deg, position.lon_deg)
+    extent_m = math.hypot(site.width_px, site.height_px) * site.gsd_m_per_px
+    limit_m = extent_m + 3.0 * position.sigma_m
+    if distance_m > limit_m:
+        is_swapped = abs(position.lon_deg) <= 90.0 and off_m(position.lon_deg, position.lat_deg) <= limit_m
+        hint = "; are latitude and longitude swapped?" if is_swapped else ""
+        raise error(
+            f"{name}: expected a place on the map {site.name}, got {position.lat_deg:g},{position.lon_deg:g}, "
+            f"{distance_m / 1000.0:,.1f} km from its middle ({middle.lat_deg:.5f},{middle.lon_deg:.5f}){hint}"
+        )

@@ -21,21 +21,20 @@ from engine.runtime.garbage import no_collection
 from engine.runtime.realtime import Realtime, check_realtime, set_realtime
 from engine.values import Prior
 from scenematch.bridges.links import parse_connection
-from scenematch.bridges.parameters import MAX_DELAY_MS
+from scenematch.bridges.parameters import MAX_DELAY_MS, MavlinkOptions
 from scenematch.bridges.pictures import CapturedImage
 from scenematch.bridges.vehicle import NedOrigin
 from scenematch.runs.arguments import check_between, check_choice, check_device, check_unused, parse_position
 from scenematch.runs.bridge_files import BridgeFiles
-from scenematch.runs.checks import check_position
 from scenematch.runs.last_fix import LastFix, last_fix_file, remember_delay
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.map_input import check_position
+from scenematch.runs.output import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
 from scenematch.runs.supervisor import become_worker, check_supervision, end_on_sigterm
 
 if TYPE_CHECKING:
     from scenematch.bridges.mavlink import MavlinkBridge
-    from scenematch.bridges.mavlink_out import MavlinkOptions
     from scenematch.bridges.mavlink_status import MavlinkStatus
 
 _AUTOPILOT_TIMEOUT_S = 10.0
@@ -43,7 +42,7 @@ _MAX_ALT_M = 10_000.0  # of an origin: above any ground, and within the range of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MavlinkSettings:
+class MavlinkSettings(MavlinkOptions):
     """How to reach the autopilot, and what to send it.
 
     Attributes:
@@ -62,42 +61,21 @@ class MavlinkSettings:
         gps_id: number of the receiver that GPS_INPUT emulates; 0 is the autopilot's first.
 
     Raises:
-        OptionError: the height of the origin is impossible or given without ``set_origin``, or the component id is
-            invalid or the autopilot's.
+        OptionError: see :class:`scenematch.bridges.parameters.MavlinkOptions`; or the height of the origin is
+            impossible or given without ``set_origin``.
     """
 
     connect: str
     listen_anywhere: bool = False
-    system_id: int = 1
-    component_id: int = 197
     key: str | None = None
-    firmware: str = "ardupilot"
-    message: str = ""
-    max_sigma_m: float = 10.0
     set_origin: bool = True
     origin_alt_m: float | None = None
-    use_velocity: bool = True
-    check_gnss: bool = True
-    gps_id: int = 0
 
     def __post_init__(self) -> None:
+        MavlinkOptions.__post_init__(self)  # super() would be the class before its slots
         if not self.set_origin:
             check_unused({"origin_alt_m": self.origin_alt_m}, "set_origin")
         check_between("origin_alt_m", self.origin_alt_m, -_MAX_ALT_M, _MAX_ALT_M)
-        if not 2 <= self.component_id <= 255:
-            raise OptionError(f"component_id: expected 2 to 255 (1 is the autopilot), got {self.component_id}")
-
-    def outgoing(self) -> MavlinkOptions:
-        """What is sent.
-
-        Raises:
-            OptionError: the firmware, the message or the accuracy is invalid.
-        """
-        from scenematch.bridges.mavlink_out import MavlinkOptions
-
-        return MavlinkOptions(
-            firmware=self.firmware, message=self.message, max_sigma_m=self.max_sigma_m, gps_id=self.gps_id
-        )
 
     def origin(self, site: OrthoMap, start: Prior | None) -> NedOrigin | None:
         """The start of the flight, or the map's centre; None if no origin should be set.
@@ -213,22 +191,21 @@ def run_mavlink_bridge(
 
     settings = settings or BridgeSettings()
     connection = parse_connection(link.connect, listen_anywhere=link.listen_anywhere)
-    outgoing = link.outgoing()
     start = parse_position("start", settings.start)
     key = None if link.key is None else read_key(Path(link.key))
+    speed_mps = settings.navigator.max_speed_mps
     # With a camera the bridge may start in the air; a replayed flight begins at its start.
     resumes = files.camera_source is not None
     last_fix = LastFix(
         last_fix_file(link.connect, link.system_id, Path(files.map.map).absolute()) if resumes else None
     )
-    max_speed_mps = settings.live_options().max_speed_mps
-    matcher = _loaded(files, settings, start, progress, brief=last_fix.prior(max_speed_mps) is not None)
+    matcher = _loaded(files, settings, start, progress, brief=last_fix.prior(speed_mps) is not None)
     site, camera = matcher.site, matcher.camera
     end_on_sigterm()  # before the fork, so that the worker has it from its first instruction
     if supervise:
         check_supervision(matcher.device)
         become_worker(progress)
-    resumed = _resumed(last_fix.prior(max_speed_mps), site, progress)
+    resumed = _resumed(last_fix.prior(speed_mps), site, progress)
     start = resumed or start
 
     # Before the link: a bench autopilot takes off as soon as the bridge listens.
@@ -236,11 +213,9 @@ def run_mavlink_bridge(
     with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
-                connection, make_navigator, outgoing, start, settings.live_options(MAX_DELAY_MS),
-                origin=link.origin(site, start), use_velocity=link.use_velocity, site=site,
-                check_gnss=link.check_gnss, resumed=resumed is not None, system_id=link.system_id,
-                component_id=link.component_id, key=key, watch=watcher, on_sent=last_fix.keep,
-                gimbal_mount=camera.mount if files.gimbal else None,
+                connection, make_navigator, link, start, settings.live_options(MAX_DELAY_MS),
+                origin=link.origin(site, start), site=site, resumed=resumed is not None, key=key,
+                watch=watcher, on_sent=last_fix.keep, gimbal_mount=camera.mount if files.gimbal else None,
             )  # fmt: skip
         except OSError as error:
             raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None

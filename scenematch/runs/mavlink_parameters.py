@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import require
-from scenematch.bridges.parameters import parameter_file
-from scenematch.runs.folders import StrPath, check_file
+from scenematch.bridges.parameters import MavlinkOptions, parameter_file
 from scenematch.runs.last_fix import measured_delay_ms
-from scenematch.runs.mavlink_bridge import MavlinkSettings
+from scenematch.runs.output import StrPath, check_file
 
 _DEFAULT_DELAY_MS = 100
 
@@ -41,7 +40,7 @@ class ParameterSettings:
 
 
 def write_parameter_file(
-    out: StrPath, link: MavlinkSettings, settings: ParameterSettings | None = None, *, force: bool = False
+    out: StrPath, link: MavlinkOptions, settings: ParameterSettings | None = None, *, force: bool = False
 ) -> WrittenParameters:
     """Write the parameters with which an autopilot uses the bridge's fixes.
 
@@ -55,18 +54,13 @@ def write_parameter_file(
         The delay written, and its source.
     """
     require("pymavlink", "mavlink")
-    out, outgoing, settings = Path(out), link.outgoing(), settings or ParameterSettings()
-    written = _delay(settings.delay_ms)
-    text = parameter_file(outgoing, settings.takeoff, written.delay_ms)
+    out, settings = Path(out), settings or ParameterSettings()
+    delay_ms, source = settings.delay_ms, "given"
+    if delay_ms is None:
+        delay_ms, source = measured_delay_ms(), "measured by the last bridge"
+        if not delay_ms:
+            delay_ms, source = _DEFAULT_DELAY_MS, "assumed; not measured yet"
+    text = parameter_file(link, settings.takeoff, delay_ms)
     check_file(out, force)
     out.write_text(text, encoding="utf-8")
-    return written
-
-
-def _delay(given_ms: int | None) -> WrittenParameters:
-    if given_ms is not None:
-        return WrittenParameters(given_ms, "given")
-    measured_ms = measured_delay_ms()
-    if measured_ms:
-        return WrittenParameters(measured_ms, "measured by the last bridge")
-    return WrittenParameters(_DEFAULT_DELAY_MS, "assumed; not measured yet")
+    return WrittenParameters(delay_ms, source)

@@ -21,8 +21,7 @@ from scenematch.report.loop_record import read_loop_csv
 from scenematch.report.metrics import Ground, errors_en_m, summarise
 from scenematch.report.page import write_page
 from scenematch.report.segments import motion_consistency, segment_errors
-from scenematch.runs.folders import write_json
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, write_json
 from scenematch.runs.record import RunRecord
 
 TRACK, SUMMARY, NOTES, PAGE = "track.csv", "summary.json", "notes.csv", "report.html"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 from engine.camera import Camera
 from engine.errors import BackendError, OptionError
@@ -14,15 +15,14 @@ from scenematch.bridges.vehicle import NedOrigin
 from scenematch.files.ros.messages import camera_from_message, image_from_message
 from scenematch.runs.arguments import parse_position
 from scenematch.runs.cameras import CameraInput
-from scenematch.runs.checks import check_position
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
-from scenematch.runs.map_input import MapInput
+from scenematch.runs.map_input import MapInput, check_position
 from scenematch.runs.mavlink_bridge import BridgeSettings
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
 from scenematch.runs.supervisor import end_on_sigterm
 
-_CAMERA_INFO_TIMEOUT_S = 30.0
+_WAIT_S = 30.0  # for the first message of a topic
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,11 +145,7 @@ def _heard_camera(node: RosNode, ros: RosSettings, progress: Progress) -> Camera
     if described.hfov_deg is None:
         return described.mounted(_published_camera(node, topics.camera_info, progress))
     progress.message(f"waiting for a picture on {topics.image}, whose size is not known")
-    message = node.wait_for(topics.image, topics.image_type, _CAMERA_INFO_TIMEOUT_S)
-    if message is None:
-        raise BackendError(
-            f"image_topic: expected a picture on {topics.image} within {_CAMERA_INFO_TIMEOUT_S:g} s, got none"
-        )
+    message = _heard(node, topics.image, topics.image_type, "image_topic: expected a picture")
     return described.with_field_of_view(image_from_message(message).shape)
 
 
@@ -158,9 +154,13 @@ def _published_camera(node: RosNode, topic: str, progress: Progress) -> Camera:
     if not topic:
         raise OptionError("camera: expected a calibration, or a topic that has it")
     progress.message(f"waiting for the calibration on {topic}")
-    message = node.wait_for(topic, "sensor_msgs/msg/CameraInfo", _CAMERA_INFO_TIMEOUT_S)
+    kind = "sensor_msgs/msg/CameraInfo"
+    return camera_from_message(_heard(node, topic, kind, "camera_info_topic: expected a calibration"))
+
+
+def _heard(node: RosNode, topic: str, msgtype: str, expected: str) -> Any:
+    """The next message of a topic."""
+    message = node.wait_for(topic, msgtype, _WAIT_S)
     if message is None:
-        raise BackendError(
-            f"camera_info_topic: expected a calibration on {topic} within {_CAMERA_INFO_TIMEOUT_S:g} s, got none"
-        )
-    return camera_from_message(message)
+        raise BackendError(f"{expected} on {topic} within {_WAIT_S:g} s, got none")
+    return message

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from scenematch.runs.progress import Progress
+from scenematch.runs.output import Progress
 
 _STATUS_PERIOD_S = 5.0
 _BEATS = 4  # per watchdog interval, so that a late or lost one does not end the bridge

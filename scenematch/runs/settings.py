@@ -10,7 +10,7 @@ from typing import Any
 
 from engine.errors import OptionError
 from engine.matching import METHODS
-from engine.options import LearnedOptions, MatcherOptions, NavigatorOptions, NccOptions, SiftOptions
+from engine.options import MatcherOptions, NavigatorOptions
 from scenematch.files.settings import (
     merged,
     nearest,
@@ -21,12 +21,12 @@ from scenematch.files.settings import (
 )
 from scenematch.files.telemetry import COLUMNS
 from scenematch.runs.arguments import check_choice, check_device, parse_budget, parse_position
-from scenematch.runs.folders import StrPath
+from scenematch.runs.output import StrPath
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrackSettings:
-    """Settings for tracking a flight.
+class TrackSettings(MatcherOptions):
+    """Settings for tracking a flight: those of the matcher, and of the run.
 
     Attributes:
         method: "ncc", "sift", "auto" or "learned".
@@ -49,20 +49,15 @@ class TrackSettings:
     """
 
     method: str = "auto"
-    profile: str = "engine"
     device: str = "auto"
     start: str | None = None
     budget_ms: float | None = None
-    risk: float = 1e-4
     telemetry_columns: dict[str, str] = field(default_factory=dict)
-    ncc: NccOptions = field(default_factory=NccOptions)
-    sift: SiftOptions = field(default_factory=SiftOptions)
-    learned: LearnedOptions = field(default_factory=LearnedOptions)
     navigator: NavigatorOptions = field(default_factory=NavigatorOptions)
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
-        self.matcher_options()  # refuses a profile or a risk that is none
+        MatcherOptions.__post_init__(self)  # super() would be the class before its slots
         if self.profile == "paper" and self.method not in ("ncc", "sift"):
             raise OptionError(f"method: expected ncc or sift with `profile` paper, got {self.method!r}")
         if self.profile == "paper" and self.navigator.odometry:
@@ -77,12 +72,6 @@ class TrackSettings:
             check_choice("telemetry_columns", name, COLUMNS)
             if not theirs.strip():
                 raise OptionError(f"telemetry_columns.{name}: expected the name of a column, got an empty one")
-
-    def matcher_options(self) -> MatcherOptions:
-        """The part of the settings that the matcher takes."""
-        return MatcherOptions(
-            profile=self.profile, risk=self.risk, ncc=self.ncc, sift=self.sift, learned=self.learned
-        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,9 +15,8 @@ from engine.errors import OptionError
 from engine.values import Frame, Prior, Truth
 from scenematch.files.flight import write_flight_folder
 from scenematch.runs.arguments import check_between, check_choice
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder
 from scenematch.runs.inputs import FlightFiles
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder
 from scenematch.runs.results import OWNED
 from scenematch.simulator import CONDITIONS, FlightPlan, FlightStyle, Town, build_town, plan_flight, world_from_map
 from scenematch.simulator.flight import NADIR_PITCH_DEG, paper_camera, reach_m

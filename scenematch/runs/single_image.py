@@ -15,10 +15,8 @@ from engine.values import Fix, Frame, NoFix
 from scenematch.files.frames import PICTURE_SUFFIXES, open_frames, read_image
 from scenematch.runs.arguments import check_choice, check_device, parse_position
 from scenematch.runs.cameras import CameraInput, check_size
-from scenematch.runs.checks import check_position
-from scenematch.runs.folders import StrPath
-from scenematch.runs.map_input import MapInput
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.map_input import MapInput, check_position
+from scenematch.runs.output import SILENT, Progress, StrPath
 
 
 def locate_image(

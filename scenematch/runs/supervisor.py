@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import Any
 
 from engine.errors import OptionError
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress
 
 _PAUSE_S, _MAX_PAUSE_S = 0.05, 5.0  # before a worker is replaced; doubled each time a new one dies at once
 _SHORT_S = 5.0

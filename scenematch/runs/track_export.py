@@ -15,7 +15,7 @@ from scenematch.files.notes import read_notes
 from scenematch.files.track import TrackRow, read_track
 from scenematch.report.metrics import height_pairs_m, truth_per_row
 from scenematch.runs.arguments import check_choice
-from scenematch.runs.folders import StrPath, check_file
+from scenematch.runs.output import StrPath, check_file
 from scenematch.runs.record import read_record
 from scenematch.runs.results import NOTES, SUMMARY, TRACK
 

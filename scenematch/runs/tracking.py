@@ -22,10 +22,9 @@ from scenematch.files.track import TrackRow, TrackWriter, read_track, track_row
 from scenematch.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
 from scenematch.runs.arguments import parse_budget, parse_position
 from scenematch.runs.checking import as_rows, diagnose_flight
-from scenematch.runs.folders import StrPath, check_folder, prepare_folder
 from scenematch.runs.inputs import FlightFiles, FlightInputs, open_inputs
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
-from scenematch.runs.progress import SILENT, Progress
+from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder
 from scenematch.runs.record import PATHS, RunRecord
 from scenematch.runs.results import NOTES, OWNED, TRACK, ReportFrames, write_results
 from scenematch.runs.settings import TrackSettings
@@ -76,7 +75,7 @@ def track(
     start, budget = parse_position("start", settings.start), parse_budget("budget_ms", settings.budget_ms)
     inputs = inputs or open_inputs(files, [settings], progress=progress)
     site, flight = inputs.site, inputs.flight
-    matcher = SceneMatcher(site, inputs.camera, settings.method, settings.device, settings.matcher_options())
+    matcher = SceneMatcher(site, inputs.camera, settings.method, settings.device, settings)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
     prepare_folder(out, force, OWNED)

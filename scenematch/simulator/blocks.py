@@ -24,18 +24,10 @@ def _houses(canvas: Canvas, u: float, v: float, du: float, dv: float) -> None:
         while at < du / 2 - 6:
             length, width = rng.uniform(9, 15), rng.uniform(8, 11)
             canvas.rect(u + at, v + row, 15.5, 19.0, canvas.tint((108, 122, 78), 11), material=GRASS)
-            canvas.rect(
-                u + at + length / 2 + 1.4,
-                v + row - turn * 4,
-                2.6,
-                13,
-                canvas.tint((156, 150, 142)),
-                material=PAVING,
-            )
-            kind, angle = (
-                str(rng.choice(["gable", "hip", "gable"])),
-                rng.choice([0, math.pi / 2]) + rng.normal(0, 0.05),
-            )
+            path = canvas.tint((156, 150, 142))
+            canvas.rect(u + at + length / 2 + 1.4, v + row - turn * 4, 2.6, 13, path, material=PAVING)
+            kind = str(rng.choice(["gable", "hip", "gable"]))
+            angle = rng.choice([0, math.pi / 2]) + rng.normal(0, 0.05)
             building(
                 canvas, u + at, v + row + rng.uniform(-1.5, 1.5), length, width, rng.uniform(5, 8), kind, angle
             )

@@ -84,7 +84,7 @@ def picture_at(
         east_north_up_m: (3,) the camera's position in it, up above the world's height 0.
         attitude: of the body, about true north.
         rng: of the sensor's noise and exposure.
-        optics: exposure time, shutter and gain; None is an ideal camera.
+        optics: exposure time and shutter; None is an ideal camera.
         sway: motion while the picture is taken.
 
     Returns:
@@ -137,7 +137,7 @@ class FlightPlan:
         telemetry: the motion as the sensors measure it.
         timestamps_ns: capture times.
         seed: of the camera's noise.
-        optics: exposure, shutter and gain; None is an ideal camera.
+        optics: exposure and shutter; None is an ideal camera.
         sways: motion during each exposure, if the optics show it.
     """
 
@@ -304,7 +304,7 @@ def plan_flight(
         style: of flying.
         town: to fly over; None builds the seed's by ``town_options``.
         camera: None uses the paper's, 300 x 300 px with 60 degrees.
-        optics: exposure time, shutter and gain of the camera; None is an ideal one.
+        optics: exposure time and shutter of the camera; None is an ideal one.
         **town_options: see :class:`TownOptions`; ignored if a town is given.
 
     Raises:

@@ -26,17 +26,8 @@ from engine.geo import Array, attitude_from_rotation
 from engine.navigation.navigator import Matcher, Navigator
 from engine.navigation.state import NavigatorState
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
-from scenematch.simulator.ekf import (
-    START_TILT_DEG,
-    FilterState,
-    fix_chi_square,
-    fuse_fix,
-    fuse_heading,
-    fuse_height,
-    initial_state,
-)
+from scenematch.simulator import ekf
 from scenematch.simulator.faults import Fault, ShiftedMap
-from scenematch.simulator.history import History
 from scenematch.simulator.light import Image
 from scenematch.simulator.pilot import Gains, Pilot, Route, Setpoint
 from scenematch.simulator.quadrotor import STEP_S, Airframe, State, Wind, WindField, advance, hovering, shaken
@@ -126,7 +117,7 @@ class LoopSample:
 
     time_s: float
     truth: State
-    estimate: FilterState
+    estimate: ekf.FilterState
     plan_m: Array
     mode: Mode
     healthy: bool
@@ -237,7 +228,7 @@ class ClosedLoop:
         self._air, self._pilot = WindField(options.wind, air), Pilot(options.gains)
         self._instruments = Instruments(options.sensors, sensors)
         self._state = hovering(route.position_m[0], float(route.heading_deg[0]))
-        self._history = History(self._initial_estimate(start), options.sensors, 1.0 + options.latency_s)
+        self._history = ekf.History(self._initial_estimate(start), options.sensors, 1.0 + options.latency_s)
         self._navigator: Navigator | None = self._new_engine()
         self._clock_s, self._pace, self._plan = 0.0, 1.0, route.at(0.0)
         self._kicks = deque(route.kicks_s)
@@ -248,12 +239,12 @@ class ClosedLoop:
         self._mode = Mode.FOLLOW
         self.flown = LoopResult([], [], [], self._history.now.position_m)
 
-    def _initial_estimate(self, rng: np.random.Generator) -> FilterState:
+    def _initial_estimate(self, rng: np.random.Generator) -> ekf.FilterState:
         """The state at rest, with errors drawn from the filter's own covariance."""
         sigma, white = self.options.start_sigma_m, rng.standard_normal(5)
         heading = self._instruments.heading_deg(self._state)
-        attitude = Attitude(START_TILT_DEG * white[3], START_TILT_DEG * white[4], heading)
-        return initial_state(self._state.position_m + sigma * white[:3], sigma, attitude, self.options.sensors)
+        attitude = Attitude(ekf.START_TILT_DEG * white[3], ekf.START_TILT_DEG * white[4], heading)
+        return ekf.initial_state(self._state.position_m + sigma * white[:3], sigma, attitude, self.options.sensors)
 
     def _new_engine(self) -> Navigator:
         """A navigator that starts from the filter's estimate."""
@@ -302,10 +293,10 @@ class ClosedLoop:
         now_s = self._history.now.time_s
         if k % steps_between(suite.barometer.rate_hz) == 0:
             height_m = instruments.height_m(state)
-            self._history.fuse(partial(fuse_height, height_m=height_m, suite=suite), now_s)
+            self._history.fuse(partial(ekf.fuse_height, height_m=height_m, suite=suite), now_s)
         if k % steps_between(suite.compass.rate_hz) == 0:
             heading_deg = instruments.heading_deg(state)
-            self._history.fuse(partial(fuse_heading, heading_deg=heading_deg, suite=suite), now_s)
+            self._history.fuse(partial(ekf.fuse_heading, heading_deg=heading_deg, suite=suite), now_s)
 
     def _process_frame(self) -> Frame:
         """Take a picture and match it; the answer arrives after the latency."""
@@ -366,11 +357,11 @@ class ClosedLoop:
         """Fuse a fix if it passes the chi-square gate; otherwise count it."""
         captured_s = answer.truth.time_s
         self._last_fix_s = captured_s
-        if fix_chi_square(self._history.at(captured_s), fix) > self.options.gate:
+        if ekf.fix_chi_square(self._history.at(captured_s), fix) > self.options.gate:
             self._contradictions += 1
             return
         self._contradictions = 0
-        self._history.fuse(partial(fuse_fix, fix=fix), captured_s)
+        self._history.fuse(partial(ekf.fuse_fix, fix=fix), captured_s)
         self.flown.used.append(answer.timestamp_ns)
 
     def _record(self) -> None:

@@ -8,7 +8,7 @@ Convention:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any
 
@@ -22,8 +22,6 @@ from engine.values import Attitude
 from scenematch.simulator.light import Array, Float32, Image
 from scenematch.simulator.render import World, render_frame
 
-GAIN_LIMITS = (0.25, 8.0)
-"""Range of the gain of automatic exposure."""
 MAX_VIEW = 4.0
 """Size of the pinhole picture that the lens is resampled from, as a multiple of the camera's."""
 
@@ -75,14 +73,12 @@ class Sensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Optics:
-    """Exposure time, shutter and gain of a camera; the defaults are an ideal one.
+    """Exposure time and shutter of a camera; the defaults are an ideal one.
 
     Attributes:
         exposure_ms: exposure of each row; motion during it blurs the row. 0 freezes motion.
         readout_ms: from the first row to the last; each row sees another pose (rolling shutter). 0 is a global
             shutter.
-        gain: multiplies light and noise alike.
-        target_level: mean grey level that automatic exposure aims at, in addition to the gain; None disables it.
         exposure_samples: number of poses averaged for motion blur.
 
     Raises:
@@ -91,14 +87,12 @@ class Optics:
 
     exposure_ms: float = 0.0
     readout_ms: float = 0.0
-    gain: float = 1.0
-    target_level: float | None = None
     exposure_samples: int = 5
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value, minimum = getattr(self, item.name), 0.0 if item.name.endswith("_ms") else 1e-3
-            if value is not None and not minimum <= value < math.inf:
+            if not minimum <= value < math.inf:
                 raise OptionError(f"{item.name}: expected {minimum:g} or more, got {value}")
 
     @property
@@ -145,7 +139,7 @@ def take_picture(
         attitude: of the body, about true north.
         rng: of noise and exposure.
         sensor: how light becomes grey levels.
-        optics: exposure, shutter and gain; None is an ideal camera.
+        optics: exposure and shutter; None is an ideal camera.
         sway: motion during the picture; None for none.
 
     Returns:
@@ -159,19 +153,7 @@ def take_picture(
         seen = _resampled(*view, _row_rays(camera, attitude, up_m - world.ground_at(grid_m), optics, sway))
     else:
         seen = render_frame(*view)
-    return _exposed(sensor, optics, seen).develop(seen, rng)
-
-
-def _exposed(sensor: Sensor, optics: Optics, seen: Image) -> Sensor:
-    """The sensor with the gain that automatic exposure sets for the scene."""
-    gain = optics.gain
-    if optics.target_level is not None:
-        level = 255.0 * float(np.mean((seen / 255.0) ** sensor.gamma)) * gain
-        gain *= float(np.clip(optics.target_level / max(level, 1e-3), *GAIN_LIMITS))
-    if gain == 1.0:
-        return sensor
-    r, g, b = (gain * balance for balance in sensor.balance_rgb)
-    return replace(sensor, balance_rgb=(r, g, b), noise_sd=sensor.noise_sd * max(gain, 1.0))
+    return sensor.develop(seen, rng)
 
 
 @lru_cache(maxsize=4)

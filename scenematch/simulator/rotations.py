@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 
 from engine.geo import Array
@@ -31,19 +32,7 @@ def rotation(vector_rad: Array) -> Array:
     Returns:
         (3, 3) rotation matrix.
     """
-    x, y, z = vector_rad.tolist()
-    angle2 = x * x + y * y + z * z
-    angle = math.sqrt(angle2)
-    a = math.sin(angle) / angle if angle > 1e-6 else 1.0 - angle2 / 6.0
-    b = (1.0 - math.cos(angle)) / angle2 if angle > 1e-4 else 0.5 - angle2 / 24.0
-    c = 1.0 - b * angle2
-    return np.array(
-        [
-            [c + b * x * x, b * x * y - a * z, b * x * z + a * y],
-            [b * x * y + a * z, c + b * y * y, b * y * z - a * x],
-            [b * x * z - a * y, b * y * z + a * x, c + b * z * z],
-        ]
-    )
+    return np.asarray(cv2.Rodrigues(vector_rad)[0], dtype=np.float64)
 
 
 def rotation_vector(matrix: Array) -> Array:
@@ -53,7 +42,7 @@ def rotation_vector(matrix: Array) -> Array:
         matrix: (3, 3) rotation by less than half a turn.
 
     Returns:
-        (3,) in radians.
+        (3,) in radians; cv2.Rodrigues would return 0 below 1e-5.
     """
     twice_sine = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
     sine = 0.5 * float(np.linalg.norm(twice_sine))

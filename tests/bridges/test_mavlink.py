@@ -26,6 +26,7 @@ from pymavlink.quaternion import Quaternion
 from engine.camera import mount_rotation
 from engine.errors import OptionError, TelemetryError
 from engine.geo import LocalFrame
+from engine.options import NavigatorOptions
 from engine.values import Attitude, NoFix, Prior, Reason
 from scenematch.bridges import mavlink_requests
 from scenematch.bridges.fix_velocity import GroundVelocity, VelocityFromFixes
@@ -33,9 +34,7 @@ from scenematch.bridges.links import Connection, parse_connection
 from scenematch.bridges.mavlink import CONFIRM_COMMAND, MavlinkBridge
 from scenematch.bridges.mavlink_in import HANDLED_MESSAGES, REQUESTED_RATES_HZ, AutopilotClock, MavlinkTelemetry
 from scenematch.bridges.mavlink_out import (
-    MESSAGES,
     FixReport,
-    MavlinkOptions,
     command_message,
     fix_message,
     heartbeat_message,
@@ -55,7 +54,7 @@ from scenematch.bridges.packets import (
     read_key,
     signing_time,
 )
-from scenematch.bridges.parameters import parameter_file
+from scenematch.bridges.parameters import MESSAGES, MavlinkOptions, parameter_file
 from scenematch.bridges.pictures import replay
 from scenematch.bridges.vehicle import NedOrigin, VehicleState, north_east_m
 from scenematch.cli.app import run as main
@@ -787,6 +786,8 @@ class Standin:
 class Matched:
     """A navigator whose every frame is a fix; it re-localises when asked to."""
 
+    options = NavigatorOptions()
+
     def __init__(self):
         self.reset_count, self.frames, self.result = 0, [], None
 
@@ -930,7 +931,7 @@ def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(loop, m
 )
 def test_an_origin_is_set_when_no_receiver_will_set_a_better_one(begin_s, armed, receiver, expected_s):
     """By a clock of the test's own, asked every 0.1 s: how long after the vehicle is first heard."""
-    requests, telemetry = AutopilotRequests(1, MavlinkOptions(), ORIGIN, with_gimbal=False), MavlinkTelemetry()
+    requests, telemetry = AutopilotRequests(MavlinkOptions(), ORIGIN, with_gimbal=False), MavlinkTelemetry()
     now_ns = 10**15
     requests.restart(now_ns)
     telemetry.update(mavlink.MAVLink_gps_raw_int_message(0, receiver, 0, 0, 0, 0, 0, 0, 0, 0), now_ns)
@@ -944,7 +945,7 @@ def test_an_origin_is_set_when_no_receiver_will_set_a_better_one(begin_s, armed,
 
 
 def test_an_origin_that_is_lost_is_set_again_only_after_the_wait():
-    requests = AutopilotRequests(1, MavlinkOptions(), ORIGIN, with_gimbal=False)
+    requests = AutopilotRequests(MavlinkOptions(), ORIGIN, with_gimbal=False)
     requests.restart(0)
     for second in range(60):
         known = ORIGIN if second < 40 else None
@@ -1043,7 +1044,7 @@ def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(loop
 
 
 def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(loop):
-    made, pilot = loop(component_id=194, use_velocity=False)
+    made, pilot = loop(MavlinkOptions(component_id=194, use_velocity=False))
     camera, station = autopilot(component=197), autopilot(system=255, component=190)
     for number in (197, 194):
         word = mavlink.MAVLink_command_long_message(1, number, CONFIRM_COMMAND, 0, *[0.0] * 7)
@@ -1064,7 +1065,7 @@ def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(loo
 
 @pytest.mark.parametrize(("use_velocity", "expected"), [(True, 0.0), (False, None)])
 def test_the_autopilots_velocity_is_used_if_the_bridge_is_told_so(loop, use_velocity, expected):
-    made, _ = loop(use_velocity=use_velocity, pilot={})
+    made, _ = loop(MavlinkOptions(use_velocity=use_velocity), pilot={})
     frames = made.navigator.frames
     fly(made.bridge, lambda: len(frames) > 10 and frames[-1].heading_deg is not None)
     assert (frames[-1].east_velocity_mps, frames[-1].north_velocity_mps) == (expected, expected)
@@ -1093,6 +1094,15 @@ def test_only_a_first_fix_waits_for_the_autopilots_word_on_its_receiver(loop, re
     else:
         fly(made.bridge, lambda: made.bridge.status.withheld.get("receiver not heard yet", 0) > 5)
         assert not pilot.of("VISION_POSITION_ESTIMATE")
+
+
+def test_the_navigators_options_decide_what_contradicts_the_track(loop, monkeypatch):
+    monkeypatch.setattr(Matched, "options", NavigatorOptions(gate=1e9))
+    made, pilot = loop()
+    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
+    made.navigator.result = fix(east_m=40.0)
+    fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE")[-1][0].y > 30.0)
+    assert "contradicts the track" not in made.bridge.status.withheld
 
 
 def test_reset_counter_steps_once_per_relocalisation(loop):

@@ -18,7 +18,7 @@ from engine.maps.rasters import GrayReader
 from engine.values import Window
 from scenematch.cli import console
 from scenematch.cli.app import run
-from scenematch.runs.checks import check_start
+from scenematch.runs.inputs import check_start
 from tests.support.rasters import from_corner, whole, write_raster
 
 SIDE = 17_000

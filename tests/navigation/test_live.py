@@ -13,10 +13,12 @@ import pytest
 
 from engine.errors import OptionError, StateError, TelemetryError
 from engine.navigation.live import Live, LiveOptions
+from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason
 from tests.support.fixes import a_fix
 
 IMAGE = np.zeros((4, 4), np.uint8)
+OPTIONS = NavigatorOptions(max_speed_mps=16.0)
 
 
 def frame(number: int) -> Frame:
@@ -42,7 +44,7 @@ class Navigators:
         if callable(odd):
             odd()
             odd = {}
-        return SimpleNamespace(update=partial(self.update, odd))
+        return SimpleNamespace(update=partial(self.update, odd), options=OPTIONS)
 
     def update(self, odd, frame, prior=None, budget=None):
         self.budgets.append(budget.total_ms)
@@ -210,7 +212,7 @@ def test_a_worker_that_hangs_is_replaced_and_starts_from_the_last_fix():
     assert live.counts.workers_replaced == 1
     first, second = navigators.starts
     assert first is None
-    assert (second.east_m, second.sigma_m) == (0.0, 1.0 + 15.0 * 1.5)
+    assert (second.east_m, second.sigma_m) == (0.0, pytest.approx(1.0 + 16.0 * 1.5))
     assert [a.frame.timestamp_ns for a in answers] == [0, 1, 2, 3]
 
 

@@ -235,11 +235,11 @@ def wait_for(happened):
 def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
     stated = []
     answer = Answer(Frame(np.zeros((3, 3), np.uint8), 1), NoFix(reason=Reason.NO_TEXTURE), 1.0)
-    quiet = lambda prior: None  # noqa: E731
+    quiet = lambda prior: SimpleNamespace(options=None)  # noqa: E731
     if bridge == "mavlink":
         mavlink = pytest.importorskip("scenematch.bridges.mavlink", reason="pymavlink is not installed")
         from scenematch.bridges.links import Connection
-        from scenematch.bridges.mavlink_out import MavlinkOptions
+        from scenematch.bridges.parameters import MavlinkOptions
 
         made = mavlink.MavlinkBridge(
             Connection("udpin", "127.0.0.1", 0), quiet, MavlinkOptions(), watch=stated.append

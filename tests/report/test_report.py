@@ -12,9 +12,8 @@ from engine.geo import LocalFrame
 from engine.values import Truth
 from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
-from scenematch.report.segments import motion_consistency
 from scenematch.report.metrics import Ground, TrackErrors, errors_en_m, summarise
-from scenematch.report.segments import segment_ends, segment_errors
+from scenematch.report.segments import motion_consistency, segment_ends, segment_errors
 
 HERE = LocalFrame(32.79, 34.99)
 SECOND_NS = 1_000_000_000

@@ -13,8 +13,8 @@ from scenematch.files.truth import read_truth
 from scenematch.report.metrics import summarise
 from scenematch.report.verdict import metres
 from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
+from scenematch.runs.evaluation import report
 from scenematch.runs.inputs import FlightFiles
-from scenematch.runs.reporting import report
 from scenematch.runs.settings import TrackSettings
 from scenematch.runs.tracking import track
 from tests.support.contrast import SCRIPT

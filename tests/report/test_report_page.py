@@ -313,7 +313,7 @@ def test_a_page_for_a_folder_that_is_not_there_is_refused_before_anything_is_dra
     flown, tmp_path, monkeypatch, capsys
 ):
     other = shutil.copytree(flown, tmp_path / "other")
-    monkeypatch.setattr("scenematch.runs.reporting.draw_together", lambda *_, **__: pytest.fail("drawn"))
+    monkeypatch.setattr("scenematch.runs.evaluation.draw_together", lambda *_, **__: pytest.fail("drawn"))
     page = tmp_path / "nofolder" / "x.html"
     line = refusal(capsys, ["evaluate", flown, other, f"--out={page}"])
     assert line == f"--out: expected a file in a folder that exists, got {page}\n"

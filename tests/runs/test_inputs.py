@@ -16,8 +16,8 @@ from scenematch.files.corrections import Corrections
 from scenematch.files.flight import camera_info
 from scenematch.files.geotiff import write_geotiff
 from scenematch.runs.cameras import CameraInput
-from scenematch.runs.checks import check_pictures
 from scenematch.runs.evaluation import recorded_files
+from scenematch.runs.inputs import check_pictures
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.record import RunRecord
 from tests.support.commands import refusal

@@ -29,7 +29,7 @@ from scenematch.runs.bridge_files import BridgeFiles
 from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
-from scenematch.runs.progress import Progress
+from scenematch.runs.output import Progress
 from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
 from scenematch.runs.service import _BEATS, running_service, status_reporter
 from tests.support.paths import ROOT

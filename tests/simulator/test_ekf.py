@@ -13,8 +13,7 @@ from engine.errors import StateError
 from engine.geo import enu_from_body
 from engine.values import Attitude
 from scenematch.simulator import ekf
-from scenematch.simulator.ekf import STATES, FilterState, fuse_fix, fuse_heading, fuse_height
-from scenematch.simulator.history import History
+from scenematch.simulator.ekf import STATES, FilterState, History, fuse_fix, fuse_heading, fuse_height
 from scenematch.simulator.quadrotor import STEP_S, Airframe, IdealImu, Wind, WindField, advance, hovering, shaken
 from scenematch.simulator.rotations import rotation, rotation_vector
 from scenematch.simulator.sensors import Instruments, SensorSuite

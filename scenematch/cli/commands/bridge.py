@@ -9,27 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from engine.errors import OptionError
-from scenematch.cli import console
-from scenematch.cli.options import (
-    EXPERT,
-    INPUT,
-    MAP,
-    OUTPUT,
-    CameraOptions,
-    ForceOption,
-    JsonOption,
-    MapOptions,
-    MatchingOptions,
-    RerunOption,
-    SettingsOption,
-    SurfaceOption,
-    flag,
-    live_view,
-    option,
-    read_settings,
-    table,
-    with_options,
-)
+from scenematch.cli import console, options
+from scenematch.cli.options import EXPERT, INPUT, MAP, OUTPUT, flag, option, table, with_options
 
 if TYPE_CHECKING:
     from scenematch.runs.live_viewing import LiveViewTarget
@@ -57,7 +38,7 @@ class LinkOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureOptions(CameraOptions):
+class PictureOptions(options.CameraOptions):
     """The camera, or recorded pictures.
 
     Attributes:
@@ -80,34 +61,20 @@ class OptionalMapOptions:
     """
 
     map: Annotated[Path | None, option("--map", "FILE", MAP)] = None
-    surface: SurfaceOption = None
+    surface: options.SurfaceOption = None
 
     def map_input(self, settings: Settings) -> MapInput:
         """The map combined with its settings."""
         if self.map is None:
             raise OptionError("map: expected a file, got none")
-        return MapOptions(map=self.map, surface=self.surface).map_input(settings)
+        return options.MapOptions(map=self.map, surface=self.surface).map_input(settings)
 
 
-@dataclass(frozen=True, kw_only=True)
-class OtherWork:
-    """What to do instead of sending fixes.
-
-    Attributes:
-        out: Write the autopilot's parameters for these fixes, then exit.
-        measure_delay: Measure the camera's latency, then exit.
-    """
-
-    out: Annotated[Path | None, option("--write-params", "FILE", OUTPUT)] = None
-    measure_delay: Annotated[bool, flag("--measure-delay", OUTPUT)] = False
-
-
-def _bridge_settings(matching: MatchingOptions, settings: Settings) -> BridgeSettings:
+def _bridge_settings(matching: options.MatchingOptions, settings: Settings) -> BridgeSettings:
     """How a bridge matches frames: the options combined with the settings."""
     how = matching.track_settings(settings)
-    matcher = how.matcher_options()
     same = {name: getattr(how, name) for name in ("method", "device", "start", "navigator")}
-    made: BridgeSettings = table(settings, "bridge", **same, matcher=matcher)
+    made: BridgeSettings = table(settings, "bridge", **same, matcher=how)
     return made
 
 
@@ -115,14 +82,15 @@ def _bridge_settings(matching: MatchingOptions, settings: Settings) -> BridgeSet
 def mavlink(
     autopilot: LinkOptions,
     pictures: PictureOptions,
-    matching: MatchingOptions,
+    matching: options.MatchingOptions,
     site: OptionalMapOptions,
-    other: OtherWork,
+    out: Annotated[Path | None, option("--write-params", "FILE", OUTPUT)] = None,
+    measure_delay: Annotated[bool, flag("--measure-delay", OUTPUT)] = False,
     supervise: Annotated[bool, flag("--supervise", EXPERT)] = False,
-    settings: SettingsOption = None,
-    rerun: RerunOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    settings: options.SettingsOption = None,
+    rerun: options.RerunOption = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Send fixes to an autopilot by MAVLink.
 
@@ -132,25 +100,28 @@ def mavlink(
     compares the rotation in the pictures with the autopilot's attitude.
 
     Options:
+        out: Write the autopilot's parameters for these fixes, then exit.
+        measure_delay: Measure the camera's latency, then exit.
         supervise: Keep a loaded standby process that takes over if the worker dies.
     """
-    given, hint = read_settings(settings), ""
-    if other.out is not None:
-        following = _write_parameters(autopilot, given, other.out, force, as_json)
-        hint = f"load {other.out} into the autopilot"
+    given, hint = options.read_settings(settings), ""
+    if out is not None:
+        following = _write_parameters(autopilot, given, out, force, as_json)
+        hint = f"load {out} into the autopilot"
     elif autopilot.connect is None:
         raise OptionError("connect: expected a link to the autopilot, got none")
-    elif other.measure_delay:
+    elif measure_delay:
         following = _measure_delay(autopilot, pictures, given, as_json)
     else:
-        following = _bridge(autopilot, pictures, matching, site, given, supervise, live_view(rerun), as_json)
+        shown = options.live_view(rerun)
+        following = _bridge(autopilot, pictures, matching, site, given, supervise, shown, as_json)
     console.next_step(following, as_json=as_json, hint=hint)
 
 
 def _bridge(
     autopilot: LinkOptions,
     pictures: PictureOptions,
-    matching: MatchingOptions,
+    matching: options.MatchingOptions,
     site: OptionalMapOptions,
     given: Settings,
     supervise: bool,
@@ -171,7 +142,7 @@ def _bridge(
     )
     link, how = autopilot.link(given), _bridge_settings(matching, given)
     status = run_mavlink_bridge(files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS)
-    console.facts(asdict(status), as_json, title=f"{link.outgoing().kind} to {link.connect}")
+    console.facts(asdict(status), as_json, title=f"{link.kind} to {link.connect}")
     flown = console.options(
         map=site.map, surface=site.surface, camera=pictures.camera, hfov_deg=pictures.hfov_deg,
         frames=pictures.frames, telemetry=pictures.telemetry,
@@ -215,16 +186,16 @@ def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, fo
 
 @with_options
 def ros(
-    site: MapOptions,
-    lens: CameraOptions,
-    matching: MatchingOptions,
+    site: options.MapOptions,
+    lens: options.CameraOptions,
+    matching: options.MatchingOptions,
     ros_arguments: Annotated[list[str] | None, typer.Argument(metavar="NAME:=VALUE")] = None,
     version: Annotated[int, option("--ros", "1|2", INPUT)] = 2,
     image: Annotated[str | None, option("--image-topic", "NAME", INPUT)] = None,
     firmware: Annotated[str | None, option("--firmware", "none|ardupilot|px4", INPUT)] = None,
-    settings: SettingsOption = None,
-    rerun: RerunOption = None,
-    as_json: JsonOption = False,
+    settings: options.SettingsOption = None,
+    rerun: options.RerunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Run as a node of ROS 1 or ROS 2.
 
@@ -241,7 +212,7 @@ def ros(
 
     from scenematch.runs.ros_bridge import run_ros_bridge
 
-    given = read_settings(settings)
+    given = options.read_settings(settings)
     node = table(
         given,
         "ros",
@@ -254,7 +225,7 @@ def ros(
     if image is not None:
         node = replace(node, topics=replace(node.topics, image=image))
     how = _bridge_settings(matching, given)
-    status = run_ros_bridge(node, how, live_view=live_view(rerun), progress=console.PROGRESS)
+    status = run_ros_bridge(node, how, live_view=options.live_view(rerun), progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"ROS {version} on {node.topics.image}")
     flown = console.options(map=site.map, surface=site.surface)
     console.next_step(f"track {flown} --frames BAG --out out", as_json=as_json)

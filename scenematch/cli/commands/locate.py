@@ -8,17 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scenematch.cli import console
-from scenematch.cli.options import (
-    CameraOptions,
-    JsonOption,
-    MapOptions,
-    MatchingOptions,
-    SettingsOption,
-    option,
-    read_settings,
-    with_options,
-)
+from scenematch.cli import console, options
+from scenematch.cli.options import option, with_options
 
 if TYPE_CHECKING:
     from engine.values import Fix, NoFix
@@ -27,16 +18,16 @@ if TYPE_CHECKING:
 @with_options
 def locate(
     image: Annotated[Path, typer.Argument(metavar="IMAGE")],
-    site: MapOptions,
-    lens: CameraOptions,
+    site: options.MapOptions,
+    lens: options.CameraOptions,
     *,
     height_agl_m: Annotated[float | None, option("--height-agl", "M")] = None,
     heading_deg: Annotated[float | None, option("--heading", "DEG")] = None,
     roll_deg: Annotated[float | None, option("--roll", "DEG")] = None,
     pitch_deg: Annotated[float | None, option("--pitch", "DEG")] = None,
-    matching: MatchingOptions,
-    settings: SettingsOption = None,
-    as_json: JsonOption = False,
+    matching: options.MatchingOptions,
+    settings: options.SettingsOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Find one picture on the map.
 
@@ -52,7 +43,7 @@ def locate(
     from engine.values import Fix
     from scenematch.runs.single_image import locate_image
 
-    given = read_settings(settings)
+    given = options.read_settings(settings)
     how = matching.track_settings(given)
     result = locate_image(
         image,
@@ -65,7 +56,7 @@ def locate(
         start=how.start,
         method=how.method,
         device=how.device,
-        options=how.matcher_options(),
+        options=how,
         progress=console.PROGRESS,
     )
     facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)

@@ -8,22 +8,8 @@ from typing import Annotated
 
 import typer
 
-from scenematch.cli import console, tables
-from scenematch.cli.options import (
-    EXPERT,
-    MAP,
-    OUTPUT,
-    ForceOption,
-    JsonOption,
-    OutOption,
-    SettingsOption,
-    SurfaceOption,
-    flag,
-    option,
-    read_settings,
-    table,
-    with_options,
-)
+from scenematch.cli import console, options, tables
+from scenematch.cli.options import EXPERT, MAP, OUTPUT, flag, option, with_options
 
 MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a picture with a world file.")]
 
@@ -31,10 +17,10 @@ MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="GeoTIFF, or a 
 @with_options
 def info(
     map_path: MapArgument,
-    surface: SurfaceOption = None,
+    surface: options.SurfaceOption = None,
     map_bounds: Annotated[str | None, option("--map-bounds", "W,S,E,N", MAP)] = None,
     map_crs: Annotated[str | None, option("--map-crs", "EPSG:N", MAP)] = None,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Show size, ground sample distance, CRS and bounds.
 
@@ -56,17 +42,17 @@ def info(
 @with_options
 def audit(
     map_path: MapArgument,
-    out: OutOption,
-    surface: SurfaceOption = None,
+    out: options.OutOption,
+    surface: options.SurfaceOption = None,
     camera: Annotated[Path | None, option("--camera", "FILE")] = None,
     height_agl_m: Annotated[float | None, option("--height-agl", "M")] = None,
     route: Annotated[Path | None, option("--route", "FILE")] = None,
     around: Annotated[str | None, option("--around", "LAT,LON,RADIUS_M")] = None,
     corridor_m: Annotated[float | None, option("--corridor-m", "M")] = None,
     other: Annotated[Path | None, option("--other", "FILE")] = None,
-    settings: SettingsOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    settings: options.SettingsOption = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Predict where frames can be matched.
 
@@ -85,13 +71,13 @@ def audit(
     from scenematch.runs.map_audit import AuditFiles, audit_map
     from scenematch.runs.map_input import MapInput
 
-    given = read_settings(settings)
-    site = MapInput(map_path, surface=surface, **table(given, "input").of(MapInput))
+    given = options.read_settings(settings)
+    site = MapInput(map_path, surface=surface, **options.table(given, "input").of(MapInput))
     files = AuditFiles(
         map=site, camera=camera, route=route, other=other, height_agl_m=height_agl_m, around=around,
         corridor_m=corridor_m,
     )  # fmt: skip
-    result = audit_map(files, out, table(given, "audit"), force=force, progress=console.PROGRESS)
+    result = audit_map(files, out, options.table(given, "audit"), force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json(result.summary)
     else:
@@ -126,10 +112,10 @@ class WantedMap:
 def fetch(
     what: WantedMap,
     out: Annotated[Path, option("--out", "FILE", OUTPUT)],
-    settings: SettingsOption = None,
+    settings: options.SettingsOption = None,
     dry_run: Annotated[bool, flag("--dry-run", EXPERT)] = False,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Fetch a map from a server that you name.
 
@@ -143,7 +129,7 @@ def fetch(
     from scenematch.runs.map_fetch import fetch_map
 
     given = asdict(what) | {"dry_run": dry_run, "force": force}
-    wanted = table(read_settings(settings), "fetch", **given)
+    wanted = options.table(options.read_settings(settings), "fetch", **given)
     facts = fetch_map(wanted, out, console.PROGRESS)
     console.facts(facts, as_json, title=f"map around {what.around}")
     if dry_run:

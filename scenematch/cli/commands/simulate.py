@@ -1,4 +1,4 @@
-"""The command `simulate`."""
+"""The commands that fly over a generated town: `demo` and `simulate`."""
 
 from __future__ import annotations
 
@@ -7,23 +7,43 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from engine.errors import OptionError
-from scenematch.cli import console
-from scenematch.cli.options import (
-    MAP,
-    OUTPUT,
-    ForceOption,
-    JsonOption,
-    RerunOption,
-    SurfaceOption,
-    flag,
-    live_view,
-    option,
-    use_threads,
-    with_options,
-)
+from scenematch.cli import console, options, tables
+from scenematch.cli.options import MAP, OUTPUT, flag, option, with_options
 
 if TYPE_CHECKING:
     from scenematch.runs.simulation import WorldSettings
+
+
+@with_options
+def demo(
+    out: Annotated[Path, option("--out", "DIR", OUTPUT)] = Path("demo-report"),
+    frames: Annotated[int | None, option("--frames", "N", min=2)] = None,
+    seed: Annotated[int, option("--seed", "N", min=0)] = 1,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Track a built-in flight with both methods.
+
+    Generates a town and the paper's flight over it, tracks it by NCC and SIFT, each with the paper's recipe and
+    with this engine's, and prints the results beside the paper's Table I. Needs no data.
+
+    Options:
+        out: Report folder.
+        frames: Fly only the first N frames.
+        seed: Number of the generated town and flight.
+    """
+    from scenematch.runs.demo import run_demo
+
+    options.use_threads()
+    results = run_demo(out, frames=frames, seed=seed, force=force, progress=console.PROGRESS)
+    if as_json:
+        console.print_json(results)
+    else:
+        tables.print_paper_table(results, seed)
+    console.say(f"report: {out.resolve()}")
+    console.next_step(
+        "check --map MAP --frames FRAMES", as_json=as_json, hint=f"open {out}/ncc-engine/report.html"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +62,7 @@ class WorldOptions:
     condition: Annotated[str | None, option("--condition", "NAME")] = None
     relief_m: Annotated[float, option("--relief-m", "H")] = 0.0
     map: Annotated[Path | None, option("--map", "FILE", MAP)] = None
-    surface: SurfaceOption = None
+    surface: options.SurfaceOption = None
     camera_pitch_deg: Annotated[float, option("--camera-pitch-deg", "P")] = -90.0
 
     def world(self) -> WorldSettings:
@@ -75,9 +95,9 @@ def simulate(
     town: WorldOptions,
     loop: LoopOptions,
     frames: Annotated[int | None, option("--frames", "N", min=1)] = None,
-    rerun: RerunOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
+    rerun: options.RerunOption = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate a flight, with ground truth.
 
@@ -90,7 +110,7 @@ def simulate(
     """
     from scenematch.runs.inputs import FOLDER_LAYOUT
 
-    use_threads()
+    options.use_threads()
     world = town.world()
     given: dict[str, Any] = {"minutes": loop.minutes, "method": loop.method, "fault": loop.fault}
     if loop.closed_loop:
@@ -99,7 +119,7 @@ def simulate(
         if frames is not None:
             raise OptionError("frames: expected without `closed_loop`, which has `minutes`")
         settings = ClosedLoopSettings(**{name: value for name, value in given.items() if value is not None})
-        shown = live_view(rerun)
+        shown = options.live_view(rerun)
         facts = fly_closed_loop(out, world, settings, force=force, live_view=shown, progress=console.PROGRESS)
     else:
         from scenematch.runs.arguments import check_unused
