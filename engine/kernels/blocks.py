@@ -13,10 +13,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from engine.kernels import surface_loops
-from engine.kernels.accuracy import FLOAT32_NORM_RATIO
 from engine.kernels.sums import check_finite
 from engine.runtime.threads import in_parallel
 
@@ -24,6 +23,9 @@ FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 _Block = tuple[tuple[slice, slice], NDArray[np.floating]]  # where its scores lie, and its transform
 
+# A float32 transform has an error of about 1e-7 of the window's norm in every numerator, which is divided by the
+# norm of a patch: if a patch's norm is smaller than the window's by this factor, the transform is in float64.
+_FLOAT32_NORM_RATIO = 16.0
 # Transforms of longer sides leave the cache, and cost twice as much per pixel.
 _CACHED_SIDE = 1152
 _MAX_BLOCKS = 16  # along one axis
@@ -134,7 +136,7 @@ def correlate(
     kinds = {spectrum.dtype for _, spectrum in blocks}
 
     def one_template(t: int) -> None:
-        spectra = {kind: spectrum_of(models[t], size, kind) for kind in kinds}
+        spectra = {kind: spectrum_of(models[t], np.empty(size, kind)) for kind in kinds}
 
         def one_block(block: _Block) -> None:
             part, spectrum = block
@@ -166,27 +168,27 @@ def _window_spectrum(
     """The transform of a window minus a mean, in float64 if some patch is too weak for float32."""
     values: NDArray[np.floating] = np.empty(size, np.float32)
     energy = surface_loops.centre(values, window, mean)
-    if energy * float(inverse_norms.max()) ** 2 > FLOAT32_NORM_RATIO**2:
+    if energy * float(inverse_norms.max()) ** 2 > _FLOAT32_NORM_RATIO**2:
         values = values.astype(np.float64)
     transform(values, 0, window.shape[0])
     return values
 
 
-def spectrum_of(model: NDArray[Any], size: tuple[int, int], kind: DTypeLike) -> NDArray[np.floating]:
-    """The transform of a template with zeros beyond it.
+def spectrum_of(values: NDArray[Any], out: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The transform of a picture with zeros beyond it.
 
     Args:
-        model: (h, w).
-        size: rows and columns of the transform.
-        kind: its floating type.
+        values: (h, w).
+        out: (rows, columns) takes the transform, in the packed order of OpenCV's real transforms.
 
     Returns:
-        (rows, columns) in the packed order of OpenCV's real transforms.
+        ``out``.
     """
-    values = np.zeros(size, kind)
-    values[: model.shape[0], : model.shape[1]] = model
-    transform(values, 0, model.shape[0])
-    return values
+    height, width = values.shape
+    out[:height, :width] = values
+    out[:height, width:], out[height:] = 0.0, 0.0
+    transform(out, 0, height)
+    return out
 
 
 def _write_scores(

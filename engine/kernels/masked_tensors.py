@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import cv2
 
-from engine.kernels.accuracy import FLAT_SHARE
+from engine.kernels.sums import FLAT_SHARE
 from engine.kernels.tensors import check_all_finite
 from engine.runtime.tensors import Tensor, torch
 

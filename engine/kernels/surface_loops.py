@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from engine.kernels.accuracy import FLAT_SHARE
+from engine.kernels.sums import FLAT_SHARE
 from engine.runtime.jit import compiled, inlined
 
 
@@ -116,11 +116,19 @@ def box_sums(picture, h, w):
 @inlined
 def _sum_rows(down, down_squares, picture, y, h, mean):
     """Sums over h rows of every column, the first of them y, from those of y - 1; both are 0 before y = 0."""
-    if y > 0:
-        _slide(down, down_squares, picture[y + h - 1], picture[y - 1], mean)
+    if y == 0:
+        for first in range(h):
+            row = picture[first]
+            for x in range(len(row)):
+                value = row[x] - mean
+                down[x] += value
+                down_squares[x] += value * value
         return
-    for first in range(h):
-        _add(down, down_squares, picture[first], mean)
+    after, before = picture[y + h - 1], picture[y - 1]
+    for x in range(len(after)):
+        new, old = after[x] - mean, before[x] - mean
+        down[x] += new - old
+        down_squares[x] += (new - old) * (new + old)
 
 
 @inlined
@@ -131,23 +139,6 @@ def _sum_along(along, along_squares, down, down_squares):
         total += down[x]
         square += down_squares[x]
         along[x + 1], along_squares[x + 1] = total, square
-
-
-@inlined
-def _add(down, down_squares, row, mean):
-    for x in range(len(row)):
-        value = row[x] - mean
-        down[x] += value
-        down_squares[x] += value * value
-
-
-@inlined
-def _slide(down, down_squares, after, before, mean):
-    """Add one row and take another away."""
-    for x in range(len(after)):
-        new, old = after[x] - mean, before[x] - mean
-        down[x] += new - old
-        down_squares[x] += (new - old) * (new + old)
 
 
 @compiled("(f4[:, ::1], f4[:, ::1], f8)")
