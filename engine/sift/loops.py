@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from engine.kernels import sift_descriptors
 from engine.kernels.sift_extrema import TAPS, find_extrema
-from engine.kernels.sift_refinement import refine_extrema
-from engine.kernels.sift_selection import spread_out
+from engine.kernels.sift_refinement import refine_extrema, spread_out
 from engine.runtime import threads
 from engine.sift.descriptors import ORIENT_STEP, orientation_weights, tents
 from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, Octave, octaves_of, reach_px
