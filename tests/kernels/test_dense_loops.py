@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engine.kernels import dense_loops
-from engine.kernels.dense_loops import median
+from engine.kernels.dense_loops import CELLS, EDGE_PX, median
 from engine.kernels.gauss_newton import by_parameters
 from engine.kernels.lower_plane import lower_plane
 
-SIDE_PX, CELLS, EDGE_PX, HEIGHT_M = 120, 8, 2.0, 80.0
+SIDE_PX, HEIGHT_M = 120, 80.0
 MATRIX = np.array([[130.0, 0.0, 59.5], [0.0, 128.0, 58.0], [0.0, 0.0, 1.0]])
 
 
@@ -33,7 +33,7 @@ def look(scene, *, center_m=None, rotation=None, slope=None, gradients=None):
     return dense_loops.project(
         picture, MATRIX, turned if rotation is None else rotation, center if center_m is None else center_m,
         leaning if slope is None else slope, offset_m, np.zeros(3),
-        np.zeros((count, 2)) if gradients is None else gradients, np.ones(count), EDGE_PX, CELLS,
+        np.zeros((count, 2)) if gradients is None else gradients, np.ones(count),
     )  # fmt: skip
 
 

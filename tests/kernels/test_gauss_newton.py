@@ -47,7 +47,7 @@ def test_sums_for_the_covariance_are_those_of_the_definition(samples):
     shown, expected, points, offset_m, rotation, weights, differences, cells = samples
     one, two = (rows(g, points, offset_m, rotation) for g in (shown, expected))
     own, common, of_map, by_cell = information(
-        shown, expected, points, offset_m, rotation, weights, differences, cells, 64
+        shown, expected, points, offset_m, rotation, weights, differences, cells
     )
     for found, a, b in ((own, one, one), (common, one, two), (of_map, two, two)):
         right = (a.T * weights) @ b
