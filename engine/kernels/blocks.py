@@ -7,7 +7,6 @@ mostly in float64. Blocks with weak patches in a window of strong contrast use f
 from __future__ import annotations
 
 import math
-import threading
 from functools import cache, lru_cache
 from typing import Any
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from engine.kernels import surface_loops
 from engine.kernels.sums import check_finite
-from engine.runtime.threads import in_parallel
+from engine.runtime.threads import in_parallel, own_array
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -195,26 +194,12 @@ def _write_scores(
     out: FloatImage, block: NDArray[np.floating], model: NDArray[np.floating], inverse_norms: FloatImage
 ) -> None:
     """Write the scores by the transforms of part of a window and of a template, both of one type."""
-    products = _scratch(block.shape, block.dtype)
+    products = own_array("products", block.shape, block.dtype)
     cv2.mulSpectrums(block, model, 0, products, True)
     transform(products, cv2.DFT_INVERSE, out.shape[0])
     if products.dtype != np.float32:
         products = products[: out.shape[0], : out.shape[1]].astype(np.float32)
     surface_loops.normalise(out, products, inverse_norms, np.float32(1.0 / block.size))
-
-
-_kept = threading.local()
-
-
-def _scratch(shape: tuple[int, ...], kind: np.dtype[np.floating]) -> NDArray[np.floating]:
-    """An array that the thread keeps between calls: fresh memory pages cost as much as a transform."""
-    count, name = math.prod(shape), kind.name
-    memory: NDArray[np.floating] | None = getattr(_kept, name, None)
-    if memory is None or memory.size < count:
-        memory = np.empty(count, kind)
-        if count <= _CACHED_SIDE**2:  # larger ones are not kept
-            setattr(_kept, name, memory)
-    return memory[:count].reshape(shape)
 
 
 def transform(values: NDArray[np.floating], flags: int, rows: int) -> None:

@@ -4,7 +4,6 @@ Keypoints are rows (K, 6) float32 in the pixels of their octave: x, y, sigma ove
 contrast, level, octave.
 """
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -164,7 +163,8 @@ def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Fl
     Returns:
         The Gaussian levels (N,), which the thread's next call overwrites; and keypoints (K, 6).
     """
-    buffer, found, source = _buffer(plan.octaves[-1][0].end), [], image
+    buffer = threads.own_array("scale space", (plan.octaves[-1][0].end,), np.float32)
+    found, source = [], image
     threshold = contrast_threshold / SCALES
     limits = (SCALES, _MOVES, threshold, _MAX_SHIFT, EDGE_RATIO)
     for number, (octave, across, down) in enumerate(plan.octaves):
@@ -272,14 +272,3 @@ def _pixel_px(keypoints: Floats, plan: LoopPlan) -> Floats:
 def _in_parts(work: Callable[[tuple[int, int]], AnyArray], parts: list[tuple[int, int]]) -> AnyArray:
     done = threads.in_parallel(work, parts)
     return done[0] if len(done) == 1 else np.concatenate(done)
-
-
-_local = threading.local()
-
-
-def _buffer(size: int) -> Floats:
-    """The thread's own memory for a scale space: allocating new pages takes a tenth of the time."""
-    buffer: Floats | None = getattr(_local, "buffer", None)
-    if buffer is None or buffer.size < size:
-        buffer = _local.buffer = np.empty(size, np.float32)
-    return buffer[:size]
