@@ -27,8 +27,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.errors import ShapeError
-
 Array = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
@@ -54,13 +52,6 @@ class Samples:
     values: Array
     gradients: Array
     weights: Array
-
-    def __post_init__(self) -> None:
-        count = len(self.points_m)
-        shapes = {"points_m": (count, 3), "values": (count,), "gradients": (count, 2), "weights": (count,)}
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ShapeError(f"{name}: expected {shape}, got {getattr(self, name).shape}")
 
 
 @dataclass(frozen=True, slots=True)
