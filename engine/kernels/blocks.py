@@ -7,7 +7,7 @@ mostly in float64. Blocks with weak patches in a window of strong contrast use f
 from __future__ import annotations
 
 import math
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -28,6 +28,7 @@ _FLOAT32_NORM_RATIO = 16.0
 # Transforms of longer sides leave the cache, and cost twice as much per pixel.
 _CACHED_SIDE = 1152
 _MAX_BLOCKS = 16  # along one axis
+_USES_IPP = hasattr(cv2, "ipp") and bool(cv2.ipp.useIPP())
 
 
 def ncc_surface(search: FloatImage, templates: FloatImage, *, zero_mean: bool) -> FloatImage:
@@ -213,9 +214,4 @@ def transform(values: NDArray[np.floating], flags: int, rows: int) -> None:
         flags: of ``cv2.dft``.
         rows: number of rows that are not zero, or for an inverse that are wanted.
     """
-    cv2.dft(values, values, flags, 0 if _uses_ipp() else rows)
-
-
-@cache
-def _uses_ipp() -> bool:
-    return hasattr(cv2, "ipp") and bool(cv2.ipp.useIPP())
+    cv2.dft(values, values, flags, 0 if _USES_IPP else rows)
