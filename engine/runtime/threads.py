@@ -110,9 +110,12 @@ def own_array(use: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any
     """Memory that the thread keeps from call to call: fresh pages cost as much as a transform.
 
     Args:
-        use: what it is for; the thread's next call for this use and type overwrites it.
+        use: what it is for.
         shape: of the array.
         dtype: of its elements.
+
+    Returns:
+        The array, which the thread's next call for this use and type overwrites.
     """
     size, name = math.prod(shape), f"{use} {np.dtype(dtype).char}"
     memory: NDArray[Any] | None = getattr(_own, name, None)
