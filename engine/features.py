@@ -135,7 +135,7 @@ def prepare_plans(sides_px: Iterable[int]) -> None:
 
     for side_px, upsample in itertools.product(sides_px, (1, 2)):
         for octave in octaves_of(side_px, side_px, upsample):
-            loops.filters_of(octave, octave.source[0])
+            loops.filters(octave.source[0], octave.sigmas, octave.up)
 
 
 def plans_created() -> int:

@@ -78,7 +78,7 @@ def ncc(
         if not 0.0 < min_overlap <= 1.0:
             raise OptionError(f"min_overlap: expected above 0 and at most 1, got {min_overlap}")
         pictures = as_arrays(search, search_valid, templates)
-        scores = _masked_kernels(pictures[0]).ncc_surface(*pictures, min_overlap=min_overlap)
+        scores = _kernels(pictures[0], masked=True).ncc_surface(*pictures, min_overlap=min_overlap)
     else:
         if types[0] in _DOUBLE or types[1] in _DOUBLE:
             pictures = [as_tensor(as_float(v, "float64")) for v in (search, templates)]
@@ -114,25 +114,15 @@ def _check_mask(search: Picture, mask: Picture) -> None:
         raise ShapeError(f"search_valid: expected {tuple(search.shape)}, got {tuple(mask.shape)}")
 
 
-def _kernels(picture: Picture) -> Any:
+def _kernels(picture: Picture, *, masked: bool = False) -> Any:
     """The kernels of arrays, or those of tensors; torch and numba take a while to import."""
     if isinstance(picture, np.ndarray):
-        from engine.kernels import blocks
+        from engine.kernels import blocks, masked_blocks
 
-        return blocks
-    from engine.kernels import tensors
+        return masked_blocks if masked else blocks
+    from engine.kernels import masked_tensors, tensors
 
-    return tensors
-
-
-def _masked_kernels(picture: Picture) -> Any:
-    if isinstance(picture, np.ndarray):
-        from engine.kernels import masked_blocks
-
-        return masked_blocks
-    from engine.kernels import masked_tensors
-
-    return masked_tensors
+    return masked_tensors if masked else tensors
 
 
 def surface(search: MapRegion, templates: Given) -> Given:
@@ -175,14 +165,9 @@ def surfaces(search: MapRegion, templates: Given, *, group: int) -> Iterator[Giv
     known = search.image if search.sums is None else search.sums
     inverse_norms = kernels.inverse_norm(known, *templates.shape[-2:])
     for first in range(0, len(templates), group):
-        part = _of_kind(search, templates[first : first + group])
+        part = same_kind_as(search.image, templates[first : first + group])
         found = kernels.prepared_surface(search.image, inverse_norms, part - part.mean((-2, -1), keepdims=True))
         yield same_kind_as(templates, found)
-
-
-def _of_kind(search: MapRegion, template: Picture) -> Picture:
-    """The template as an array if the map is one; else unchanged."""
-    return as_arrays(template)[0] if isinstance(search.image, np.ndarray) else template
 
 
 def match_template(search: MapRegion, template: Picture, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
@@ -206,7 +191,7 @@ def match_template(search: MapRegion, template: Picture, *, exclusion_px: float,
     """
     _check_fit(search, template[None])
     if isinstance(search.image, np.ndarray) and not exhaustive:
-        found = coarse_to_fine.peak(search, as_arrays(template)[0], exclusion_px)
+        found = coarse_to_fine.peak(search, same_kind_as(search.image, template), exclusion_px)
         if found is not None:
             return found
     return find_peak(surface(search, template[None])[0], exclusion_px=exclusion_px)

@@ -7,25 +7,28 @@ mostly in float64. Blocks with weak patches in a window of strong contrast use f
 from __future__ import annotations
 
 import math
-import threading
-from functools import cache, lru_cache
-from typing import Any, NamedTuple
+from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from engine.kernels import surface_loops
-from engine.kernels.accuracy import FLOAT32_NORM_RATIO
 from engine.kernels.sums import check_finite
-from engine.runtime.threads import in_parallel
+from engine.runtime.threads import in_parallel, own_array
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+_Block = tuple[tuple[slice, slice], NDArray[np.floating]]  # where its scores lie, and its transform
 
+# A float32 transform has an error of about 1e-7 of the window's norm in every numerator, which is divided by the
+# norm of a patch: if a patch's norm is smaller than the window's by this factor, the transform is in float64.
+_FLOAT32_NORM_RATIO = 16.0
 # Transforms of longer sides leave the cache, and cost twice as much per pixel.
 _CACHED_SIDE = 1152
 _MAX_BLOCKS = 16  # along one axis
+_USES_IPP = hasattr(cv2, "ipp") and bool(cv2.ipp.useIPP())
 
 
 def ncc_surface(search: FloatImage, templates: FloatImage, *, zero_mean: bool) -> FloatImage:
@@ -71,7 +74,7 @@ def write_surfaces(
     inverse_norms = surface_loops.inverse_norms(window, mean, energy, *templates.shape[1:], zero_mean)
     if asked is not None:
         inverse_norms[~asked] = 0.0
-    correlate(out, window, (mean, energy), inverse_norms, [model for model, _ in models])
+    correlate(out, window, mean, inverse_norms, [model for model, _ in models])
 
 
 def inverse_norm(image: FloatImage, h: int, w: int) -> FloatImage:
@@ -104,86 +107,44 @@ def prepared_surface(image: FloatImage, inverse_norms: FloatImage, templates: Fl
     image = np.ascontiguousarray(image)  # loops over a crop of a larger picture would not be vectorised
     out = np.empty((len(templates), *inverse_norms.shape), np.float32)
     models = [surface_loops.unit(picture, False)[0] for picture in np.ascontiguousarray(templates)]
-    correlate(out, image, surface_loops.moments(image, False), inverse_norms, models)
+    correlate(out, image, 0.0, inverse_norms, models)
     return out
 
 
-class _Block(NamedTuple):
-    """The transform of part of a window, and where its scores lie on the surface."""
-
-    spectrum: NDArray[np.floating]  # float64 if some patch is too weak for float32
-    rows: slice
-    columns: slice
-
-
 def correlate(
-    out: FloatImage,
-    window: FloatImage,
-    moments: tuple[float, float],
-    inverse_norms: FloatImage,
-    models: list[FloatImage],
+    out: FloatImage, window: FloatImage, mean: float, inverse_norms: FloatImage, models: list[FloatImage]
 ) -> None:
     """Write the scores of all templates.
 
     Args:
         out: (T, H-h+1, W-w+1) takes the scores.
         window: (H, W).
-        moments: its mean and its sum of squares about it.
+        mean: of the window.
         inverse_norms: (H-h+1, W-w+1) reciprocal norm of every patch; 0 makes its score 0.
         models: T templates (h, w) of norm 1, about their means where the scores are.
     """
     (height, width), (h, w) = out.shape[1:], models[0].shape
     (ny, rows), (nx, columns) = _division(height, h), _division(width, w)
-    size, mean = (rows, columns), moments[0]
-    if ny == nx == len(models) == 1:
-        _write_pair(out[0], window, moments, inverse_norms, models[0], size)
-        return
+    size = (rows, columns)
 
     def prepared(index: int) -> _Block:
         y, x = index // nx * (rows - h + 1), index % nx * (columns - w + 1)
-        part = slice(y, min(y + rows - h + 1, height)), slice(x, min(x + columns - w + 1, width))
-        spectrum = _window_spectrum(window[y : y + rows, x : x + columns], mean, size, inverse_norms[part])
-        return _Block(spectrum, *part)
+        part = np.s_[y : y + rows - h + 1, x : x + columns - w + 1]
+        return part, _window_spectrum(window[y : y + rows, x : x + columns], mean, size, inverse_norms[part])
 
     blocks = in_parallel(prepared, range(ny * nx))
+    kinds = {spectrum.dtype for _, spectrum in blocks}
 
     def one_template(t: int) -> None:
-        spectra = {kind: spectrum_of(models[t], size, kind) for kind in {block.spectrum.dtype for block in blocks}}
+        spectra = {kind: spectrum_of(models[t], np.empty(size, kind)) for kind in kinds}
 
         def one_block(block: _Block) -> None:
-            part, spectrum = (block.rows, block.columns), block.spectrum
+            part, spectrum = block
             _write_scores(out[t][part], spectrum, spectra[spectrum.dtype], inverse_norms[part])
 
         in_parallel(one_block, blocks)
 
     in_parallel(one_template, range(len(models)))
-
-
-def _write_pair(
-    out: FloatImage,
-    window: FloatImage,
-    moments: tuple[float, float],
-    inverse_norms: FloatImage,
-    model: FloatImage,
-    size: tuple[int, int],
-) -> None:
-    """Write the scores of one template in a window of one block: both pictures in one complex transform."""
-    mean, energy = moments
-    if _is_weak(energy, float(inverse_norms.max())):
-        spectrum = _window_spectrum(window, mean, size, inverse_norms)
-        _write_scores(out, spectrum, spectrum_of(model, size, spectrum.dtype), inverse_norms)
-        return
-    packed, products = _scratch("packed", (*size, 2)), _scratch("products", size)
-    surface_loops.pack(packed, window, mean, 1.0 / math.sqrt(energy) if energy > 0.0 else 0.0, model)
-    cv2.dft(packed, packed)
-    surface_loops.packed_product(products, packed)
-    transform(products, cv2.DFT_INVERSE, out.shape[0])
-    surface_loops.normalise(out, products, inverse_norms, np.float32(math.sqrt(energy) / products.size))
-
-
-def _is_weak(energy: float, largest: float) -> bool:
-    """Whether some patch, by the largest of the inverse norms, is too weak in this window for float32."""
-    return energy * largest**2 > FLOAT32_NORM_RATIO**2
 
 
 @lru_cache(maxsize=1024)
@@ -207,53 +168,39 @@ def _window_spectrum(
     """The transform of a window minus a mean, in float64 if some patch is too weak for float32."""
     values: NDArray[np.floating] = np.empty(size, np.float32)
     energy = surface_loops.centre(values, window, mean)
-    if _is_weak(energy, float(inverse_norms.max())):
+    if energy * float(inverse_norms.max()) ** 2 > _FLOAT32_NORM_RATIO**2:
         values = values.astype(np.float64)
     transform(values, 0, window.shape[0])
     return values
 
 
-def spectrum_of(model: NDArray[Any], size: tuple[int, int], kind: DTypeLike) -> NDArray[np.floating]:
-    """The transform of a template with zeros beyond it.
+def spectrum_of(values: NDArray[Any], out: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The transform of a picture with zeros beyond it.
 
     Args:
-        model: (h, w).
-        size: rows and columns of the transform.
-        kind: its floating type.
+        values: (h, w).
+        out: (rows, columns) takes the transform, in the packed order of OpenCV's real transforms.
 
     Returns:
-        (rows, columns) in the packed order of OpenCV's real transforms.
+        ``out``.
     """
-    values = np.zeros(size, kind)
-    values[: model.shape[0], : model.shape[1]] = model
-    transform(values, 0, model.shape[0])
-    return values
+    height, width = values.shape
+    out[:height, :width] = values
+    out[:height, width:], out[height:] = 0.0, 0.0
+    transform(out, 0, height)
+    return out
 
 
 def _write_scores(
     out: FloatImage, block: NDArray[np.floating], model: NDArray[np.floating], inverse_norms: FloatImage
 ) -> None:
     """Write the scores by the transforms of part of a window and of a template, both of one type."""
-    products = _scratch("products", block.shape, block.dtype)
+    products = own_array("products", block.shape, block.dtype)
     cv2.mulSpectrums(block, model, 0, products, True)
     transform(products, cv2.DFT_INVERSE, out.shape[0])
     if products.dtype != np.float32:
         products = products[: out.shape[0], : out.shape[1]].astype(np.float32)
     surface_loops.normalise(out, products, inverse_norms, np.float32(1.0 / block.size))
-
-
-_kept = threading.local()
-
-
-def _scratch(name: str, shape: tuple[int, ...], kind: DTypeLike = np.float32) -> NDArray[Any]:
-    """An array that the thread keeps between calls: fresh memory pages cost as much as a transform."""
-    count, name = math.prod(shape), f"{name} {np.dtype(kind).char}"
-    memory: NDArray[Any] | None = getattr(_kept, name, None)
-    if memory is None or memory.size < count:
-        memory = np.empty(count, kind)
-        if count <= 2 * _CACHED_SIDE**2:  # complex numbers of one block; larger ones are not kept
-            setattr(_kept, name, memory)
-    return memory[:count].reshape(shape)
 
 
 def transform(values: NDArray[np.floating], flags: int, rows: int) -> None:
@@ -263,13 +210,8 @@ def transform(values: NDArray[np.floating], flags: int, rows: int) -> None:
     of a part of the rows.
 
     Args:
-        values: (H, W) float32 or float64, or (H, W, 2) complex numbers.
+        values: (H, W) float32 or float64.
         flags: of ``cv2.dft``.
         rows: number of rows that are not zero, or for an inverse that are wanted.
     """
-    cv2.dft(values, values, flags, 0 if _uses_ipp() else rows)
-
-
-@cache
-def _uses_ipp() -> bool:
-    return hasattr(cv2, "ipp") and bool(cv2.ipp.useIPP())
+    cv2.dft(values, values, flags, 0 if _USES_IPP else rows)

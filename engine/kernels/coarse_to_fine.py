@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from engine.kernels.local import LocalScores
 from engine.kernels.peaks import FAR, NEAR, best_positions, fit_peak
-from engine.kernels.search_levels import COARSE_TEMPLATE_PX, MAX_HALVINGS, MapRegion
+from engine.kernels.search_levels import COARSE_TEMPLATE_PX, MapRegion
 from engine.kernels.sums import halved
 from engine.values import Peak
 
@@ -153,17 +153,14 @@ def _levels(search: MapRegion, template: FloatImage, min_overlap: float, max_los
         max_loss: of a perfect match between pixels, beyond which a level is too coarse.
     """
     parts, models = [search], [template - template.mean()]
-    while True:
-        part, model = parts[-1], models[-1]
-        (H, W), (h, w) = part.image.shape, model.shape
-        if len(parts) > MAX_HALVINGS or part.half is None or min(h, w) < 2 * COARSE_TEMPLATE_PX:
+    while (half := parts[-1].half) is not None:
+        (H, W), (h, w) = parts[-1].image.shape, models[-1].shape
+        if min(h, w) < 2 * COARSE_TEMPLATE_PX or H * W < _MIN_HALVED_PX or min(H - h, W - w) < 16:
             break
-        if H * W < _MIN_HALVED_PX or min(H - h, W - w) < 16:
+        coarser = halved(models[-1])
+        if max_loss < 1.0 and _phase_loss(models[-1], coarser) > max_loss:
             break
-        coarser = halved(model)
-        if max_loss < 1.0 and _phase_loss(model, coarser) > max_loss:
-            break
-        parts.append(part.half)
+        parts.append(half)
         models.append(coarser)
     return _Levels(parts, models, min_overlap) if len(parts) > 1 else None
 

@@ -27,8 +27,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.errors import ShapeError
-
 Array = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
@@ -36,10 +34,6 @@ MIN_SAMPLES = 60
 MAX_STEPS = 12
 """Gauss-Newton steps at most; four or five are usual."""
 _LAST_STEP = 0.5  # in standard deviations of the pose; the next one would be a tenth of it
-_EDGE_PX = 2.0  # border of the picture that is not sampled
-# The score vector is summed over 8 x 8 cells of the picture: the scatter of the sums accounts for errors that
-# neighbouring samples have in common.
-_CELLS = 8
 _EXCESS = 1.6  # variance factor at which the errors over six simulated towns at noon match the covariance
 
 
@@ -58,13 +52,6 @@ class Samples:
     values: Array
     gradients: Array
     weights: Array
-
-    def __post_init__(self) -> None:
-        count = len(self.points_m)
-        shapes = {"points_m": (count, 3), "values": (count,), "gradients": (count, 2), "weights": (count,)}
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ShapeError(f"{name}: expected {shape}, got {getattr(self, name).shape}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +144,7 @@ def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> floa
     offset_m = np.ascontiguousarray((samples.points_m - pose.center_m).T)
     levels, _, _, _, weights, _, count = dense_loops.project(
         picture.levels, picture.matrix, np.ascontiguousarray(pose.rotation), pose.center_m, pose.slope,
-        offset_m, pose.center_m, samples.gradients, samples.weights, _EDGE_PX, _CELLS,
+        offset_m, pose.center_m, samples.gradients, samples.weights,
     )  # fmt: skip
     return float(dense_loops.compare_levels(levels, samples.values, weights)[2]) if count >= MIN_SAMPLES else 0.0
 
@@ -183,7 +170,7 @@ def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: Gaussia
         picture.levels, picture.matrix, rotation, start.center_m, start.slope,
         prior_rotation, prior.pose.center_m, prior.pose.slope, prior.precision,
         offset_m, samples.values, samples.gradients, samples.weights,
-        _EDGE_PX, _CELLS, MIN_SAMPLES, MAX_STEPS, _EXCESS, _LAST_STEP**2,
+        MIN_SAMPLES, MAX_STEPS, _EXCESS, _LAST_STEP**2,
     )  # fmt: skip
     if not found:
         return None
@@ -208,7 +195,6 @@ def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
 
     own, common, of_map, by_cell = gauss_newton.information(
         fit.shown, fit.expected, fit.points, fit.offsets_m, fit.rotation, fit.weights, fit.differences, fit.cells,
-        _CELLS**2,
     )  # fmt: skip
     variance = max(float(fit.weights @ fit.differences**2 / fit.weights.sum()), 1e-12)
     reference = _inverse(own / variance + prior.precision)

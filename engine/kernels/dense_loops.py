@@ -10,16 +10,19 @@ import numpy as np
 from engine.kernels.small_matrices import pixel_of, rotated
 from engine.runtime.jit import compiled, inlined
 
+EDGE_PX = 2.0
+"""Border of the picture that is not sampled: differences reach so far."""
+CELLS = 8
+"""Along each side of the picture. The score vector is summed over them: the scatter of the sums accounts for
+errors that neighbouring samples have in common."""
 # Median absolute differences at which the weight reaches 0: 4.685 standard deviations for Tukey's biweight, and
 # normal noise has one of 1.4826 such medians.
 _FAR = 4.685 * 1.4826
 _MEDIAN_STEP = 3  # the median uses every third difference
 
 
-@compiled(
-    "(f4[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8, i8)"
-)
-def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradients, known, edge_px, cells):
+@compiled("(f4[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])")
+def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradients, known):
     """Project samples into the picture by a pose, and read levels and gradients there.
 
     Args:
@@ -32,8 +35,6 @@ def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradi
         pivot_m: (3,) of the slope.
         gradients: (N, 2) of the map, per metre to the east and to the north.
         known: (N,) weights.
-        edge_px: border of the picture that is not sampled, at least 2.
-        cells: along each side of the picture.
 
     Returns:
         levels (N,); points (3, N) in the camera; derivatives (3, N) of the levels by the points, from the
@@ -43,7 +44,7 @@ def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradi
     samples, (height, width), shift = known.size, picture.shape, pivot_m - center_m
     levels, weights, cell = np.zeros(samples), np.zeros(samples), np.zeros(samples, np.int64)
     points, shown, expected = np.zeros((3, samples)), np.zeros((3, samples)), np.zeros((3, samples))
-    right, bottom, count = width - 1.0 - edge_px, height - 1.0 - edge_px, 0
+    right, bottom, count = width - 1.0 - EDGE_PX, height - 1.0 - EDGE_PX, 0
     for n in range(samples):
         e, north, up = _from_camera(offset_m, n, shift, slope)
         points[0, n], points[1, n], points[2, n] = x, y, z = rotated(rotation, e, north, up)
@@ -51,12 +52,12 @@ def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradi
             continue
         across, down = x / z, y / z
         u, v = pixel_of(matrix, across, down)
-        if not (edge_px < u < right and edge_px < v < bottom):
+        if not (EDGE_PX < u < right and EDGE_PX < v < bottom):
             continue
         levels[n], by_u, by_v = _bilinear(picture, u, v)
         shown[0, n], shown[1, n], shown[2, n] = _by_point(matrix, by_u, by_v, across, down, z)
         _from_map(expected, rotation, gradients, n, e, north, up)
-        cell[n] = int(v / bottom * cells) * cells + int(u / right * cells)
+        cell[n] = int(v / bottom * CELLS) * CELLS + int(u / right * CELLS)
         weights[n], count = known[n], count + 1
     return levels, points, shown, expected, weights, cell, count
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.dense_loops import compare_levels, project
-from engine.kernels.small_matrices import mirror, solve, turn, turn_between
+from engine.kernels.dense_loops import CELLS, compare_levels, project
+from engine.kernels.small_matrices import add_equation, mirror, solve, turn, turn_between
 from engine.runtime.jit import compiled
 
 _PARAMETERS = 8
@@ -17,11 +17,11 @@ _PARAMETERS = 8
 
 @compiled(
     "(f4[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], "
-    "f8[::1], f8[:, ::1], f8[::1], f8, i8, i8, i8, f8, f8)"
+    "f8[::1], f8[:, ::1], f8[::1], i8, i8, f8, f8)"
 )
 def gauss_newton(
     picture, matrix, rotation, center_m, slope, prior_rotation, prior_center_m, prior_slope, precision,
-    offset_m, values, gradients, known, edge_px, cells, least, steps, excess, last_step,
+    offset_m, values, gradients, known, least, steps, excess, last_step,
 ):  # fmt: skip
     """Steps until the last one is small.
 
@@ -39,8 +39,6 @@ def gauss_newton(
         values: (N,) of the map.
         gradients: (N, 2) of the map, per metre to the east and to the north.
         known: (N,) weights.
-        edge_px: border of the picture that is not sampled, at least 2.
-        cells: along each side of the picture.
         least: number of visible samples with which to go on.
         steps: at most.
         excess: factor on the variance of the differences.
@@ -57,7 +55,7 @@ def gauss_newton(
     while True:
         seen = rotation.copy()
         levels, points, shown, expected, weights, cell, count = project(
-            picture, matrix, seen, center_m, slope, offset_m, prior_center_m, gradients, known, edge_px, cells
+            picture, matrix, seen, center_m, slope, offset_m, prior_center_m, gradients, known
         )
         if count < least:
             found = False
@@ -111,17 +109,9 @@ def normal_equations(shown, expected, points, offset_m, rotation, weights, diffe
         weight = weights[n] * scale
         if weight <= 0.0:
             continue
-        a, b, c = (
-            0.5 * (shown[0, n] + expected[0, n]),
-            0.5 * (shown[1, n] + expected[1, n]),
-            0.5 * (shown[2, n] + expected[2, n]),
-        )
-        by_parameters(row, a, b, c, points, offset_m, rotation, n)
-        for i in range(_PARAMETERS):
-            weighted = weight * row[i]
-            score[i] -= weighted * differences[n]
-            for j in range(i + 1):
-                normal[i, j] += weighted * row[j]
+        a, b, c = shown[0, n] + expected[0, n], shown[1, n] + expected[1, n], shown[2, n] + expected[2, n]
+        by_parameters(row, 0.5 * a, 0.5 * b, 0.5 * c, points, offset_m, rotation, n)
+        add_equation(normal, score, row, weight, -differences[n])
     mirror(normal)
     return normal, score
 
@@ -136,8 +126,8 @@ def by_parameters(row, a, b, c, points, offset_m, rotation, n):
     row[6], row[7] = -row[2] * offset_m[0, n], -row[2] * offset_m[1, n]
 
 
-@compiled("(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], i8[::1], i8)")
-def information(shown, expected, points, offset_m, rotation, weights, differences, cell, cells):
+@compiled("(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], i8[::1])")
+def information(shown, expected, points, offset_m, rotation, weights, differences, cell):
     """Sums over the samples, for the covariance.
 
     Args:
@@ -149,14 +139,13 @@ def information(shown, expected, points, offset_m, rotation, weights, difference
         weights: (N,) of the samples.
         differences: (N,) of picture and map.
         cell: (N,) of the picture.
-        cells: number of cells.
 
     Returns:
         (8, 8) information by the picture's gradients; (8, 8) by both, its symmetric part; (8, 8) by the map's;
-        (8, cells) score vectors by the mean of both, summed over the cells.
+        (8, C) score vectors by the mean of both, summed over the C cells.
     """
     own, common = np.zeros((_PARAMETERS, _PARAMETERS)), np.zeros((_PARAMETERS, _PARAMETERS))
-    of_map, by_cell = np.zeros((_PARAMETERS, _PARAMETERS)), np.zeros((_PARAMETERS, cells))
+    of_map, by_cell = np.zeros((_PARAMETERS, _PARAMETERS)), np.zeros((_PARAMETERS, CELLS**2))
     one, two = np.zeros(_PARAMETERS), np.zeros(_PARAMETERS)
     for n in range(weights.size):
         weight = weights[n]

@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels.accuracy import FLAT_SHARE
-from engine.kernels.sums import box_sum
+from engine.kernels.sums import FLAT_SHARE, box_sum
 
 FloatImage = NDArray[np.float32]
 Sums = NDArray[np.float64]

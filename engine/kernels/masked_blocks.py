@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels import surface_loops
-from engine.kernels.accuracy import FLAT_SHARE
 from engine.kernels.blocks import Mask, fast_side, spectrum_of, transform, write_surfaces
-from engine.kernels.sums import box_sum, check_finite, counts, integrals
+from engine.kernels.sums import FLAT_SHARE, box_sum, check_finite, counts, integrals
 
 Array = NDArray[np.float64]
 
@@ -96,7 +95,8 @@ def _score_partial(
     size = fast_side(rows + h - 1), fast_side(columns + w - 1)
     models = [_model(template, size) for template in templates]
     window, valid, mean = picture
-    floor = FLAT_SHARE * _energy(window, valid, mean)
+    shown = window[valid] - np.float64(mean)
+    floor = FLAT_SHARE * float(np.dot(shown, shown))
     # Kept from block to block: fresh pages of memory cost as much as a transform.
     spectra, products = np.empty((2, *size)), np.empty((3, *size))
     for y, x in corners:
@@ -105,8 +105,8 @@ def _score_partial(
         mask = valid[inner].astype(np.float32)
         values = np.where(valid[inner], window[inner] - np.float64(mean), 0.0)
         boxes = integrals(values), counts(valid[inner])
-        for spectrum, shown in zip(spectra, (values, mask), strict=True):
-            _write_spectrum(spectrum, shown)
+        spectrum_of(values, spectra[0])
+        spectrum_of(mask, spectra[1])
         for t, model in enumerate(models):
             pairs = (spectra[0], model.values), (spectra[1], model.values), (spectra[1], model.squares)
             for product, (one, other) in zip(products, pairs, strict=True):
@@ -114,12 +114,6 @@ def _score_partial(
                 transform(product, cv2.DFT_INVERSE, rows)
             floors = floor, FLAT_SHARE * model.energy
             surface_loops.masked_scores(out[t][part], asked[part], products, boxes, (h, w), floors)
-
-
-def _energy(window: NDArray[Any], valid: Mask, mean: float) -> float:
-    """Sum of squares about the mean."""
-    shown = window[valid] - np.float64(mean)
-    return float(np.dot(shown, shown))
 
 
 def _blocks(asked: Mask, h: int, w: int) -> tuple[tuple[int, int], list[tuple[int, int]]]:
@@ -144,11 +138,4 @@ def _model(template: NDArray[Any], size: tuple[int, int]) -> _Model:
     values -= values[0, 0]  # of one level are exact zeros
     values -= values.mean()
     squares = values * values
-    return _Model(float(squares.sum()), *(spectrum_of(part, size, np.float64) for part in (values, squares)))
-
-
-def _write_spectrum(out: Array, values: NDArray[Any]) -> None:
-    height, width = values.shape
-    out[:height, :width] = values
-    out[:height, width:], out[height:] = 0.0, 0.0
-    transform(out, 0, height)
+    return _Model(float(squares.sum()), *(spectrum_of(part, np.empty(size)) for part in (values, squares)))

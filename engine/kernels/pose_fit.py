@@ -9,10 +9,9 @@ import math
 
 import numpy as np
 
-from engine.kernels.small_matrices import mirror, pixel_of, rotated, solve, turn, turn_between
+from engine.kernels.small_matrices import add_equation, mirror, pixel_of, rotated, solve, turn, turn_between
 from engine.runtime.jit import compiled, inlined
 
-_SIX = 6
 _FAR_PX = 1e9  # assigned coordinates of points behind the camera
 
 
@@ -83,8 +82,8 @@ def fit_pose(
     reach = slack * slack * square
     variance, freedom, found = reach / 9.0, np.inf, True
     rotation, center = rotation.copy(), center.copy()
-    delta, angles, covariance = np.empty(_SIX), np.empty(3), np.empty((_SIX, _SIX))
-    inliers, information = np.empty(weights.size, np.bool_), np.zeros((_SIX, _SIX))
+    delta, angles, covariance = np.empty(6), np.empty(3), np.empty((6, 6))
+    inliers, information = np.empty(weights.size, np.bool_), np.zeros((6, 6))
     tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
     count = _mark_within(squared, reach, inliers)
     while True:
@@ -102,9 +101,9 @@ def fit_pose(
             for j in range(3):
                 gradient[3 + i] -= precision[i, j] * angles[j]
         size = determined = 0.0
-        for i in range(_SIX):
+        for i in range(6):
             delta[i] = 0.0
-            for j in range(_SIX):
+            for j in range(6):
                 delta[i] += covariance[i, j] * gradient[j]
                 determined += covariance[i, j] * normal[i, j]
                 information[i, j] = gain * normal[i, j]
@@ -135,7 +134,7 @@ def normal_equations(tangents, projected, squared, pixels, matrix, weights, reac
     In the camera's axes, with x = R (X - C), R <- exp([w]) R and C <- C + R^T c:  dx = -c + w x x,  and the pixel
     is K x / z.
     """
-    normal, gradient, row = np.zeros((_SIX, _SIX)), np.zeros(_SIX), np.empty((2, _SIX))
+    normal, gradient, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
     for n in range(weights.size):
         agreement = max(1.0 - squared[n] / reach, 0.0)
         weight = weights[n] * agreement * agreement / variance
@@ -145,14 +144,9 @@ def normal_equations(tangents, projected, squared, pixels, matrix, weights, reac
         by_u = (-near, 0.0, u * near, -u * v, 1.0 + u * u, -v)
         by_v = (0.0, -near, v * near, -1.0 - v * v, u * v, u)
         for axis in range(2):
-            off = pixels[axis, n] - projected[axis, n]
-            for i in range(_SIX):
-                row[axis, i] = matrix[axis, 0] * by_u[i] + matrix[axis, 1] * by_v[i]
-                gradient[i] += weight * row[axis, i] * off
-            for i in range(_SIX):
-                weighted = weight * row[axis, i]
-                for j in range(i + 1):
-                    normal[i, j] += weighted * row[axis, j]
+            for i in range(6):
+                row[i] = matrix[axis, 0] * by_u[i] + matrix[axis, 1] * by_v[i]
+            add_equation(normal, gradient, row, weight, pixels[axis, n] - projected[axis, n])
     mirror(normal)
     return normal, gradient
 
@@ -170,11 +164,11 @@ def _mark_within(squared, reach, inliers):
 @inlined
 def _invert(information, precision, out):
     """Write the inverse information of matches and known attitude; False if it is not definite."""
-    total, right = np.empty((_SIX, _SIX)), np.empty(_SIX)
-    for column in range(_SIX):
-        for i in range(_SIX):
+    total, right = np.empty((6, 6)), np.empty(6)
+    for column in range(6):
+        for i in range(6):
             right[i] = 1.0 if i == column else 0.0
-            for j in range(_SIX):
+            for j in range(6):
                 total[i, j] = information[i, j]
                 if i >= 3 and j >= 3:
                     total[i, j] += precision[i - 3, j - 3]

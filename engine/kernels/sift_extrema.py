@@ -38,10 +38,11 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
         (M, 3) int64 level, y, x of the voxels where |DoG| is the maximum of its 3 x 3 x 3.
     """
     height, width, _, _, _ = layout
-    up, dogs, margin = across[0].shape[1], len(down[1]) - 1, _padding(across[1])
+    up, dogs = across[0].shape[1], len(down[1]) - 1
+    margin = _padding(down[1])  # both axes have the same filters
     low, high = max(rows[0] - 1, 0) // up, min(rows[1], height - 1) // up + 1  # rows of the source
     searched = max(rows[0], border), min(rows[1], height - border)
-    tall, start = _between_zeros(source, down[1], margin, low, high), low - _padding(down[1])
+    tall, start = _between_zeros(source, margin, low, high), low - margin
     wide = source.shape[1] + 2 * margin
     lines = np.empty((up, _STRIP // up * wide), np.float32)
     filtered = np.empty((2, _STRIP // up * wide), np.float32)
@@ -62,19 +63,17 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
 
 @inlined
 def _padding(reach):
-    largest = reach[0]
-    for level in range(1, reach.size):
-        largest = max(largest, reach[level])
-    return largest + TAPS
+    """Samples beyond the ends of an axis that some filter of any level reads."""
+    return reach.max() + TAPS
 
 
 @inlined
-def _between_zeros(source, reach, margin, low, high):
+def _between_zeros(source, margin, low, high):
     """Rows that the filters of rows ``low`` to ``high`` read, flat, zeros beyond the picture and in a margin."""
     height, width = source.shape
-    start, wide = low - _padding(reach), width + 2 * margin
-    tall = np.zeros((high + _padding(reach) - start) * wide, np.float32)
-    for y in range(max(start, 0), min(high + _padding(reach), height)):
+    start, wide = low - margin, width + 2 * margin
+    tall = np.zeros((high + margin - start) * wide, np.float32)
+    for y in range(max(start, 0), min(high + margin, height)):
         at = (y - start) * wide + margin
         row = tall[at : at + width]
         for x in range(width):  # an assignment of slices would compile its message of unequal shapes
@@ -93,12 +92,7 @@ def _filter_down(lines, size, tall, at, wide, level, down):
     """Filter the columns about a strip of the source that begins at ``at``: its rows once for each phase."""
     weights, reach, _ = down
     start, taps = at - reach[level] * wide, _taps(reach[level], len(lines))
-    if len(lines) == 1:
-        _slide(lines[0, :size], tall, start, wide, weights[level, 0], taps)
-    else:
-        _slide_both(
-            lines[0, :size], lines[1, :size], tall, start, wide, weights[level, 0], weights[level, 1], taps
-        )
+    _slide_phases(lines, size, tall, start, wide, weights[level], taps)
 
 
 @inlined
@@ -106,15 +100,11 @@ def _filter_across(buffer, lines, size, filtered, wide, strip, level, across, do
     """Filter a strip along its rows, and write it with the gains that make up for the edges."""
     height, width, offset, per_level, per_row = layout
     weights, reach, gains = across
-    up = len(lines)
+    up, along = len(lines), np.int64(1)
     start, taps = _padding(reach) - reach[level], _taps(reach[level], up)
-    size, along = size - 2 * _padding(reach), np.int64(1)  # the last row's margin is only read
+    size -= 2 * _padding(reach)  # the last row's margin is only read
     for phase in range(up):
-        if up == 1:
-            _slide(filtered[0, :size], lines[0], start, along, weights[level, 0], taps)
-        else:
-            even, odd = weights[level, 0], weights[level, 1]
-            _slide_both(filtered[0, :size], filtered[1, :size], lines[phase], start, along, even, odd, taps)
+        _slide_phases(filtered, size, lines[phase], start, along, weights[level], taps)
         for y in range(strip[0] + phase, strip[1], up):
             at, begin = offset + level * per_level + y * per_row, (y - strip[0]) // up * wide
             out = buffer[at : at + width]
@@ -157,6 +147,15 @@ def _gain_of(gains, level, y, height):
     if y < edge:
         return gains[0, level, y]
     return gains[1, level, y - height + edge] if y >= height - edge else np.float32(1)
+
+
+@inlined
+def _slide_phases(out, size, values, start, stride, weights, taps):
+    """Filter values by the one phase of the weights (up, taps), or by both."""
+    if len(weights) == 1:
+        _slide(out[0, :size], values, start, stride, weights[0], taps)
+    else:
+        _slide_both(out[0, :size], out[1, :size], values, start, stride, weights[0], weights[1], taps)
 
 
 @compiled()

@@ -25,6 +25,16 @@ def pixel_of(matrix, across, down):
     return u, matrix[1, 0] * across + matrix[1, 1] * down + matrix[1, 2]
 
 
+@inlined
+def add_equation(normal, right, row, weight, off):
+    """Add the weighted equation row x = off to normal equations, of the matrix (N, N) to the lower triangle."""
+    for i in range(right.size):
+        weighted = weight * row[i]
+        right[i] += weighted * off
+        for j in range(i + 1):
+            normal[i, j] += weighted * row[j]
+
+
 @compiled()
 def mirror(matrix):
     """Complete a symmetric matrix (N, N) from its lower triangle, in place."""
@@ -80,41 +90,20 @@ def turn(rotation, vector, out):
 
 @compiled()
 def turn_between(rotation, other, out):
-    """Write the rotation vector (3,) of rotation other^T, which turns the other rotation into this one."""
-    trace = 0.0
-    for i in range(3):
-        for k in range(3):
-            trace += rotation[i, k] * other[i, k]
-    square = 0.0
+    """Write the rotation vector (3,) of rotation other^T, which turns the other rotation into this one.
+
+    Of exactly half a turn it is 0: the axis is that of the antisymmetric part, which vanishes.
+    """
+    trace = square = 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
+        trace += _entry(rotation, other, i, i)
         out[i] = 0.5 * (_entry(rotation, other, k, j) - _entry(rotation, other, j, k))
         square += out[i] * out[i]
     size, cosine = np.sqrt(square), 0.5 * (trace - 1.0)
     angle = np.arctan2(size, cosine)
-    if cosine > -0.9:
-        for i in range(3):
-            out[i] *= 1.0 if size < 1e-9 else angle / size
-        return
-    # Towards half a turn the sine vanishes: the axis is that of the symmetric part, 1 - cosine times a a^T.
-    first = 0
-    for i in range(1, 3):
-        if _entry(rotation, other, i, i) > _entry(rotation, other, first, first):
-            first = i
-    scale = 1.0 - cosine
-    largest = np.sqrt(max((_entry(rotation, other, first, first) - cosine) / scale, 0.0))
-    along, sine_at_first = 0.0, out[first]
     for i in range(3):
-        axis = largest
-        if i != first:
-            axis = (_entry(rotation, other, first, i) + _entry(rotation, other, i, first)) / (
-                2.0 * scale * largest
-            )
-            along += axis * out[i]
-        out[i] = axis
-    along += largest * sine_at_first
-    for i in range(3):
-        out[i] *= -angle if along < 0.0 else angle
+        out[i] *= 1.0 if size < 1e-9 else angle / size
 
 
 @inlined

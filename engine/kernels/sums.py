@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from engine.errors import OptionError
 from engine.runtime.device import Picture
 
+# Sums of squares about a mean below this share of the whole picture's are rounding: there a patch is flat.
+FLAT_SHARE = 1e-12
+
 
 def integrals(image: NDArray[Any]) -> NDArray[np.float64]:
     """Integral images of a picture and of its square.

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from engine.kernels.accuracy import FLAT_SHARE
+from engine.kernels.sums import FLAT_SHARE
 from engine.runtime.jit import compiled, inlined
 
 
@@ -116,11 +116,19 @@ def box_sums(picture, h, w):
 @inlined
 def _sum_rows(down, down_squares, picture, y, h, mean):
     """Sums over h rows of every column, the first of them y, from those of y - 1; both are 0 before y = 0."""
-    if y > 0:
-        _slide(down, down_squares, picture[y + h - 1], picture[y - 1], mean)
+    if y == 0:
+        for first in range(h):
+            row = picture[first]
+            for x in range(len(row)):
+                value = row[x] - mean
+                down[x] += value
+                down_squares[x] += value * value
         return
-    for first in range(h):
-        _add(down, down_squares, picture[first], mean)
+    after, before = picture[y + h - 1], picture[y - 1]
+    for x in range(len(after)):
+        new, old = after[x] - mean, before[x] - mean
+        down[x] += new - old
+        down_squares[x] += (new - old) * (new + old)
 
 
 @inlined
@@ -131,23 +139,6 @@ def _sum_along(along, along_squares, down, down_squares):
         total += down[x]
         square += down_squares[x]
         along[x + 1], along_squares[x + 1] = total, square
-
-
-@inlined
-def _add(down, down_squares, row, mean):
-    for x in range(len(row)):
-        value = row[x] - mean
-        down[x] += value
-        down_squares[x] += value * value
-
-
-@inlined
-def _slide(down, down_squares, after, before, mean):
-    """Add one row and take another away."""
-    for x in range(len(after)):
-        new, old = after[x] - mean, before[x] - mean
-        down[x] += new - old
-        down_squares[x] += (new - old) * (new + old)
 
 
 @compiled("(f4[:, ::1], f4[:, ::1], f8)")
@@ -163,66 +154,6 @@ def centre(out, picture, mean):
         to[width:] = 0.0
     out[height:] = 0.0
     return energy
-
-
-@compiled("(f4[:, :, ::1], f4[:, ::1], f8, f8, f4[:, ::1])")
-def pack(out, window, mean, scale, model):
-    """Write a window less its mean, scaled, and a template as real and imaginary part, zeros where they end.
-
-    Args:
-        out: (rows, columns, 2) float32, written to.
-        window: (H, W) float32.
-        mean: of the window.
-        scale: factor of the window.
-        model: (h, w) float32.
-    """
-    (height, width), (h, w) = window.shape, model.shape
-    out[height:], out[:height, width:] = 0.0, 0.0
-    for y in range(height):
-        to, row = out[y], window[y]
-        for x in range(width):
-            to[x, 0] = (row[x] - mean) * scale
-            to[x, 1] = 0.0
-        if y < h:
-            values = model[y]
-            for x in range(w):
-                to[x, 1] = values[x]
-
-
-@compiled("(f4[:, ::1], f4[:, :, ::1])")
-def packed_product(out, packed):
-    """Spectrum of the correlation of two real pictures that were transformed as one complex picture.
-
-    Args:
-        out: (rows, columns) float32, written to in the packed order of OpenCV's real transforms.
-        packed: (rows, columns, 2) float32, transform of picture + i template; even rows and columns.
-    """
-    rows, columns = out.shape
-    # Indices that cannot be negative are vectorised.
-    two, full, half = np.uint64(2), np.uint64(columns), np.uint64(columns // 2)
-    for y in range(rows):
-        to, one, other = out[y], packed[y], packed[(rows - y) % rows]
-        for x in range(np.uint64(1), half):
-            back = full - x
-            to[two * x - np.uint64(1)], to[two * x] = _product(
-                one[x, 0], one[x, 1], other[back, 0], other[back, 1]
-            )
-    for x in (0, columns // 2):
-        column = out[:, 0 if x == 0 else columns - 1]
-        for y in range(rows // 2 + 1):
-            one, other = packed[y, x], packed[(rows - y) % rows, x]
-            real, imaginary = _product(one[0], one[1], other[0], other[1])
-            column[max(0, 2 * y - 1)] = real
-            if 0 < y < rows // 2:
-                column[2 * y] = imaginary
-
-
-@inlined
-def _product(a, b, c, d):
-    """One spectrum times the conjugate of the other, from a + ib and c + id at opposite frequencies."""
-    quarter = np.float32(0.25)
-    real, imaginary, across, along = a + c, b - d, a - c, b + d
-    return (real * along - imaginary * across) * quarter, (real * across + imaginary * along) * quarter
 
 
 @compiled("(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4)")

@@ -10,8 +10,7 @@ import math
 
 import cv2
 
-from engine.kernels.accuracy import FLAT_SHARE
-from engine.kernels.sums import box_sum, check_finite
+from engine.kernels.sums import FLAT_SHARE, box_sum, check_finite
 from engine.runtime.tensors import Tensor, torch
 
 # Lower bound on a template's norm; a template of zeros scores 0.

@@ -25,8 +25,7 @@ from engine.orthomap import OrthoMap
 from engine.runtime import device as devices
 from engine.runtime import threads
 from engine.runtime import workers as processes
-from engine.runtime.loops import loops_compiled, prepare_loops
-from engine.runtime.scheduler import Costs, Scheduler
+from engine.runtime.scheduler import Costs, Scheduler, loops_compiled
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, Window
 from engine.window import level_crop, level_for
 
@@ -108,7 +107,10 @@ class SceneMatcher:
             brief: for a start in the air: run each step of a frame with a prior once, and no search. Costs are
                 then learned from the first frames, of which some may be late.
         """
-        prepare_loops(self._method.loops, report)
+        if self._method.loops:
+            from engine.runtime import jit  # numba takes a while to import
+
+            jit.prepare(self._method.loops, report)
         self._method.prepare()
         shares, rounds = (_WARMUP_SHARES[:1], 1) if brief else (_WARMUP_SHARES, self._method.warmup_rounds)
         for share in shares:

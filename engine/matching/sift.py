@@ -47,7 +47,6 @@ class Sift(Method):
         "pose_fit",
         "clusters",
         "nearest",
-        "sift_selection",
         "sift_refinement",
         "sift_descriptors",
         "sift_extrema",

@@ -13,6 +13,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -89,28 +90,21 @@ def set_realtime(realtime: Realtime | None = None) -> None:
 
 
 def check_realtime(realtime: Realtime | None) -> None:
-    """Refuse settings that are not permitted before anything depends on them, by a trial in a short thread.
+    """Refuse settings that are not permitted before anything depends on them, by a trial in a thread of its own.
 
     Raises:
         OptionError, BackendError: as of :func:`set_realtime`.
     """
     if realtime is None:
         return
-    refused: list[OptionError | BackendError] = []
 
     def attempt() -> None:
-        try:
-            set_realtime(replace(realtime, lock_memory=False))
-            if realtime.lock_memory:
-                _check_lockable()
-        except (OptionError, BackendError) as error:
-            refused.append(error)
+        set_realtime(replace(realtime, lock_memory=False))
+        if realtime.lock_memory:
+            _check_lockable()
 
-    thread = threading.Thread(target=attempt, name="scenematch-realtime")
-    thread.start()
-    thread.join()
-    if refused:
-        raise refused[0]
+    with ThreadPoolExecutor(1) as trial:
+        trial.submit(attempt).result()
 
 
 def start_thread(

@@ -6,6 +6,7 @@ it must fit into the time left. No single run decides: a step with fewer than tw
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping
@@ -15,12 +16,17 @@ from statistics import median_low
 from engine.budget import Deadline
 from engine.runtime import threads
 from engine.runtime.device import Device, synchronise
-from engine.runtime.loops import loops_compiled
 
 RUNS, STAGES, WAITS = 15, 48, 240  # of a step, of all stages (some six frames), and of their waits, that count
 DEVIATIONS, SEVERAL = (2.0, 5.0), 10.0  # median absolute deviations, before and beside a fix; medians at most
 FADE, FORGOTTEN = 0.99, 4  # per refusal: share of the cost that is left, and stages; so a step is tried again
 MAX_WAIT_MS = 20.0  # longest wait for the processor that a fix is protected from
+
+
+def loops_compiled() -> int:
+    """How often numba compiled a loop, or loaded one from its cache, so far; numba need not be imported."""
+    jit = sys.modules.get("engine.runtime.jit")
+    return 0 if jit is None else jit.count()
 
 
 class OutOfTime(Exception):  # noqa: N818 - no error, and never seen by a caller of the engine

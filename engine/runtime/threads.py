@@ -5,6 +5,7 @@ torch is configured now if loaded, else when it is loaded (:mod:`engine.runtime.
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import threading
@@ -12,6 +13,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 from engine.errors import OptionError
 
@@ -100,6 +104,28 @@ def in_parallel(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
     for worker in begun:
         worker.result()
     return [done[number] for number in range(len(pieces))]
+
+
+def own_array(use: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Memory that the thread keeps from call to call: fresh pages cost as much as a transform.
+
+    Args:
+        use: what it is for.
+        shape: of the array.
+        dtype: of its elements.
+
+    Returns:
+        The array, which the thread's next call for this use and type overwrites.
+    """
+    size, name = math.prod(shape), f"{use} {np.dtype(dtype).char}"
+    memory: NDArray[Any] | None = getattr(_own, name, None)
+    if memory is None or memory.size < size:
+        memory = np.empty(size, dtype)
+        setattr(_own, name, memory)
+    return memory[:size].reshape(shape)
+
+
+_own = threading.local()
 
 
 @lru_cache(maxsize=1)

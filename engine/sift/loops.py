@@ -4,7 +4,6 @@ Keypoints are rows (K, 6) float32 in the pixels of their octave: x, y, sigma ove
 contrast, level, octave.
 """
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,17 +14,17 @@ from numpy.typing import NDArray
 
 from engine.kernels import sift_descriptors
 from engine.kernels.sift_extrema import TAPS, find_extrema
-from engine.kernels.sift_refinement import refine_extrema
-from engine.kernels.sift_selection import spread_out
+from engine.kernels.sift_refinement import refine_extrema, spread_out
 from engine.runtime import threads
 from engine.sift.descriptors import ORIENT_STEP, orientation_weights, tents
-from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, Octave, octaves_of, reach_px
+from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, Octave, octaves_of
 from engine.sift.values import Features, SiftChoice
 
 AnyArray = NDArray[Any]
 Floats = NDArray[np.float32]
 Filters = tuple[Floats, NDArray[np.int64], Floats]
 
+_TRUNCATE = 3.0  # a Gaussian's reach in sigmas
 _BORDER = 4  # octave pixels along the edge without keypoints
 _EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
 _MOVES = 2  # times that a keypoint may move to a neighbouring voxel
@@ -67,52 +66,47 @@ def plan_loops(height: int, width: int, upsample: int) -> LoopPlan:
     octaves = octaves_of(height, width, upsample)
     filtered = []
     for octave in octaves:
-        down, across = (filters_of(octave, length) for length in octave.source)
+        down, across = (filters(length, octave.sigmas, octave.up) for length in octave.source)
         filtered.append((octave, across, down))
     return LoopPlan(tuple(filtered), np.array([octave.layout for octave in octaves]), upsample)
 
 
-def filters_of(octave: Octave, length: int) -> Filters:
-    """The filters of an octave along an axis of its source; see :func:`filters`."""
-    return filters(length, octave.sigmas, tuple(map(reach_px, octave.sigmas)), octave.up)
-
-
 @lru_cache(maxsize=4096)  # two kilobytes each; a camera of 1280 px has 1,400
-def filters(inputs: int, sigmas: tuple[float, ...], reach: tuple[int, ...], up: int) -> Filters:
+def filters(inputs: int, sigmas: tuple[float, ...], up: int) -> Filters:
     """Gaussian filters of all levels along one axis.
 
     Args:
         inputs: pixels along the axis; ``up (inputs - 1) + 1`` come out.
         sigmas: of the levels, in pixels of the input; 0 copies.
-        reach: of each filter to either side, in pixels of the input.
         up: outputs per input, 1 or 2.
 
     Returns:
-        Weights (levels, up, taps), reach (levels,) and the gains (2, levels, E) of the first and of the last E
-        outputs, which compensate for what a filter misses beyond an edge; all others have 1.
+        Weights (levels, up, taps); reach (levels,) to either side, in pixels of the input; and the gains
+        (2, levels, E) of the first and of the last E outputs, which compensate for what a filter misses beyond an
+        edge; all others have 1.
     """
-    weights, below = _weights(sigmas, reach, up)
-    near, outputs = np.array(reach), up * (inputs - 1) + 1
-    edge = min(outputs, up * (max(reach) + 1))
+    weights, reach, below = _weights(sigmas, up)
+    outputs = up * (inputs - 1) + 1
+    edge = min(outputs, up * (int(reach.max()) + 1))
     index = np.array([np.arange(edge), np.arange(outputs - edge, outputs)])[:, None]  # (2, 1, E)
-    taps, level = below.shape[2] - 1, np.arange(len(near))[:, None]
-    first, end = (np.clip(limit + near[:, None] - index // up, 0, taps) for limit in (0, inputs))
+    taps, level = below.shape[2] - 1, np.arange(len(reach))[:, None]
+    first, end = (np.clip(limit + reach[:, None] - index // up, 0, taps) for limit in (0, inputs))
     gains = 1.0 / (below[level, index % up, end] - below[level, index % up, first])
-    return weights, near, gains.astype(np.float32)
+    return weights, reach, gains.astype(np.float32)
 
 
 @lru_cache(maxsize=16)
-def _weights(sigmas: tuple[float, ...], reach: tuple[int, ...], up: int) -> tuple[Floats, NDArray[np.float64]]:
-    """Weights (levels, up, taps), and the sums (levels, up, taps + 1) of those before a tap."""
-    near = np.array(reach)
-    taps = -(-(2 * near.max() + up) // TAPS) * TAPS
-    offsets = np.arange(taps) - near[:, None, None]  # (levels, 1, taps)
+def _weights(sigmas: tuple[float, ...], up: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.float64]]:
+    """Weights (levels, up, taps), reach (levels,), and the sums (levels, up, taps + 1) of those before a tap."""
+    reach = np.ceil(_TRUNCATE * np.array(sigmas)).astype(np.int64)
+    taps = -(-(2 * reach.max() + up) // TAPS) * TAPS
+    offsets = np.arange(taps) - reach[:, None, None]  # (levels, 1, taps)
     phase = np.arange(up).reshape(1, -1, 1) / up
     weights = np.exp(-0.5 * ((offsets - phase) / np.maximum(np.array(sigmas), 1e-3).reshape(-1, 1, 1)) ** 2)
-    weights *= offsets < near[:, None, None] + up
+    weights *= offsets < reach[:, None, None] + up
     weights /= weights.sum(-1, keepdims=True)
     below = np.concatenate([np.zeros_like(weights[..., :1]), weights.cumsum(-1)], axis=-1)
-    return weights.astype(np.float32), below
+    return weights.astype(np.float32), reach, below
 
 
 def find_features(pictures: Floats, allowed: NDArray[np.bool_] | None, choice: SiftChoice) -> Features:
@@ -165,7 +159,8 @@ def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Fl
     Returns:
         The Gaussian levels (N,), which the thread's next call overwrites; and keypoints (K, 6).
     """
-    buffer, found, source = _buffer(plan.octaves[-1][0].end), [], image
+    buffer = threads.own_array("scale space", (plan.octaves[-1][0].end,), np.float32)
+    found, source = [], image
     threshold = contrast_threshold / SCALES
     limits = (SCALES, _MOVES, threshold, _MAX_SHIFT, EDGE_RATIO)
     for number, (octave, across, down) in enumerate(plan.octaves):
@@ -273,14 +268,3 @@ def _pixel_px(keypoints: Floats, plan: LoopPlan) -> Floats:
 def _in_parts(work: Callable[[tuple[int, int]], AnyArray], parts: list[tuple[int, int]]) -> AnyArray:
     done = threads.in_parallel(work, parts)
     return done[0] if len(done) == 1 else np.concatenate(done)
-
-
-_local = threading.local()
-
-
-def _buffer(size: int) -> Floats:
-    """The thread's own memory for a scale space: allocating new pages takes a tenth of the time."""
-    buffer: Floats | None = getattr(_local, "buffer", None)
-    if buffer is None or buffer.size < size:
-        buffer = _local.buffer = np.empty(size, np.float32)
-    return buffer[:size]

@@ -1,4 +1,4 @@
-"""Match descriptors by distance: Lowe's ratio test, a mutual test, and limits on rotation and scale."""
+"""Match descriptors by distance: Lowe's ratio test, a mutual test, and a limit on scale."""
 
 from __future__ import annotations
 
@@ -21,21 +21,17 @@ def match(
     train: Features,
     *,
     ratio: float = 0.8,
-    rotation_deg: float = 0.0,
-    max_angle_diff_deg: float | None = None,
     scale: float = 1.0,
     max_scale_factor: float | None = None,
 ) -> Matches:
     """Match descriptors by Euclidean distance, with Lowe's ratio test; each must be the other's nearest.
 
-    Pairs that contradict the known rotation or scale have an infinite distance, all others sqrt(2 - 2 <q, t>).
+    Pairs that contradict the known scale have an infinite distance, all others sqrt(2 - 2 <q, t>).
 
     Args:
         query: Features of B images, or of one for all of the train's.
         train: Features of B images, or of one for all of the query's.
         ratio: Upper bound, in (0, 1], on nearest over second nearest distance; 1 accepts all.
-        rotation_deg: Known angle of a train keypoint less that of its query.
-        max_angle_diff_deg: Exclude pairs whose angles differ from ``rotation_deg`` by more.
         scale: Known scale of a train keypoint over that of its query.
         max_scale_factor: Exclude pairs whose scales differ from ``scale`` by more than this factor.
 
@@ -47,7 +43,7 @@ def match(
     """
     if not 0 < ratio <= 1:
         raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
-    limits, given = (rotation_deg, max_angle_diff_deg, scale, max_scale_factor), query.descriptors
+    limits, given = (scale, max_scale_factor), query.descriptors
     if device_of(given).type != "cpu":
         from engine.sift.matching_tensors import match_tensors  # torch takes a while to import
 
@@ -78,30 +74,25 @@ def _nearest_by_loops(query: Features, train: Features, limits: Limits) -> tuple
     """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best."""
     from engine.kernels import nearest  # numba takes a while to import
 
-    rotation_deg, max_angle_diff_deg, scale, max_scale_factor = limits
+    scale, max_scale_factor = limits
     count, slots = max(len(query.valid), len(train.valid)), query.valid.shape[1]
     first, second = np.full((2, count, slots), -np.inf, np.float32)
     index, is_mutual = np.zeros((count, slots), np.int64), np.zeros((count, slots), np.bool_)
-    least_cos = -2.0 if max_angle_diff_deg is None else math.cos(math.radians(min(max_angle_diff_deg, 180.0)))
     most_log = np.float32(math.inf if max_scale_factor is None else math.log(max_scale_factor))
-    own = _angles_and_scales(query, rotation_deg, scale, max_scale_factor is not None)
-    other = _angles_and_scales(train, 0.0, 1.0, max_scale_factor is not None)
+    own = _log_scales(query, scale, max_scale_factor is not None)
+    other = _log_scales(train, 1.0, max_scale_factor is not None)
     for n in range(count):
         q, t = min(n, len(query.valid) - 1), min(n, len(train.valid) - 1)
         out = (first[n], index[n], second[n], is_mutual[n])
         for start in range(0, train.valid.shape[1], TRAIN_CHUNK):
             end = start + TRAIN_CHUNK
             cosine = train.descriptors[t, start:end] @ query.descriptors[q].T
-            angles = np.ascontiguousarray(other[:, t, start:end])
-            nearest.two_nearest(
-                cosine, np.ascontiguousarray(own[:, q]), angles, np.float32(least_cos), most_log, start, *out
-            )
+            nearest.two_nearest(cosine, own[q], other[t, start:end], most_log, start, *out)
     return first, index, second, is_mutual
 
 
-def _angles_and_scales(features: Features, rotation_deg: float, scale: float, is_limited: bool) -> Floats:
-    """(3, B, N) logarithm of scale if used, NaN without a keypoint; cosine and sine of the angle."""
+def _log_scales(features: Features, scale: float, is_limited: bool) -> Floats:
+    """(B, N) logarithm of scale if that is limited, else 0; NaN without a keypoint."""
     sizes = features.scale_px if is_limited else np.ones(features.valid.shape, np.float32)
-    angle = np.deg2rad(features.angle_deg + np.float32(rotation_deg))
     log = np.log(np.where(features.valid, np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
-    return np.stack([log, np.cos(angle), np.sin(angle)]).astype(np.float32)
+    return log.astype(np.float32, copy=False)

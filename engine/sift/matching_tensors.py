@@ -38,16 +38,9 @@ def _distance(cosine: Tensor) -> Tensor:
 
 def _forbid(cosine: Tensor, query: Features, train: Features, limits: Limits) -> None:
     """Lower the cosine (B, N, M) of excluded pairs by a large number, in place; faster than masks."""
-    rotation_deg, max_angle_diff_deg, scale, max_scale_factor = limits
+    scale, max_scale_factor = limits
     for valid, dim in ((query.valid, 2), (train.valid, 1)):
         cosine.sub_((~valid).to(cosine.dtype).unsqueeze(dim), alpha=_FAR)
-    if max_angle_diff_deg is not None and max_angle_diff_deg < 180:
-        expected, actual = torch.deg2rad(query.angle_deg + rotation_deg), torch.deg2rad(train.angle_deg)
-        cos_diff = torch.stack([expected.cos(), expected.sin()], dim=2) @ torch.stack(
-            [actual.cos(), actual.sin()], dim=1
-        )
-        excess = math.cos(math.radians(max_angle_diff_deg)) - cos_diff
-        cosine.sub_(excess.clamp_min_(0), alpha=_FAR)
     if max_scale_factor is not None:
         own, other = (query.scale_px * scale).clamp_min(1e-9).log(), train.scale_px.clamp_min(1e-9).log()
         excess = (other[:, None, :] - own[:, :, None]).abs_().sub_(math.log(max_scale_factor))

@@ -8,7 +8,6 @@ LEVELS = SCALES + 3  # Gaussian levels per octave
 FIRST_SIGMA_PX = 0.8  # sigma of the first Gaussian level, in pixels of the image
 EDGE_RATIO = 10.0  # ratio of a keypoint's curvatures at which it lies on an edge
 _CAMERA_SIGMA_PX = 0.5  # assumed blur of an image
-_TRUNCATE = 3.0  # a Gaussian's reach in sigmas
 _MIN_OCTAVE = 12
 
 
@@ -58,8 +57,3 @@ def octaves_of(height: int, width: int, upsample: int) -> tuple[Octave, ...]:
         sigmas = tuple(FIRST_SIGMA_PX * upsample * math.sqrt(g**2 - 1) for g in growth)
         source, up = ((height + 1) // 2, (width + 1) // 2), 1
     return tuple(octaves)
-
-
-def reach_px(sigma: float) -> int:
-    """Return the reach of a truncated Gaussian, in pixels of its input."""
-    return math.ceil(_TRUNCATE * sigma)

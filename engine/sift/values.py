@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from engine.runtime.device import Picture
 
-Limits = tuple[float, float | None, float, float | None]
-"""Rotation between matched keypoints and its largest error in degrees, ratio of their scales and its factor."""
+Limits = tuple[float, float | None]
+"""Ratio of the scales of matched keypoints, and the factor that it may be off by; None allows all."""
 TRAIN_CHUNK = 4096  # train slots compared at a time, to bound memory for a whole map
 FORBIDDEN = -2.0  # below every cosine
 ROUNDING = 2e-3  # distance between a descriptor and itself by float32 rounding

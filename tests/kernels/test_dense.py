@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
-from engine.errors import ShapeError
 from engine.geo import enu_from_body
 from engine.kernels.dense import EnhancedFrame, GaussianPrior, Pose, Samples, correlation_at, covariance_of, refine
 from engine.maps.prepared import PreparedMap
@@ -155,11 +154,6 @@ def test_no_pose_from_samples_that_are_not_seen(scene, camera):
     assert fitted(camera, scene, believed(pose), weights=nothing) is None
     picture = EnhancedFrame(levels, camera.matrix)
     assert correlation_at(picture, replace(samples, weights=nothing), pose) == 0.0
-
-
-def test_samples_of_odd_shapes_are_refused():
-    with pytest.raises(ShapeError, match=r"values: expected \(4,\), got \(3,\)"):
-        Samples(np.zeros((4, 3)), np.zeros(3), np.zeros((4, 2)), np.ones(4))
 
 
 # ------------------------------------------------------------------------------------------------ as part of NCC

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engine.kernels import dense_loops
-from engine.kernels.dense_loops import median
+from engine.kernels.dense_loops import CELLS, EDGE_PX, median
 from engine.kernels.gauss_newton import information, normal_equations
 from engine.kernels.lower_plane import lower_plane
 from engine.kernels.small_matrices import solve, turn, turn_between
 
-SIDE_PX, CELLS, EDGE_PX, HEIGHT_M = 120, 8, 2.0, 80.0
+SIDE_PX, HEIGHT_M = 120, 80.0
 MATRIX = np.array([[130.0, 0.0, 59.5], [0.0, 128.0, 58.0], [0.0, 0.0, 1.0]])
 
 
@@ -36,7 +36,7 @@ def look(scene, *, center_m=None, rotation=None, slope=None, gradients=None):
     return dense_loops.project(
         picture, MATRIX, turned if rotation is None else rotation, center if center_m is None else center_m,
         leaning if slope is None else slope, offset_m, np.zeros(3),
-        np.zeros((count, 2)) if gradients is None else gradients, np.ones(count), EDGE_PX, CELLS,
+        np.zeros((count, 2)) if gradients is None else gradients, np.ones(count),
     )  # fmt: skip
 
 
@@ -168,7 +168,7 @@ def test_sums_for_the_covariance_are_those_of_the_definition(samples):
     shown, expected, points, offset_m, rotation, weights, differences, cells = samples
     one, two = (rows(g, points, offset_m, rotation) for g in (shown, expected))
     own, common, of_map, by_cell = information(
-        shown, expected, points, offset_m, rotation, weights, differences, cells, 64
+        shown, expected, points, offset_m, rotation, weights, differences, cells
     )
     for found, a, b in ((own, one, one), (common, one, two), (of_map, two, two)):
         right = (a.T * weights) @ b
