@@ -194,6 +194,11 @@ class Grid:
     crs: CRS
 
     @property
+    def area_px(self) -> int:
+        """Number of pixels."""
+        return self.width_px * self.height_px
+
+    @property
     def centre_px(self) -> Array:
         """(2,) middle of the picture."""
         return np.array([(self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0])
@@ -255,6 +260,12 @@ class Grid:
         with np.errstate(invalid="ignore"):
             steps_m = np.linalg.norm(LocalFrame(lat[0], lon[0]).enu_from_geodetic(lat[1:], lon[1:]), axis=1)
         return bool(steps_m.max() <= 1.01 * steps_m.min())
+
+
+def by_corner(grid: Grid) -> Array:
+    """GDAL's affine (6,) of a grid, from the outer corner of its first pixel."""
+    corner = apply_affine(grid.pixel_to_crs, np.array([-0.5, -0.5]))
+    return np.column_stack([grid.pixel_to_crs[:, :2], corner]).ravel()
 
 
 def warp_between(grid: Grid, other: Grid) -> Warp:
