@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.maps.grids import Grid, by_corner
-from engine.maps.heights import part_grid
+from engine.maps.grids import Grid, by_corner, part_grid
 from engine.maps.rasters import STRETCH_PERCENT, Source, map_errors, palette_of, stretched
 from engine.values import Window
 
