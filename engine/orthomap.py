@@ -20,10 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from engine.errors import MapError
 from engine.maps.colour import read_colour
 from engine.maps.georeference import Georeference
-from engine.maps.grids import Array, Grid, warp_between
-from engine.maps.metric_copy import ProgressCallback
-from engine.maps.preparation import check_arrays, metric_grid, open_readable
-from engine.maps.pyramid import ArrayReader, Pyramid, Reader
+from engine.maps.grids import Array, Grid, metric_grid, warp_between
+from engine.maps.metric_copy import ProgressCallback, open_readable
+from engine.maps.pyramid import ArrayReader, Pyramid, Reader, check_arrays
 from engine.maps.rasters import (
     GEOREFERENCE_TAG,
     SLOPE_TAG,

@@ -279,6 +279,28 @@ def by_corner(grid: Grid) -> Array:
     return np.column_stack([grid.pixel_to_crs[:, :2], corner]).ravel()
 
 
+def metric_grid(shape: tuple[int, ...], matrix: Array, crs: Any) -> Grid:
+    """The grid of arrays.
+
+    Args:
+        shape: (H, W).
+        matrix: (2, 3) affine from pixels to the CRS.
+        crs: anything that pyproj takes.
+
+    Returns:
+        Grid: metric and north-up.
+
+    Raises:
+        MapError: the grid is not metric and north-up.
+    """
+    if matrix.shape != (2, 3) or not np.isfinite(matrix).all() or np.linalg.det(matrix[:, :2]) == 0.0:
+        raise MapError(f"pixel_to_crs: expected a finite, invertible (2, 3), got {matrix.tolist()}")
+    grid = Grid(shape[1], shape[0], matrix, earth_crs(crs, "crs"))
+    if not grid.is_metric:
+        raise MapError(f"pixel_to_crs: expected a square north-up grid in a projected CRS, got {grid.crs.name!r}")
+    return grid
+
+
 def warp_between(grid: Grid, other: Grid) -> Warp:
     """The transform from pixels of a grid to pixels of another, to a hundredth of a pixel."""
     to_crs = grid.pixels_of(other.crs)[0]

@@ -16,6 +16,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -107,6 +108,35 @@ def _resampled(reader: GrayReader, source: Grid, grid: Grid, windows: Iterable[W
             inside = ((at >= -0.5) & (at <= [source.width_px - 0.5, source.height_px - 0.5])).all(axis=-1)
             block[1] = np.where((np.asarray(solid) == 255) & inside, 255, 0)
         yield window, block
+
+
+def open_readable(
+    source: Source, cache_dir: str | os.PathLike[str] | None, on_copy: ProgressCallback | None
+) -> tuple[Source, GrayReader, dict[str, Any]]:
+    """The source or its metric copy, the reader of that, and facts about the source.
+
+    Raises:
+        MapError: the file cannot be read.
+    """
+    used, original = source, None if is_large(source.grid) else GrayReader(source)
+    if needs_copy(source):
+        used = open_metric_copy(source, original, cache_dir, on_copy)
+        reader = GrayReader(used, find_collar=False)
+    else:
+        reader = original or GrayReader(source)
+    return (
+        used,
+        reader,
+        {
+            "path": str(source.path),
+            "driver": source.dataset.driver,
+            "bands": source.dataset.count,
+            "dtype": source.dataset.dtypes[0],
+            "source_size_px": [source.grid.width_px, source.grid.height_px],
+            "source_nodata_share": (original or reader).invalid_share,
+            "resampled": not source.grid.is_metric,
+        },
+    )
 
 
 def open_metric_copy(

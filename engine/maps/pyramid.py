@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from engine.errors import OptionError
+from engine.errors import DtypeError, OptionError, ShapeError
 from engine.maps.grids import Array
 from engine.maps.rasters import COARSE_LIMIT_PX, MEMORY_LIMIT_PX, Gray, GrayReader, Mask, scaled_window
 from engine.values import Window
@@ -41,6 +42,27 @@ class ArrayReader:
             (h, w) uint8 grey and (h, w) bool validity, without a copy.
         """
         return self.gray[window.slices], self.valid[window.slices]
+
+
+def check_arrays(gray: Gray, valid: Mask, heights: NDArray[np.float32] | None) -> None:
+    """Refuse arrays that do not form a map.
+
+    Args:
+        gray: (H, W) uint8.
+        valid: (H, W) bool.
+        heights: (H, W), or None.
+
+    Raises:
+        ShapeError: an array has another shape.
+        DtypeError: ``gray`` is not uint8.
+    """
+    if gray.ndim != 2 or 0 in gray.shape:
+        raise ShapeError(f"gray: expected (H, W) with at least one pixel, got {gray.shape}")
+    if gray.dtype != np.uint8:
+        raise DtypeError(f"gray: expected uint8, got {gray.dtype}")
+    for name, array in (("valid", valid), ("surface_m", heights)):
+        if array is not None and array.shape != gray.shape:
+            raise ShapeError(f"{name}: expected the shape of gray {gray.shape}, got {array.shape}")
 
 
 Reader = ArrayReader | GrayReader
@@ -120,7 +142,8 @@ class Pyramid:
         if not (0 <= window.x0 < window.x1 <= width and 0 <= window.y0 < window.y1 <= height):
             raise OptionError(f"window: expected one inside {width} x {height} px of level {level}, got {window}")
         if level >= self._base:
-            return ArrayReader(*self._level(level)).read(window)
+            gray, valid = self._level(level)
+            return gray[window.slices], valid[window.slices]
         last = self._last
         if last is None or last[0] != (window, level):  # grey and validity are often read in turn
             last = self._last = ((window, level), self._from_file(window, level))
