@@ -137,6 +137,9 @@ def open_source(
         what, driver = openable(file, argument)
         dataset = rasterio.open(what, driver=driver)
         transform, own_crs = dataset.transform, dataset.crs
+    if dataset.count == 0:
+        names = ", ".join(name.rpartition(":")[2] for name in dataset.subdatasets)
+        raise MapError(f"{argument}: expected a GeoPackage with one raster, got {names} in {file}")
     size = dataset.width, dataset.height
     own = None if transform.is_identity else _centred(transform)
     if own is not None:
