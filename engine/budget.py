@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 from engine.errors import OptionError
 
-_SPENT_MS = 1e-6
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Budget:
@@ -35,8 +33,9 @@ class Budget:
 
     def after(self, elapsed_ms: float) -> Budget:
         """The budget left after so many milliseconds; once spent, too little for any answer."""
-        search_ms = None if self.search_ms is None else max(self.search_ms - elapsed_ms, _SPENT_MS)
-        return Budget(total_ms=max(self.total_ms - elapsed_ms, _SPENT_MS), search_ms=search_ms)
+        spent_ms = math.ulp(0.0)
+        search_ms = None if self.search_ms is None else max(self.search_ms - elapsed_ms, spent_ms)
+        return Budget(total_ms=max(self.total_ms - elapsed_ms, spent_ms), search_ms=search_ms)
 
 
 class Deadline:

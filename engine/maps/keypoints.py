@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from engine.learned import KeypointMatcher, Keypoints
-from engine.maps.landmarks import as_picture
+from engine.maps.landmarks import MAX_LANDMARKS, as_picture
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import HALO_PX, tile_at, tiles_under, widened
 from engine.runtime.device import CPU, as_tensor
@@ -27,7 +27,7 @@ TILE_PX = 512
 """Tiles begin on multiples of this in every level."""
 PX_PER_KEYPOINT = 64
 """A tile has at most one keypoint per this many pixels."""
-MAX_KEYPOINTS = 1 << 18
+MAX_KEYPOINTS = MAX_LANDMARKS
 """Keypoints kept in memory, besides those of the last window; one takes up to 520 bytes."""
 _NODATA_PX = 5  # a keypoint this near to a pixel without data may be its edge
 

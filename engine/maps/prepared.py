@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from engine.kernels.scores import enhance
 from engine.kernels.search_levels import MAX_HALVINGS
 from engine.maps.recently_used import RecentlyUsed
-from engine.maps.tiles import TILE_PX, widened, within
+from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, widened, within
 from engine.ncc_fft import MapRegion, prepare
 from engine.runtime.device import Device, Picture, on_host, to_device
 from engine.values import Window
@@ -26,9 +26,7 @@ if TYPE_CHECKING:  # a map is built on what lies here
 
 FloatImage = NDArray[np.float32]
 
-WHOLE_LEVEL_PX = 1 << 23
-"""Levels of at most this many pixels are prepared as a whole."""
-MAX_REGION_PX = 6 << 20
+MAX_REGION_PX = WHOLE_LEVEL_PX
 """Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 6 bytes, 11 with nodata,
 and on a GPU 20."""
 

@@ -39,8 +39,6 @@ Bounds = tuple[float, float, float, float]
 
 COLLAR_SHARE = 0.005
 STRETCH_PERCENT = (2.0, 98.0)
-OVERVIEW_PX = 4096
-"""Stretch and collar are found on a copy of at most this many pixels a side."""
 GEOREFERENCE_TAG = "SCENEMATCH_GEOREFERENCE_SIGMA_M"
 """Metadata item of a GeoTIFF: its georeferencing accuracy, one standard deviation in metres per axis."""
 SLOPE_TAG = "SCENEMATCH_SLOPE_SIGMA_DEG"
@@ -50,6 +48,8 @@ MEMORY_LIMIT_PX = 256 * 2**20
 """Grey maps of up to this many pixels are held in memory; larger ones are read window by window."""
 COARSE_LIMIT_PX = 16 * 2**20
 """Of those the first level of up to this many pixels, and the coarser ones, are held in memory."""
+OVERVIEW_PX = math.isqrt(COARSE_LIMIT_PX)
+"""Stretch and collar are found on a copy of at most this many pixels a side."""
 
 
 @dataclass(frozen=True, eq=False)

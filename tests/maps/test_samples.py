@@ -55,7 +55,7 @@ def test_several_threads_may_take_samples_at_once(by_cells, monkeypatch):
     sampled, _ = make_map(3 * TILE_PX, 3 * TILE_PX)
     rng = np.random.default_rng(0)
     one = Samples(np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), np.ones(1))
-    monkeypatch.setattr(samples, "MAX_CELLS", 1)
+    monkeypatch.setattr(samples, "COARSE_LIMIT_PX", 1)
     monkeypatch.setattr(sampled, "_sampled", lambda cell, level: (one, (1, 1)))
     windows = [Window(x, y, 40, 40) for x, y in rng.integers(0, 3 * TILE_PX - 40, (6000, 2)).tolist()]
     assert len(called_at_once(lambda window: sampled.find(window, 0), windows)) == len(windows)
