@@ -114,12 +114,13 @@ class OrthoMap(Georeference):
             MapError: a file cannot be read or has no georeference, or the surface does not overlap the map.
             OptionError: an accuracy is not a number above 0.
         """
-        original = open_source(path, bounds_deg=bounds_deg, bounds_crs=bounds_crs, crs=crs)
+        opened = partial(open_source, path, bounds_deg=bounds_deg, bounds_crs=bounds_crs, crs=crs)
+        original = opened()
         used, reader, facts = open_readable(original, cache_dir, on_copy)
         facts["surface_path"] = None if surface is None else os.fspath(surface)
         site = cls(original.path.name, used.grid, reader, original.grid.crs, facts)
         heights_file = None if surface is None else open_source(surface, "surface")
-        site._source = partial(open_source, path, bounds_deg=bounds_deg, bounds_crs=bounds_crs, crs=crs)
+        site._source = opened
         site._set_accuracy(georeference_sigma_m, slope_sigma_deg, original, heights_file)
         if heights_file is not None:
             site._attach(*open_surface(heights_file, site._grid))
