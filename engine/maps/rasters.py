@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
 from engine.maps.grids import Array, Grid, earth_crs, wgs84
-from engine.maps.raster_formats import DTYPES, local_path, openable
+from engine.maps.raster_formats import DTYPES, OWN_TAGS, local_path, openable
 from engine.values import MAX_SIGMA_M, Window
 
 if TYPE_CHECKING:
@@ -61,14 +61,13 @@ class Source:
     grid: Grid
 
 
-def stated_sigma(given: float | None, source: Source | None, tag: str, argument: str) -> float | None:
+def stated_sigma(given: float | None, source: Source | None, tag: str) -> float | None:
     """The given accuracy, else the one in a file's metadata, else None.
 
     Args:
         given: the user's value.
         source: the file with the metadata.
-        tag: metadata item.
-        argument: name of ``given`` in messages.
+        tag: metadata item; the name of ``given`` in messages follows from it.
 
     Raises:
         OptionError: ``given`` is not above 0, or larger than any map.
@@ -77,6 +76,7 @@ def stated_sigma(given: float | None, source: Source | None, tag: str, argument:
     text = None if source is None else source.dataset.tags().get(tag)
     if given is not None:
         if not 0.0 < given <= MAX_SIGMA_M:
+            argument = tag.removeprefix(OWN_TAGS).lower()
             raise OptionError(f"{argument}: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {given}")
         return float(given)
     if source is None or text is None:
