@@ -141,4 +141,4 @@ def test_several_threads_may_cut_at_once(gray, monkeypatch, by_cells):
     places = np.random.default_rng(0).integers(0, 400 - 64, (4000, 2)).tolist()
     cuts = called_at_once(lambda place: maps.cut(Window(*place, 64, 64), 0), places)
     assert all(cut.window.x0 == x & -8 for cut, (x, _) in zip(cuts, places, strict=True))
-    assert len(maps._regions) <= 2
+    assert len(maps._regions.values()) <= 2
