@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from engine.errors import OptionError
+from engine.values import check
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,9 +27,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         for name in ("total_ms", "search_ms"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise OptionError(f"{name}: expected more than 0 ms, got {value}")
+            check(self, name, "more than 0 ms", lambda ms: ms is None or ms > 0)
 
     def after(self, elapsed_ms: float) -> Budget:
         """The budget left after so many milliseconds; once spent, too little for any answer."""

@@ -274,7 +274,14 @@ def part_grid(own: Grid, part: Window, shape: tuple[int, int]) -> Grid:
 
 
 def by_corner(grid: Grid) -> Array:
-    """GDAL's affine (6,) of a grid, from the outer corner of its first pixel."""
+    """GDAL's affine of a grid, from the outer corner of its first pixel.
+
+    Args:
+        grid: whose pixels are centres.
+
+    Returns:
+        (6,) as :class:`affine.Affine` takes them.
+    """
     corner = apply_affine(grid.pixel_to_crs, np.array([-0.5, -0.5]))
     return np.column_stack([grid.pixel_to_crs[:, :2], corner]).ravel()
 

@@ -37,16 +37,14 @@ class SampleMap:
         site: the map.
         enhanced: a window of a level of the same map, enhanced, and its mask; see
             :func:`engine.maps.prepared.enhanced_part`.
+
+    Attributes:
+        cells: sampled so far, by level and window; the least recently used are evicted.
     """
 
     def __init__(self, site: OrthoMap, enhanced: Enhanced) -> None:
         self._site, self._enhanced = site, enhanced
-        self._cells: RecentlyUsed[tuple[int, Window], tuple[Samples, tuple[int, int]]] = RecentlyUsed()
-
-    @property
-    def created(self) -> int:
-        """Cells sampled so far."""
-        return self._cells.created
+        self.cells: RecentlyUsed[tuple[int, Window], tuple[Samples, tuple[int, int]]] = RecentlyUsed()
 
     def find(self, window: Window, level: int, max_samples: int = MAX_SAMPLES) -> Samples:
         """Samples of a window.
@@ -86,8 +84,8 @@ class SampleMap:
 
     def _cell(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
         """Samples of a cell, row by row, and the number of their rows and columns."""
-        found = self._cells.get((level, cell), partial(self._sampled, cell, level))
-        self._cells.evict(lambda key, _: key[1].area_px, COARSE_LIMIT_PX, keep=1)
+        found = self.cells.get((level, cell), partial(self._sampled, cell, level))
+        self.cells.evict(lambda key, _: key[1].area_px, COARSE_LIMIT_PX, keep=1)
         return found
 
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:

@@ -47,7 +47,14 @@ class HeightTiles:
         self.shape = (part.height_px, part.width_px)
 
     def sample(self, at: Array) -> Array:
-        """Bilinear heights (N,) at places (N, 2) in pixels of the part, NaN outside and next to nodata."""
+        """Bilinear heights.
+
+        Args:
+            at: (N, 2) places in pixels of the part.
+
+        Returns:
+            (N,) metres, NaN outside and next to nodata.
+        """
         out, last = np.full(len(at), np.nan), np.array(self.shape[::-1]) - 1
         inside = np.flatnonzero(((at >= -0.5) & (at <= last + 0.5)).all(axis=1))
         if len(inside) == 0:

@@ -66,7 +66,7 @@ class Ncc(Method):
     @property
     def cache_counters(self) -> dict[str, int]:
         """How many entries of each cache were created so far."""
-        return {"map regions": self.prepared.created, "sampled cells": self.samples.created}
+        return {"map regions": self.prepared.regions.created, "sampled cells": self.samples.cells.created}
 
     def warmup(self, query: Query) -> None:
         """Run every variant of every step, so that it is compiled and its cost known."""

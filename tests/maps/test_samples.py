@@ -59,7 +59,7 @@ def test_several_threads_may_take_samples_at_once(by_cells, monkeypatch):
     monkeypatch.setattr(sampled, "_sampled", lambda cell, level: (one, (1, 1)))
     windows = [Window(x, y, 40, 40) for x, y in rng.integers(0, 3 * TILE_PX - 40, (6000, 2)).tolist()]
     assert len(called_at_once(lambda window: sampled.find(window, 0), windows)) == len(windows)
-    assert len(sampled._cells.values()) == 1
+    assert len(sampled.cells.values()) == 1
 
 
 def test_samples_are_the_same_with_and_without_a_prepared_map(by_cells):
