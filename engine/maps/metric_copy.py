@@ -23,7 +23,7 @@ import numpy as np
 from engine.errors import MapError
 from engine.maps import xyz_tiles
 from engine.maps.grids import Grid, Warp, apply_affine, by_corner, wgs84, window_about
-from engine.maps.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_errors, open_source, stored_levels
+from engine.maps.rasters import Gray, GrayReader, Source, is_large, map_errors, open_source, stored_levels
 from engine.maps.tiles import tile_at, tiles_under
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
@@ -62,15 +62,9 @@ def _metric_grid(source: Grid) -> Grid:
     return Grid(math.ceil(size[0] - 1e-6), math.ceil(size[1] - 1e-6), matrix, utm)
 
 
-def is_large(grid: Grid) -> bool:
-    """Whether a map on this grid is read window by window instead of held in memory."""
-    return grid.area_px > MEMORY_LIMIT_PX
-
-
 def needs_copy(source: Source) -> bool:
     """Whether a map needs a copy: its grid is not metric, or even its smallest overview is large."""
-    smallest_px = source.grid.area_px >> 2 * stored_levels(source)[-1]
-    return not source.grid.is_metric or smallest_px > MEMORY_LIMIT_PX
+    return not source.grid.is_metric or is_large(source.grid.area_px >> 2 * stored_levels(source)[-1])
 
 
 def _copied(reader: GrayReader, source: Grid, grid: Grid) -> Iterator[_Block]:
@@ -118,7 +112,7 @@ def open_readable(
     Raises:
         MapError: the file cannot be read.
     """
-    used, original = source, None if is_large(source.grid) else GrayReader(source)
+    used, original = source, None if is_large(source.grid.area_px) else GrayReader(source)
     if needs_copy(source):
         used = open_metric_copy(source, original, cache_dir, on_copy)
         reader = GrayReader(used, find_collar=False)
@@ -243,5 +237,5 @@ def _write(path: Path, grid: Grid, blocks: Iterable[_Block], report: ProgressCal
             dataset.write(block, window=window.slices)
             done_px += window.area_px
             report(done_px, grid.area_px)
-        if is_large(grid):
+        if is_large(grid.area_px):
             dataset.build_overviews(FACTORS, Resampling.average)

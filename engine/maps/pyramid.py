@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.maps.grids import Array
-from engine.maps.rasters import COARSE_LIMIT_PX, MEMORY_LIMIT_PX, Gray, GrayReader, Mask, scaled_window
+from engine.maps.rasters import COARSE_LIMIT_PX, Gray, GrayReader, Mask, is_large, scaled_window
 from engine.values import Window
 
 MIN_LEVEL_PX = 16
@@ -81,12 +81,11 @@ class Pyramid:
     def __init__(self, width_px: int, height_px: int, reader: Reader) -> None:
         self._size, self._reader = (height_px, width_px), reader
         self.levels = max(1, int(math.log2(max(1.0, min(self._size) / MIN_LEVEL_PX))) + 1)
-        self._base = 0
-        self.is_large = math.prod(self._size) > MEMORY_LIMIT_PX
+        self.is_large = is_large(width_px * height_px)
         """Whether it is too large for memory."""
-        limit_px = min(MEMORY_LIMIT_PX, COARSE_LIMIT_PX)
-        while self.is_large and self._base < self.levels - 1 and math.prod(self.shape(self._base)) > limit_px:
-            self._base += 1
+        areas_px = [math.prod(self.shape(level)) for level in range(self.levels - 1)]
+        # The finest level in memory: 0, or that after all which are too large.
+        self._base = sum(area_px > COARSE_LIMIT_PX for area_px in areas_px) if self.is_large else 0
         self._cached: dict[int, tuple[Gray, Mask]] = {}
         self._last: tuple[tuple[Window, int], tuple[Gray, Mask]] | None = None
         if self._base == 0:

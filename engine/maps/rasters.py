@@ -52,6 +52,11 @@ OVERVIEW_PX = math.isqrt(COARSE_LIMIT_PX)
 """Stretch and collar are found on a copy of at most this many pixels a side."""
 
 
+def is_large(area_px: int) -> bool:
+    """Whether a map of so many pixels is read window by window instead of held in memory."""
+    return area_px > MEMORY_LIMIT_PX
+
+
 @dataclass(frozen=True, eq=False)
 class Source:
     """An open raster file and its grid."""

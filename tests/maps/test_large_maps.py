@@ -172,8 +172,8 @@ def test_a_surface_of_a_small_part_of_the_map_gives_its_ground(large_path, tmp_p
 @pytest.fixture
 def tiny_limits(monkeypatch):
     """A map of a few hundred pixels a side counts as large, and its copy is written in blocks of 128."""
-    for module in ("maps.metric_copy", "maps.pyramid"):
-        monkeypatch.setattr(f"engine.{module}.MEMORY_LIMIT_PX", 20_000)
+    monkeypatch.setattr("engine.maps.rasters.MEMORY_LIMIT_PX", 20_000)
+    monkeypatch.setattr("engine.maps.pyramid.COARSE_LIMIT_PX", 20_000)
     monkeypatch.setattr(metric_copy, "BLOCK_PX", 128)
 
 

@@ -85,8 +85,8 @@ def own(cache, tmp_path):
 @pytest.fixture
 def tiny_limits(monkeypatch):
     """A map of a few tiles is too large for memory."""
-    for module in ("maps.metric_copy", "maps.pyramid"):
-        monkeypatch.setattr(f"engine.{module}.MEMORY_LIMIT_PX", 20_000)
+    monkeypatch.setattr("engine.maps.rasters.MEMORY_LIMIT_PX", 20_000)
+    monkeypatch.setattr("engine.maps.pyramid.COARSE_LIMIT_PX", 20_000)
 
 
 def there():
