@@ -62,7 +62,7 @@ def _metric_grid(source: Grid) -> Grid:
     return Grid(math.ceil(size[0] - 1e-6), math.ceil(size[1] - 1e-6), matrix, utm)
 
 
-def needs_copy(source: Source) -> bool:
+def _needs_copy(source: Source) -> bool:
     """Whether a map needs a copy: its grid is not metric, or even its smallest overview is large."""
     return not source.grid.is_metric or is_large(source.grid.area_px >> 2 * stored_levels(source)[-1])
 
@@ -112,25 +112,22 @@ def open_readable(
     Raises:
         MapError: the file cannot be read.
     """
-    used, original = source, None if is_large(source.grid.area_px) else GrayReader(source)
-    if needs_copy(source):
+    original = None if is_large(source.grid.area_px) else GrayReader(source)
+    if _needs_copy(source):
         used = open_metric_copy(source, original, cache_dir, on_copy)
         reader = GrayReader(used, find_collar=False)
     else:
-        reader = original or GrayReader(source)
-    return (
-        used,
-        reader,
-        {
-            "path": str(source.path),
-            "driver": source.dataset.driver,
-            "bands": source.dataset.count,
-            "dtype": source.dataset.dtypes[0],
-            "source_size_px": [source.grid.width_px, source.grid.height_px],
-            "source_nodata_share": (original or reader).invalid_share,
-            "resampled": not source.grid.is_metric,
-        },
-    )
+        used, reader = source, original or GrayReader(source)
+    facts = {
+        "path": str(source.path),
+        "driver": source.dataset.driver,
+        "bands": source.dataset.count,
+        "dtype": source.dataset.dtypes[0],
+        "source_size_px": [source.grid.width_px, source.grid.height_px],
+        "source_nodata_share": (original or reader).invalid_share,
+        "resampled": not source.grid.is_metric,
+    }
+    return used, reader, facts
 
 
 def open_metric_copy(
