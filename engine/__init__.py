@@ -5,84 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 from engine.runtime.lazy_names import imported_on_use
 
-if TYPE_CHECKING:
-    from engine import features, ncc_fft
-    from engine.budget import Budget
-    from engine.camera import Camera
-    from engine.errors import (
-        BackendError,
-        CalibrationError,
-        DeviceError,
-        DtypeError,
-        EngineError,
-        MapError,
-        MissingExtraError,
-        OptionError,
-        ShapeError,
-        StateError,
-        TelemetryError,
-    )
-    from engine.matching.matcher import SceneMatcher
-    from engine.navigation.live import Answer, Live, LiveOptions
-    from engine.navigation.navigator import Navigator
-    from engine.navigation.state import NavigatorState
-    from engine.options import (
-        AssumedErrors,
-        LearnedOptions,
-        MatcherOptions,
-        NavigatorOptions,
-        NccOptions,
-        PoseOptions,
-        SiftOptions,
-    )
-    from engine.orthomap import OrthoMap
-    from engine.runtime.realtime import Realtime, set_realtime
-    from engine.runtime.threads import set_threads
-    from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, Timings, Window
-
-__all__ = [
-    "Answer",
-    "AssumedErrors",
-    "Attitude",
-    "BackendError",
-    "Budget",
-    "CalibrationError",
-    "Camera",
-    "DeviceError",
-    "DtypeError",
-    "EngineError",
-    "Fix",
-    "Frame",
-    "LearnedOptions",
-    "Live",
-    "LiveOptions",
-    "MapError",
-    "MatcherOptions",
-    "MissingExtraError",
-    "Navigator",
-    "NavigatorOptions",
-    "NavigatorState",
-    "NccOptions",
-    "NoFix",
-    "OptionError",
-    "OrthoMap",
-    "PoseOptions",
-    "Prior",
-    "Realtime",
-    "Reason",
-    "SceneMatcher",
-    "ShapeError",
-    "SiftOptions",
-    "StateError",
-    "TelemetryError",
-    "Timings",
-    "Window",
-    "features",
-    "ncc_fft",
-    "set_realtime",
-    "set_threads",
-]
-
 _NAMES = {
     "engine.budget": "Budget",
     "engine.camera": "Camera",
@@ -101,12 +23,55 @@ _NAMES = {
 }
 """The public names by module. A module is imported when one of its names is used: torch alone takes seconds."""
 
+_MODULES = ("features", "ncc_fft")
+__all__ = sorted([*" ".join(_NAMES.values()).split(), *_MODULES])
 _imported = imported_on_use(__name__, _NAMES)
 
-if not TYPE_CHECKING:  # type checkers see the names above and reject others
+if TYPE_CHECKING:  # the same names for type checkers; `as` makes them public
+    from engine import features as features
+    from engine import ncc_fft as ncc_fft
+    from engine.budget import Budget as Budget
+    from engine.camera import Camera as Camera
+    from engine.errors import BackendError as BackendError
+    from engine.errors import CalibrationError as CalibrationError
+    from engine.errors import DeviceError as DeviceError
+    from engine.errors import DtypeError as DtypeError
+    from engine.errors import EngineError as EngineError
+    from engine.errors import MapError as MapError
+    from engine.errors import MissingExtraError as MissingExtraError
+    from engine.errors import OptionError as OptionError
+    from engine.errors import ShapeError as ShapeError
+    from engine.errors import StateError as StateError
+    from engine.errors import TelemetryError as TelemetryError
+    from engine.matching.matcher import SceneMatcher as SceneMatcher
+    from engine.navigation.live import Answer as Answer
+    from engine.navigation.live import Live as Live
+    from engine.navigation.live import LiveOptions as LiveOptions
+    from engine.navigation.navigator import Navigator as Navigator
+    from engine.navigation.state import NavigatorState as NavigatorState
+    from engine.options import AssumedErrors as AssumedErrors
+    from engine.options import LearnedOptions as LearnedOptions
+    from engine.options import MatcherOptions as MatcherOptions
+    from engine.options import NavigatorOptions as NavigatorOptions
+    from engine.options import NccOptions as NccOptions
+    from engine.options import PoseOptions as PoseOptions
+    from engine.options import SiftOptions as SiftOptions
+    from engine.orthomap import OrthoMap as OrthoMap
+    from engine.runtime.realtime import Realtime as Realtime
+    from engine.runtime.realtime import set_realtime as set_realtime
+    from engine.runtime.threads import set_threads as set_threads
+    from engine.values import Attitude as Attitude
+    from engine.values import Fix as Fix
+    from engine.values import Frame as Frame
+    from engine.values import NoFix as NoFix
+    from engine.values import Prior as Prior
+    from engine.values import Reason as Reason
+    from engine.values import Timings as Timings
+    from engine.values import Window as Window
+else:  # type checkers see the names above and reject others
 
     def __getattr__(name: str) -> Any:
-        if name in ("features", "ncc_fft"):  # public modules
+        if name in _MODULES:
             return import_module(f"engine.{name}")
         return _imported(name)
 

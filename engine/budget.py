@@ -7,9 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from engine.errors import OptionError
-
-_SPENT_MS = 1e-6
+from engine.values import check
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,14 +27,13 @@ class Budget:
 
     def __post_init__(self) -> None:
         for name in ("total_ms", "search_ms"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise OptionError(f"{name}: expected more than 0 ms, got {value}")
+            check(self, name, "more than 0 ms", lambda ms: ms is None or ms > 0)
 
     def after(self, elapsed_ms: float) -> Budget:
         """The budget left after so many milliseconds; once spent, too little for any answer."""
-        search_ms = None if self.search_ms is None else max(self.search_ms - elapsed_ms, _SPENT_MS)
-        return Budget(total_ms=max(self.total_ms - elapsed_ms, _SPENT_MS), search_ms=search_ms)
+        spent_ms = math.ulp(0.0)
+        search_ms = None if self.search_ms is None else max(self.search_ms - elapsed_ms, spent_ms)
+        return Budget(total_ms=max(self.total_ms - elapsed_ms, spent_ms), search_ms=search_ms)
 
 
 class Deadline:

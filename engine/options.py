@@ -9,7 +9,7 @@ from engine.errors import OptionError
 from engine.kernels.scores import check_score
 from engine.learned.pairs import PairMatcher
 from engine.sift import BACKENDS
-from engine.values import MAX_SIGMA_M, GridPose, check_positive
+from engine.values import MAX_SIGMA_M, GridPose, check, check_choice, check_positive
 
 PROFILES = ("engine", "paper")
 MAP_FEATURES = ("prepared", "per_frame")
@@ -47,8 +47,7 @@ class AssumedErrors:
 
     def __post_init__(self) -> None:
         check_positive(self, *(name for name in self.__dataclass_fields__ if name != "height_share"))
-        if not 0.0 <= self.height_share < math.inf:
-            raise OptionError(f"height_share: expected a number from 0 up, got {self.height_share}")
+        check(self, "height_share", "a number from 0 up", lambda share: 0.0 <= share < math.inf)
         for name in self.__dataclass_fields__:
             if getattr(self, name) > MAX_SIGMA_M:
                 raise OptionError(f"{name}: expected at most {MAX_SIGMA_M:g}, got {getattr(self, name):g}")
@@ -86,12 +85,9 @@ class PoseOptions:
 
     def __post_init__(self) -> None:
         for name in ("reprojection_px", "distinct_px", "min_spread_px"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise OptionError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        if self.min_inliers < 4:
-            raise OptionError(f"min_inliers: expected at least 4, got {self.min_inliers}")
-        if math.isnan(self.max_log10_nfa):
-            raise OptionError("max_log10_nfa: expected a number, got nan")
+            check(self, name, "a positive number", lambda pixels: 0 < pixels < math.inf)
+        check(self, "min_inliers", "at least 4", lambda count: count >= 4)
+        check(self, "max_log10_nfa", "a number", lambda bound: not math.isnan(bound))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,8 +113,7 @@ class NccOptions:
     def __post_init__(self) -> None:
         check_positive(self, "exclusion_m")
         check_score(self.score)
-        if self.enhance_radius_px < 0:
-            raise OptionError(f"enhance_radius_px: expected 0 or more, got {self.enhance_radius_px}")
+        check(self, "enhance_radius_px", "0 or more", lambda radius: radius >= 0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,27 +165,17 @@ class SiftOptions:
 
     def __post_init__(self) -> None:
         for name in ("height_factor", "max_height_m", "tolerance_px"):
-            if math.isinf(getattr(self, name)):
-                raise OptionError(f"{name}: expected a finite number, got {getattr(self, name)}")
-        if not self.height_factor >= 1.0:
-            raise OptionError(f"height_factor: expected 1 or more, got {self.height_factor}")
-        if not 0.0 < self.scale <= 1.0:
-            raise OptionError(f"scale: expected above 0 and at most 1, got {self.scale}")
-        for name, minimum in (
-            ("max_height_m", MIN_HEIGHT_M), ("max_tilt_deg", 0.0),
-            ("keypoints_per_px", 0.0), ("tolerance_px", 0.0),
-        ):  # fmt: skip
-            value = getattr(self, name)
-            if not value > minimum:
-                raise OptionError(f"{name}: expected above {minimum:g}, got {value}")
-        if self.upsample not in (1, 2):
-            raise OptionError(f"upsample: expected 1 or 2, got {self.upsample}")
-        for name, known in (("map_features", MAP_FEATURES), ("backend", BACKENDS)):
-            if getattr(self, name) not in known:
-                raise OptionError(f"{name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}")
+            check(self, name, "a finite number", lambda value: not math.isinf(value))
+        check(self, "height_factor", "1 or more", lambda factor: factor >= 1.0)
+        check(self, "scale", "above 0 and at most 1", lambda scale: 0.0 < scale <= 1.0)
+        check(self, "max_height_m", f"above {MIN_HEIGHT_M:g}", lambda height: height > MIN_HEIGHT_M)
+        for name in ("max_tilt_deg", "keypoints_per_px", "tolerance_px"):
+            check(self, name, "above 0", lambda value: value > 0.0)
+        check(self, "upsample", "1 or 2", lambda factor: factor in (1, 2))
+        check_choice(self, "map_features", MAP_FEATURES)
+        check_choice(self, "backend", BACKENDS)
         for name in ("max_keypoints", "max_map_keypoints"):
-            if not getattr(self, name) >= 4:
-                raise OptionError(f"{name}: expected 4 or more, got {getattr(self, name)}")
+            check(self, name, "4 or more", lambda count: count >= 4)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -214,12 +199,11 @@ class LearnedOptions:
     tolerance_px: float = 2.0
 
     def __post_init__(self) -> None:
-        limits = {"max_picture_px": 4096, "max_window_px": 4096, "max_keypoints": 4, "max_map_keypoints": 4}
-        for name, minimum in limits.items():
-            if not getattr(self, name) >= minimum:
-                raise OptionError(f"{name}: expected {minimum} or more, got {getattr(self, name)}")
-        if not 0.0 < self.tolerance_px < math.inf:
-            raise OptionError(f"tolerance_px: expected a positive number, got {self.tolerance_px}")
+        for name in ("max_picture_px", "max_window_px"):
+            check(self, name, "4096 or more", lambda pixels: pixels >= 4096)
+        for name in ("max_keypoints", "max_map_keypoints"):
+            check(self, name, "4 or more", lambda count: count >= 4)
+        check(self, "tolerance_px", "a positive number", lambda pixels: 0.0 < pixels < math.inf)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -241,10 +225,8 @@ class MatcherOptions:
     learned: LearnedOptions = field(default_factory=LearnedOptions)
 
     def __post_init__(self) -> None:
-        if self.profile not in PROFILES:
-            raise OptionError(f"profile: expected one of {', '.join(PROFILES)}, got {self.profile!r}")
-        if not 0.0 < self.risk < 1.0:
-            raise OptionError(f"risk: expected a probability above 0 and below 1, got {self.risk}")
+        check_choice(self, "profile", PROFILES)
+        check(self, "risk", "a probability above 0 and below 1", lambda risk: 0.0 < risk < 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -292,8 +274,7 @@ class NavigatorOptions:
 
     def __post_init__(self) -> None:
         check_positive(self, *(name for name in self.__dataclass_fields__ if name != "odometry"))
-        if self.min_confidence >= 1.0:
-            raise OptionError(f"min_confidence: expected a probability below 1, got {self.min_confidence}")
+        check(self, "min_confidence", "a probability below 1", lambda confidence: confidence < 1.0)
 
     @property
     def min_log_odds(self) -> float:

@@ -20,10 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from engine.errors import MapError
 from engine.maps.colour import read_colour
 from engine.maps.georeference import Georeference
-from engine.maps.grids import Array, Grid, warp_between
-from engine.maps.metric_copy import ProgressCallback
-from engine.maps.preparation import check_arrays, metric_grid, open_readable
-from engine.maps.pyramid import ArrayReader, Pyramid, Reader
+from engine.maps.grids import Array, Grid, metric_grid, warp_between
+from engine.maps.metric_copy import ProgressCallback, open_readable
+from engine.maps.pyramid import ArrayReader, Pyramid, Reader, check_arrays
 from engine.maps.rasters import (
     GEOREFERENCE_TAG,
     SLOPE_TAG,
@@ -67,9 +66,6 @@ class OrthoMap(Georeference):
         slope_sigma_deg: slope accuracy of the surface under a frame, one standard deviation; None if unknown.
     """
 
-    georeference_sigma_m: float | None = None
-    slope_sigma_deg: float | None = None
-
     def __init__(
         self, name: str, grid: Grid, reader: Reader, source_crs: CRS, facts: dict[str, Any] | None = None
     ) -> None:
@@ -79,6 +75,8 @@ class OrthoMap(Georeference):
         self._surface: SurfaceModel | None = None
         self.has_surface, self.ground_m = False, 0.0
         self.surface_datum: str | None = None
+        self.georeference_sigma_m: float | None = None
+        self.slope_sigma_deg: float | None = None
         self._pyramid = Pyramid(grid.width_px, grid.height_px, reader)
         self.levels = self._pyramid.levels
 
@@ -115,30 +113,19 @@ class OrthoMap(Georeference):
             MapError: a file cannot be read or has no georeference, or the surface does not overlap the map.
             OptionError: an accuracy is not a number above 0.
         """
-        original = open_source(path, bounds_deg=bounds_deg, bounds_crs=bounds_crs, crs=crs)
+        opened = partial(open_source, path, bounds_deg=bounds_deg, bounds_crs=bounds_crs, crs=crs)
+        original = opened()
         used, reader, facts = open_readable(original, cache_dir, on_copy)
         facts["surface_path"] = None if surface is None else os.fspath(surface)
         site = cls(original.path.name, used.grid, reader, original.grid.crs, facts)
         heights_file = None if surface is None else open_source(surface, "surface")
-        site._source = partial(open_source, path, bounds_deg=bounds_deg, bounds_crs=bounds_crs, crs=crs)
-        site._set_accuracy(georeference_sigma_m, slope_sigma_deg, original, heights_file)
+        site._source = opened
+        site.georeference_sigma_m = stated_sigma(georeference_sigma_m, original, GEOREFERENCE_TAG)
+        site.slope_sigma_deg = stated_sigma(slope_sigma_deg, heights_file, SLOPE_TAG)
         if heights_file is not None:
             site._attach(*open_surface(heights_file, site._grid))
             site.surface_datum = vertical_datum(heights_file.dataset)
         return site
-
-    def _set_accuracy(
-        self,
-        georeference_sigma_m: float | None,
-        slope_sigma_deg: float | None,
-        source: Source | None = None,
-        heights_file: Source | None = None,
-    ) -> None:
-        """Take the given accuracies, or those in the files' metadata."""
-        self.georeference_sigma_m = stated_sigma(
-            georeference_sigma_m, source, GEOREFERENCE_TAG, "georeference_sigma_m"
-        )
-        self.slope_sigma_deg = stated_sigma(slope_sigma_deg, heights_file, SLOPE_TAG, "slope_sigma_deg")
 
     @classmethod
     def from_arrays(
@@ -177,7 +164,8 @@ class OrthoMap(Georeference):
         check_arrays(gray, mask, heights)
         grid = metric_grid(gray.shape, np.asarray(pixel_to_crs, np.float64), crs)
         site = cls("arrays", grid, ArrayReader(gray, mask), grid.crs)
-        site._set_accuracy(georeference_sigma_m, slope_sigma_deg)
+        site.georeference_sigma_m = stated_sigma(georeference_sigma_m, None, GEOREFERENCE_TAG)
+        site.slope_sigma_deg = stated_sigma(slope_sigma_deg, None, SLOPE_TAG)
         if heights is not None:
             site._attach(SurfaceModel(heights, warp_between(grid, grid)), grid)
         return site

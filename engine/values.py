@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -442,6 +442,34 @@ Result = Fix | NoFix
 """The answer to a frame."""
 
 
+def check(options: object, name: str, expected: str, is_valid: Callable[[Any], bool]) -> None:
+    """Check one option.
+
+    Args:
+        options: has it.
+        name: of the option.
+        expected: what it may be, in words.
+        is_valid: the same as a test of its value.
+
+    Raises:
+        OptionError: it is not valid.
+    """
+    value = getattr(options, name)
+    if not is_valid(value):
+        raise OptionError(f"{name}: expected {expected}, got {value}")
+
+
+def check_choice(options: object, name: str, choices: Sequence[str]) -> None:
+    """Check that an option is one of these words.
+
+    Raises:
+        OptionError: it is not.
+    """
+    value = getattr(options, name)
+    if value not in choices:
+        raise OptionError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
 def check_positive(options: object, *names: str) -> None:
     """Check that all options are finite numbers above 0.
 
@@ -449,6 +477,4 @@ def check_positive(options: object, *names: str) -> None:
         OptionError: names the first that is not.
     """
     for name in names:
-        value = getattr(options, name)
-        if not (math.isfinite(value) and value > 0):
-            raise OptionError(f"{name}: expected a number above 0, got {value}")
+        check(options, name, "a number above 0", lambda value: math.isfinite(value) and value > 0)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.maps.grids import Array, Grid, apply_affine
-from engine.maps.heights import part_grid
+from engine.maps.grids import Grid, by_corner, part_grid
 from engine.maps.rasters import STRETCH_PERCENT, Source, map_errors, palette_of, stretched
 from engine.values import Window
 
@@ -37,20 +36,14 @@ def read_colour(source: Source, grid: Grid, window: Window, shape: tuple[int, in
         return None
     given, wanted = source.grid, part_grid(grid, window, shape)
     view = {
-        "src_crs": given.crs.to_wkt(), "src_transform": Affine(*_by_corner(given)),
-        "crs": wanted.crs.to_wkt(), "transform": Affine(*_by_corner(wanted)),
+        "src_crs": given.crs.to_wkt(), "src_transform": Affine(*by_corner(given)),
+        "crs": wanted.crs.to_wkt(), "transform": Affine(*by_corner(wanted)),
         "height": shape[0], "width": shape[1],
         "resampling": Resampling.bilinear if palette is None else Resampling.nearest,
     }  # fmt: skip
     with map_errors("map", source.path), WarpedVRT(source.dataset, **view) as warped:
         bands = warped.read([1, 2, 3] if palette is None else [1])
     return _stretched(np.moveaxis(bands if palette is None else palette[:, bands[0]], 0, -1))
-
-
-def _by_corner(grid: Grid) -> Array:
-    """GDAL's affine (6,) of a grid, from the outer corner of its first pixel."""
-    corner = apply_affine(grid.pixel_to_crs, np.array([-0.5, -0.5]))
-    return np.column_stack([grid.pixel_to_crs[:, :2], corner]).ravel()
 
 
 def _stretched(colour: NDArray[np.generic]) -> Rgb:

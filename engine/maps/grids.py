@@ -194,6 +194,11 @@ class Grid:
     crs: CRS
 
     @property
+    def area_px(self) -> int:
+        """Number of pixels."""
+        return self.width_px * self.height_px
+
+    @property
     def centre_px(self) -> Array:
         """(2,) middle of the picture."""
         return np.array([(self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0])
@@ -255,6 +260,52 @@ class Grid:
         with np.errstate(invalid="ignore"):
             steps_m = np.linalg.norm(LocalFrame(lat[0], lon[0]).enu_from_geodetic(lat[1:], lon[1:]), axis=1)
         return bool(steps_m.max() <= 1.01 * steps_m.min())
+
+
+def part_grid(own: Grid, part: Window, shape: tuple[int, int]) -> Grid:
+    """The grid of a window of another grid, decimated to ``shape`` (rows, columns)."""
+    low, size = np.array([part.x0, part.y0]), np.array([part.width_px, part.height_px])
+    scale = size / np.array(shape[::-1])
+    # Pixel x of the decimated copy covers the file's pixels around low + (x + 0.5) * scale - 0.5.
+    crop_to_file = np.column_stack([np.diag(scale), low + 0.5 * scale - 0.5])
+    linear = own.pixel_to_crs[:, :2] @ crop_to_file[:, :2]
+    origin = apply_affine(own.pixel_to_crs, crop_to_file[:, 2])
+    return Grid(shape[1], shape[0], np.column_stack([linear, origin]), own.crs)
+
+
+def by_corner(grid: Grid) -> Array:
+    """GDAL's affine of a grid, from the outer corner of its first pixel.
+
+    Args:
+        grid: whose pixels are centres.
+
+    Returns:
+        (6,) as :class:`affine.Affine` takes them.
+    """
+    corner = apply_affine(grid.pixel_to_crs, np.array([-0.5, -0.5]))
+    return np.column_stack([grid.pixel_to_crs[:, :2], corner]).ravel()
+
+
+def metric_grid(shape: tuple[int, ...], matrix: Array, crs: Any) -> Grid:
+    """The grid of arrays.
+
+    Args:
+        shape: (H, W).
+        matrix: (2, 3) affine from pixels to the CRS.
+        crs: anything that pyproj takes.
+
+    Returns:
+        Grid: metric and north-up.
+
+    Raises:
+        MapError: the grid is not metric and north-up.
+    """
+    if matrix.shape != (2, 3) or not np.isfinite(matrix).all() or np.linalg.det(matrix[:, :2]) == 0.0:
+        raise MapError(f"pixel_to_crs: expected a finite, invertible (2, 3), got {matrix.tolist()}")
+    grid = Grid(shape[1], shape[0], matrix, earth_crs(crs, "crs"))
+    if not grid.is_metric:
+        raise MapError(f"pixel_to_crs: expected a square north-up grid in a projected CRS, got {grid.crs.name!r}")
+    return grid
 
 
 def warp_between(grid: Grid, other: Grid) -> Warp:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from engine.learned import KeypointMatcher, Keypoints
-from engine.maps.landmarks import as_picture
+from engine.maps.landmarks import MAX_LANDMARKS, as_picture
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import HALO_PX, tile_at, tiles_under, widened
 from engine.runtime.device import CPU, as_tensor
@@ -27,7 +27,7 @@ TILE_PX = 512
 """Tiles begin on multiples of this in every level."""
 PX_PER_KEYPOINT = 64
 """A tile has at most one keypoint per this many pixels."""
-MAX_KEYPOINTS = 1 << 18
+MAX_KEYPOINTS = MAX_LANDMARKS
 """Keypoints kept in memory, besides those of the last window; one takes up to 520 bytes."""
 _NODATA_PX = 5  # a keypoint this near to a pixel without data may be its edge
 
@@ -40,16 +40,14 @@ class KeypointMap:
     Args:
         site: the map.
         matcher: its extractor describes the map.
+
+    Attributes:
+        tiles: described so far; the least recently used are evicted.
     """
 
     def __init__(self, site: OrthoMap, matcher: KeypointMatcher) -> None:
         self._site, self._matcher = site, matcher
-        self._tiles: RecentlyUsed[_Key, Keypoints] = RecentlyUsed()
-
-    @property
-    def created(self) -> int:
-        """Tiles described so far."""
-        return self._tiles.created
+        self.tiles: RecentlyUsed[_Key, Keypoints] = RecentlyUsed()
 
     def find(self, window: Window, level: int, count: int) -> Keypoints:
         """The strongest keypoints of a window.
@@ -66,11 +64,11 @@ class KeypointMap:
         size = np.array([window.width_px, window.height_px], np.float32)
         keys = [(level, row, column) for row, column in tiles_under(window, TILE_PX)]
         parts = []
-        for tile in [self._tiles.get(key, partial(self._describe, *key)) for key in keys]:
+        for tile in [self.tiles.get(key, partial(self._describe, *key)) for key in keys]:
             xy = tile.xy_px - tile.xy_px.new_tensor(corner)
             inside = ((xy >= 0.0) & (xy <= xy.new_tensor(size) - 1.0)).all(dim=1)
             parts.append(Keypoints(xy, tile.strength, tile.descriptors).only(inside))
-        self._tiles.evict(lambda _, tile: len(tile), MAX_KEYPOINTS, keep=len(keys))
+        self.tiles.evict(lambda _, tile: len(tile), MAX_KEYPOINTS, keep=len(keys))
         share = min(1.0, count / max(1, sum(map(len, parts))))
         parts = [part.only(torch.arange(int(share * len(part)), device=part.xy_px.device)) for part in parts]
         return Keypoints(*(torch.cat(v) for v in zip(*map(_fields, parts), strict=True)))

@@ -83,10 +83,7 @@ def save_arrays(key: str, arrays: NamedArrays) -> None:
     path = cache_path(key)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(suffix=".npz", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as stream:
-                np.savez(stream, allow_pickle=False, key=np.array(key), **arrays)
-            os.replace(name, path)
-        finally:
-            Path(name).unlink(missing_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            written = Path(folder) / path.name
+            np.savez(written, allow_pickle=False, key=np.array(key), **arrays)
+            os.replace(written, path)

@@ -77,18 +77,16 @@ class LandmarkMap:
         site: the map.
         device: of detection and of the returned features, the frame's too; the cache is in host memory.
         backend: of :func:`engine.features.sift`.
+
+    Attributes:
+        tiles: described so far; the least recently used are evicted.
     """
 
     def __init__(self, site: OrthoMap, device: Device, backend: str = "auto") -> None:
         self._site, self.device = site, device
         self._backend = chosen_backend(backend, device)
-        self._tiles: RecentlyUsed[_Key, NamedArrays] = RecentlyUsed()
+        self.tiles: RecentlyUsed[_Key, NamedArrays] = RecentlyUsed()
         self._max_landmarks = MAX_LANDMARKS
-
-    @property
-    def created(self) -> int:
-        """Tiles described so far."""
-        return self._tiles.created
 
     def find(self, window: Window, level: int, *, upright: bool, per_px: float = math.inf) -> Landmarks:
         """The landmarks of a window.
@@ -104,7 +102,7 @@ class LandmarkMap:
         """
         keys = _keys(window, level, upright)
         tiles = [self._tile(key) for key in keys]
-        self._tiles.evict(lambda _, tile: _count(tile), self._max_landmarks, keep=len(keys))
+        self.tiles.evict(lambda _, tile: _count(tile), self._max_landmarks, keep=len(keys))
         max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
         return self._to_landmarks(_gathered(tiles, [_inside(tile, window, max_rank) for tile in tiles]))
 
@@ -122,13 +120,13 @@ class LandmarkMap:
             for upright in (True, False):
                 self._prepare(level, upright)
         # No more than is prepared now: a large map with few prepared levels keeps the usual limit.
-        self._max_landmarks = max(self._max_landmarks, sum(map(_count, self._tiles.values())))
+        self._max_landmarks = max(self._max_landmarks, sum(map(_count, self.tiles.values())))
 
     def _prepare(self, level: int, upright: bool) -> None:
         rows, columns = self._site.level_shape(level)
         whole = Window(0, 0, columns, rows)
         keys = _keys(whole, level, upright)
-        if all(key in self._tiles for key in keys):
+        if all(key in self.tiles for key in keys):
             return
         if not self._site.from_file:
             for key in keys:
@@ -144,12 +142,12 @@ class LandmarkMap:
         at = np.rint(stored["xy_px"]).astype(np.int64) // TILE_PX
         for key in keys:
             own = (at == (key[3], key[2])).all(axis=1)
-            self._tiles[key] = self._with_points({field: values[own] for field, values in stored.items()}, level)
+            self.tiles[key] = self._with_points({field: values[own] for field, values in stored.items()}, level)
 
     def _tile(self, key: _Key) -> NamedArrays:
         """Get a tile, which becomes the most recently used."""
         level = key[0]
-        return self._tiles.get(key, lambda: self._with_points(self._detect(*key), level))
+        return self.tiles.get(key, lambda: self._with_points(self._detect(*key), level))
 
     def _detect(self, level: int, upright: bool, row: int, column: int) -> NamedArrays:
         """Every keypoint on a tile, as detected in the whole level."""

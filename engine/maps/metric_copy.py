@@ -1,8 +1,7 @@
 """The metric copy of a map, used for matching: north-up in UTM, created once and cached on disk.
 
-A map in degrees, rotated or with oblong pixels is resampled; a large one without overviews gets them. A copy is a
-folder of tiles. Each is written and renamed in one step, and a list records the hash of its content, so that an
-interrupted copy can continue and a damaged tile is created again.
+A map in degrees, rotated or with oblong pixels is resampled; a large one without overviews gets them. A copy is
+one GeoTIFF, renamed when it is complete, with the hash of its content beside it: a damaged one is created again.
 """
 
 from __future__ import annotations
@@ -14,7 +13,8 @@ import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,25 +22,22 @@ import numpy as np
 
 from engine.errors import MapError
 from engine.maps import xyz_tiles
-from engine.maps.grids import Grid, Warp, apply_affine, wgs84, window_about
-from engine.maps.rasters import MEMORY_LIMIT_PX, Gray, GrayReader, Source, map_errors, open_source, stored_levels
-from engine.maps.tiles import within
+from engine.maps.grids import Grid, Warp, apply_affine, by_corner, wgs84, window_about
+from engine.maps.rasters import Gray, GrayReader, Source, is_large, map_errors, open_source, stored_levels
+from engine.maps.tiles import tile_at, tiles_under
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
 
-GRID_VERSION = 1
+GRID_VERSION = 2
 """Part of the key of cached copies; raise it with every change in how they are created."""
-TILE_PX = 8192
-"""Side of the tiles of a copy; those of a large one have overviews down to a thirty-second."""
-COARSEST_PX = 16384
-"""A large file whose smallest overview has a longer side than this is copied."""
-LIST = "tiles.txt"
-"""In the folder of a copy: a line per tile, its name and its SHA-256, or "-" if it has no valid pixel."""
+FACTORS = [2, 4, 8, 16, 32]
+"""Of the overviews of a large copy. The file is padded to a multiple, so that their pixels lie on the levels'."""
+BLOCK_PX = 1024
+"""Side of the blocks in which a copy is read, resampled and written."""
 ProgressCallback = Callable[[int, int], None]
 """Called while a copy is created, with the number of pixels done and in all."""
 _Block = tuple[Window, Gray]
 _CACHED_HASH_BYTES = 1 << 22  # the hashes of larger files are cached by size and time
-_FACTORS = [2, 4, 8, 16, 32]
 
 
 def _metric_grid(source: Grid) -> Grid:
@@ -65,44 +62,31 @@ def _metric_grid(source: Grid) -> Grid:
     return Grid(math.ceil(size[0] - 1e-6), math.ceil(size[1] - 1e-6), matrix, utm)
 
 
-def is_large(grid: Grid) -> bool:
-    """Whether a map on this grid is read window by window instead of held in memory."""
-    return grid.width_px * grid.height_px > MEMORY_LIMIT_PX
+def _needs_copy(source: Source) -> bool:
+    """Whether a map needs a copy: its grid is not metric, or even its smallest overview is large."""
+    return not source.grid.is_metric or is_large(source.grid.area_px >> 2 * stored_levels(source)[-1])
 
 
-def needs_copy(source: Source) -> bool:
-    """Whether a map needs a copy: its grid is not metric, or it is large without overviews."""
-    grid = source.grid
-    if not grid.is_metric:
-        return True
-    longest_px = max(grid.width_px, grid.height_px) >> stored_levels(source)[-1]
-    return is_large(grid) and longest_px > COARSEST_PX
-
-
-def _blocks(part: Window, block_px: int = 1024) -> Iterator[Window]:
-    """Windows that cover a window, row by row; the last ones are smaller."""
-    for y0 in range(part.y0, part.y1, block_px):
-        for x0 in range(part.x0, part.x1, block_px):
-            yield Window(x0, y0, min(block_px, part.x1 - x0), min(block_px, part.y1 - y0))
-
-
-def _copied(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[_Block]:
-    """Blocks of a part of the copy's grid as (2, h, w) grey and alpha."""
+def _copied(reader: GrayReader, source: Grid, grid: Grid) -> Iterator[_Block]:
+    """The copy block by block, as (2, h, w) grey and alpha."""
+    shape = grid.height_px, grid.width_px
+    whole = Window(0, 0, grid.width_px, grid.height_px)
+    windows = (tile_at(*place, BLOCK_PX, shape) for place in tiles_under(whole, BLOCK_PX))
     if grid is not source:
-        yield from _resampled(reader, source, grid, part)
+        yield from _resampled(reader, source, grid, windows)
         return
-    for window in _blocks(part):
+    for window in windows:
         gray, valid = reader.read(window)
         yield window, np.stack([gray, valid.astype(np.uint8) * 255])
 
 
-def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> Iterator[_Block]:
-    """The same, resampled: grey is cubic, alpha 255 where all of it is valid."""
+def _resampled(reader: GrayReader, source: Grid, grid: Grid, windows: Iterable[Window]) -> Iterator[_Block]:
+    """Blocks of the copy, resampled: grey is cubic, alpha 255 where all of it is valid."""
     import cv2
 
     to_source = source.pixels_of(grid.crs)[1]
     warp = Warp(lambda xy: to_source(apply_affine(grid.pixel_to_crs, xy)), grid.box(), tolerance=0.005)
-    for window in _blocks(part):
+    for window in windows:
         columns = np.arange(window.x0, window.x1, dtype=np.float64)
         rows = np.arange(window.y0, window.y1, dtype=np.float64)
         at = np.nan_to_num(warp.on_grid(columns, rows), nan=-9.0, posinf=-9.0, neginf=-9.0)
@@ -120,16 +104,30 @@ def _resampled(reader: GrayReader, source: Grid, grid: Grid, part: Window) -> It
         yield window, block
 
 
-class _Progress:
-    """Counts and reports the finished pixels of a copy."""
+def open_readable(
+    source: Source, cache_dir: str | os.PathLike[str] | None, on_copy: ProgressCallback | None
+) -> tuple[Source, GrayReader, dict[str, Any]]:
+    """The source or its metric copy, the reader of that, and facts about the source.
 
-    def __init__(self, grid: Grid, on_progress: ProgressCallback | None) -> None:
-        self._done_px, self._all_px, self._on_progress = 0, grid.width_px * grid.height_px, on_progress
-
-    def add(self, count_px: int, *, quietly: bool = False) -> None:
-        self._done_px += count_px
-        if self._on_progress is not None and not quietly:
-            self._on_progress(self._done_px, self._all_px)
+    Raises:
+        MapError: the file cannot be read.
+    """
+    original = None if is_large(source.grid.area_px) else GrayReader(source)
+    if _needs_copy(source):
+        used = open_metric_copy(source, original, cache_dir, on_copy)
+        reader = GrayReader(used, find_collar=False)
+    else:
+        used, reader = source, original or GrayReader(source)
+    facts = {
+        "path": str(source.path),
+        "driver": source.dataset.driver,
+        "bands": source.dataset.count,
+        "dtype": source.dataset.dtypes[0],
+        "source_size_px": [source.grid.width_px, source.grid.height_px],
+        "source_nodata_share": (original or reader).invalid_share,
+        "resampled": not source.grid.is_metric,
+    }
+    return used, reader, facts
 
 
 def open_metric_copy(
@@ -152,7 +150,7 @@ def open_metric_copy(
     """
     grid = source.grid if source.grid.is_metric else _metric_grid(source.grid)
     cache = cache_folder() if cache_dir is None else Path(cache_dir)
-    name = _key(source, cache)
+    name = Path(_key(source, cache), "map.tif")
     try:
         return _built(cache / name, source, reader, grid, on_progress)
     except OSError:
@@ -193,81 +191,48 @@ def _file_hash(path: Path, cache: Path) -> str:
 
 
 def _built(
-    folder: Path, source: Source, reader: GrayReader | None, grid: Grid, on_progress: ProgressCallback | None
+    path: Path, source: Source, reader: GrayReader | None, grid: Grid, on_progress: ProgressCallback | None
 ) -> Source:
-    """The copy in a folder, after tiles that are missing or differ from the list were written.
+    """The copy in a file, after it was written if it is missing or its content has another hash than noted.
 
     Raises:
-        OSError: a tile cannot be written.
+        OSError: it cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    listed, progress = _read_list(folder / LIST), _Progress(grid, on_progress)
-    tiles = list(_blocks(Window(0, 0, grid.width_px, grid.height_px), TILE_PX))
-    for tile in tiles:
-        target = folder / f"{tile.y0 // TILE_PX:04d}-{tile.x0 // TILE_PX:04d}.tif"
-        if listed.get(target.name) == _state(target):
-            progress.add(tile.area_px, quietly=True)
-            continue
-        progress.add(0)  # reports progress before the first block is done
-        reader = reader or GrayReader(source)
-        corner = tile in (tiles[0], tiles[-1])  # they define the extent of the grid
-        blocks = _copied(reader, source.grid, grid, tile)
-        _write(target, grid, tile, blocks, progress, is_corner=corner)
-        with (folder / LIST).open("a", encoding="ascii") as stream:
-            stream.write(f"{target.name} {_state(target)}\n")
-    return open_source(folder)
+    noted, cache = path.with_suffix(".sha256"), path.parent.parent
+    known_hash = noted.read_text("ascii", "replace") if noted.is_file() else ""
+    if not path.is_file() or _file_hash(path, cache) != known_hash:
+        report = on_progress or (lambda done_px, all_px: None)
+        report(0, grid.area_px)  # before the file is read for the first time
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, suffix=".part") as folder:
+            written = Path(folder) / path.name
+            _write(written, grid, _copied(reader or GrayReader(source), source.grid, grid), report)
+            os.replace(written, path)
+        noted.write_text(_file_hash(path, cache), "ascii")
+    copy = open_source(path)
+    return replace(copy, grid=replace(copy.grid, width_px=grid.width_px, height_px=grid.height_px))
 
 
-def _state(tile: Path) -> str:
-    """What the list records of a tile: its hash, or "-" if it has no file, since no pixel of it is valid."""
-    return _file_hash(tile, tile.parent.parent) if tile.exists() else "-"
-
-
-def _read_list(path: Path) -> dict[str, str]:
-    """The recorded hash of each tile; the last of several lines counts, a truncated line does not."""
-    if not path.is_file():
-        return {}
-    lines = (line.split() for line in path.read_text(encoding="ascii", errors="replace").splitlines())
-    return {words[0]: words[1] for words in lines if len(words) == 2}
-
-
-def _profile(grid: Grid, part: Window) -> dict[str, Any]:
-    """Options of rasterio for the GeoTIFF of a part of the copy."""
-    from rasterio import Affine
-
-    (a, _, c), (_, e, f) = grid.pixel_to_crs
-    x, y = c + a * (part.x0 - 0.5), f + e * (part.y0 - 0.5)
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 2, "crs": grid.crs.to_wkt(), "bigtiff": "if_safer"}
-    profile |= {"tiled": True, "compress": "deflate", "width": part.width_px, "height": part.height_px}
-    return profile | {"transform": Affine(a, 0.0, x, 0.0, e, y)}
-
-
-def _write(
-    target: Path, grid: Grid, part: Window, blocks: Iterator[_Block], progress: _Progress, *, is_corner: bool
-) -> None:
-    """Write a part of the copy under a temporary name and rename it, if it has a valid pixel or is a corner.
+def _write(path: Path, grid: Grid, blocks: Iterable[_Block], report: ProgressCallback) -> None:
+    """Write a copy as a GeoTIFF without its empty blocks; one of a large map has overviews.
 
     Raises:
         OSError: it cannot be written.
     """
     import rasterio
+    from rasterio import Affine
     from rasterio.enums import ColorInterp, Resampling
 
-    handle, name = tempfile.mkstemp(suffix=".part", dir=target.parent)
-    os.close(handle)
-    is_kept = is_corner
-    try:
-        with rasterio.open(name, "w", **_profile(grid, part)) as dataset:
-            dataset.colorinterp = (ColorInterp.gray, ColorInterp.alpha)
-            for window, block in blocks:
-                dataset.write(block, window=within(window, part))
-                is_kept = is_kept or bool(block[1].any())
-                progress.add(window.area_px)
-            if is_large(grid):
-                dataset.build_overviews(_FACTORS, Resampling.average)
-        if is_kept:
-            os.replace(name, target)
-        else:
-            target.unlink(missing_ok=True)
-    finally:
-        Path(name).unlink(missing_ok=True)
+    width_px, height_px = (-(-n // FACTORS[-1]) * FACTORS[-1] for n in (grid.width_px, grid.height_px))
+    done_px = 0
+    profile = {"driver": "GTiff", "dtype": "uint8", "count": 2, "crs": grid.crs.to_wkt(), "bigtiff": "if_safer"}
+    profile |= {"tiled": True, "compress": "deflate", "width": width_px, "height": height_px}
+    profile |= {"transform": Affine(*by_corner(grid)), "sparse_ok": True}
+    with rasterio.Env(SPARSE_OK_OVERVIEW="ON"), rasterio.open(path, "w", **profile) as dataset:
+        dataset.colorinterp = (ColorInterp.gray, ColorInterp.alpha)
+        for window, block in blocks:
+            dataset.write(block, window=window.slices)
+            done_px += window.area_px
+            report(done_px, grid.area_px)
+        if is_large(grid.area_px):
+            dataset.build_overviews(FACTORS, Resampling.average)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from engine.kernels.scores import enhance
 from engine.kernels.search_levels import MAX_HALVINGS
 from engine.maps.recently_used import RecentlyUsed
-from engine.maps.tiles import TILE_PX, widened, within
+from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, widened, within
 from engine.ncc_fft import MapRegion, prepare
 from engine.runtime.device import Device, Picture, on_host, to_device
 from engine.values import Window
@@ -26,9 +26,7 @@ if TYPE_CHECKING:  # a map is built on what lies here
 
 FloatImage = NDArray[np.float32]
 
-WHOLE_LEVEL_PX = 1 << 23
-"""Levels of at most this many pixels are prepared as a whole."""
-MAX_REGION_PX = 6 << 20
+MAX_REGION_PX = WHOLE_LEVEL_PX
 """Regions are kept up to this many pixels in all, besides whole levels; a pixel takes 6 bytes, 11 with nodata,
 and on a GPU 20."""
 
@@ -58,16 +56,14 @@ class PreparedMap:
         device: of the regions.
         radius_px: of the local normalisation, see :func:`engine.kernels.scores.enhance`.
         score: see :func:`engine.kernels.scores.enhance`.
+
+    Attributes:
+        regions: prepared so far, by level and window; the least recently used are evicted.
     """
 
     def __init__(self, site: OrthoMap, device: Device, radius_px: int, score: str = "local") -> None:
         self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
-        self._regions: RecentlyUsed[tuple[int, Window], Region] = RecentlyUsed()
-
-    @property
-    def created(self) -> int:
-        """Regions prepared so far."""
-        return self._regions.created
+        self.regions: RecentlyUsed[tuple[int, Window], Region] = RecentlyUsed()
 
     def cut(self, window: Window, level: int) -> Region:
         """The prepared part of a level that contains a window, cropped to it.
@@ -106,15 +102,15 @@ class PreparedMap:
 
     def _region(self, window: Window, level: int) -> Region:
         """The most recently used region that contains a window, or a new one."""
-        held = (key for key in reversed(list(self._regions)) if key[0] == level and _contains(key[1], window))
+        held = (key for key in reversed(list(self.regions)) if key[0] == level and _contains(key[1], window))
         found = next(held, None)
         if found is not None:
-            return self._regions.get(found, partial(self._prepare, found[1], level))
+            return self.regions.get(found, partial(self._prepare, found[1], level))
         rows, columns = self._site.level_shape(level)
         is_whole = rows * columns <= WHOLE_LEVEL_PX
         target = Window(0, 0, columns, rows) if is_whole else _on_grid(window, columns, rows)
-        region = self._regions.get((level, target), partial(self._prepare, target, level))
-        self._regions.evict(self._evictable_px, MAX_REGION_PX, keep=1)
+        region = self.regions.get((level, target), partial(self._prepare, target, level))
+        self.regions.evict(self._evictable_px, MAX_REGION_PX, keep=1)
         return region
 
     def _evictable_px(self, key: tuple[int, Window], region: Region) -> int:

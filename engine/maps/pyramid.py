@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from engine.errors import OptionError
+from engine.errors import DtypeError, OptionError, ShapeError
 from engine.maps.grids import Array
-from engine.maps.rasters import COARSE_LIMIT_PX, MEMORY_LIMIT_PX, Gray, GrayReader, Mask, scaled_window
+from engine.maps.rasters import COARSE_LIMIT_PX, Gray, GrayReader, Mask, is_large, scaled_window
 from engine.values import Window
 
 MIN_LEVEL_PX = 16
@@ -43,6 +44,27 @@ class ArrayReader:
         return self.gray[window.slices], self.valid[window.slices]
 
 
+def check_arrays(gray: Gray, valid: Mask, heights: NDArray[np.float32] | None) -> None:
+    """Refuse arrays that do not form a map.
+
+    Args:
+        gray: (H, W) uint8.
+        valid: (H, W) bool.
+        heights: (H, W), or None.
+
+    Raises:
+        ShapeError: an array has another shape.
+        DtypeError: ``gray`` is not uint8.
+    """
+    if gray.ndim != 2 or 0 in gray.shape:
+        raise ShapeError(f"gray: expected (H, W) with at least one pixel, got {gray.shape}")
+    if gray.dtype != np.uint8:
+        raise DtypeError(f"gray: expected uint8, got {gray.dtype}")
+    for name, array in (("valid", valid), ("surface_m", heights)):
+        if array is not None and array.shape != gray.shape:
+            raise ShapeError(f"{name}: expected the shape of gray {gray.shape}, got {array.shape}")
+
+
 Reader = ArrayReader | GrayReader
 """Source of pixels: arrays, or a file."""
 
@@ -59,12 +81,11 @@ class Pyramid:
     def __init__(self, width_px: int, height_px: int, reader: Reader) -> None:
         self._size, self._reader = (height_px, width_px), reader
         self.levels = max(1, int(math.log2(max(1.0, min(self._size) / MIN_LEVEL_PX))) + 1)
-        self._base = 0
-        self.is_large = math.prod(self._size) > MEMORY_LIMIT_PX
+        self.is_large = is_large(width_px * height_px)
         """Whether it is too large for memory."""
-        limit_px = min(MEMORY_LIMIT_PX, COARSE_LIMIT_PX)
-        while self.is_large and self._base < self.levels - 1 and math.prod(self.shape(self._base)) > limit_px:
-            self._base += 1
+        areas_px = [math.prod(self.shape(level)) for level in range(self.levels - 1)]
+        # The finest level in memory: 0, or that after all which are too large.
+        self._base = sum(area_px > COARSE_LIMIT_PX for area_px in areas_px) if self.is_large else 0
         self._cached: dict[int, tuple[Gray, Mask]] = {}
         self._last: tuple[tuple[Window, int], tuple[Gray, Mask]] | None = None
         if self._base == 0:
@@ -120,7 +141,8 @@ class Pyramid:
         if not (0 <= window.x0 < window.x1 <= width and 0 <= window.y0 < window.y1 <= height):
             raise OptionError(f"window: expected one inside {width} x {height} px of level {level}, got {window}")
         if level >= self._base:
-            return ArrayReader(*self._level(level)).read(window)
+            gray, valid = self._level(level)
+            return gray[window.slices], valid[window.slices]
         last = self._last
         if last is None or last[0] != (window, level):  # grey and validity are often read in turn
             last = self._last = ((window, level), self._from_file(window, level))

@@ -108,24 +108,7 @@ def openable(path: Path, argument: str) -> tuple[str | Path, str]:
     if path.is_dir():
         return vrt_of_folder(path, argument), "VRT"
     driver = driver_of(path, argument)
-    if driver == "GPKG":
-        _check_geopackage(path, argument)
     return (_vrt_of_file(path, argument), driver) if driver == "VRT" else (path, driver)
-
-
-def _check_geopackage(file: Path, argument: str) -> None:
-    """Refuse a GeoPackage without a raster or with several: GDAL would open none of them."""
-    import sqlite3
-
-    kinds = "'tiles', '2d-gridded-coverage'"
-    try:
-        with contextlib.closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
-            found = base.execute(f"SELECT table_name FROM gpkg_contents WHERE data_type IN ({kinds})").fetchall()
-    except sqlite3.Error as error:
-        raise MapError(f"{argument}: cannot read {file}: {error}") from None
-    if len(found) != 1:
-        names = ", ".join(str(name) for (name,) in found) or "none"
-        raise MapError(f"{argument}: expected a GeoPackage with one raster, got {names} in {file}")
 
 
 # ------------------------------------------------------------------------------------------ a folder of tiles

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
 from engine.maps.grids import Array, Grid, earth_crs, wgs84
-from engine.maps.raster_formats import DTYPES, local_path, openable
+from engine.maps.raster_formats import DTYPES, OWN_TAGS, local_path, openable
 from engine.values import MAX_SIGMA_M, Window
 
 if TYPE_CHECKING:
@@ -39,8 +39,6 @@ Bounds = tuple[float, float, float, float]
 
 COLLAR_SHARE = 0.005
 STRETCH_PERCENT = (2.0, 98.0)
-OVERVIEW_PX = 4096
-"""Stretch and collar are found on a copy of at most this many pixels a side."""
 GEOREFERENCE_TAG = "SCENEMATCH_GEOREFERENCE_SIGMA_M"
 """Metadata item of a GeoTIFF: its georeferencing accuracy, one standard deviation in metres per axis."""
 SLOPE_TAG = "SCENEMATCH_SLOPE_SIGMA_DEG"
@@ -50,6 +48,13 @@ MEMORY_LIMIT_PX = 256 * 2**20
 """Grey maps of up to this many pixels are held in memory; larger ones are read window by window."""
 COARSE_LIMIT_PX = 16 * 2**20
 """Of those the first level of up to this many pixels, and the coarser ones, are held in memory."""
+OVERVIEW_PX = math.isqrt(COARSE_LIMIT_PX)
+"""Stretch and collar are found on a copy of at most this many pixels a side."""
+
+
+def is_large(area_px: int) -> bool:
+    """Whether a map of so many pixels is read window by window instead of held in memory."""
+    return area_px > MEMORY_LIMIT_PX
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,14 +66,13 @@ class Source:
     grid: Grid
 
 
-def stated_sigma(given: float | None, source: Source | None, tag: str, argument: str) -> float | None:
+def stated_sigma(given: float | None, source: Source | None, tag: str) -> float | None:
     """The given accuracy, else the one in a file's metadata, else None.
 
     Args:
         given: the user's value.
         source: the file with the metadata.
-        tag: metadata item.
-        argument: name of ``given`` in messages.
+        tag: metadata item; the name of ``given`` in messages follows from it.
 
     Raises:
         OptionError: ``given`` is not above 0, or larger than any map.
@@ -77,6 +81,7 @@ def stated_sigma(given: float | None, source: Source | None, tag: str, argument:
     text = None if source is None else source.dataset.tags().get(tag)
     if given is not None:
         if not 0.0 < given <= MAX_SIGMA_M:
+            argument = tag.removeprefix(OWN_TAGS).lower()
             raise OptionError(f"{argument}: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {given}")
         return float(given)
     if source is None or text is None:
@@ -137,6 +142,9 @@ def open_source(
         what, driver = openable(file, argument)
         dataset = rasterio.open(what, driver=driver)
         transform, own_crs = dataset.transform, dataset.crs
+    if dataset.count == 0:
+        names = ", ".join(name.rpartition(":")[2] for name in dataset.subdatasets)
+        raise MapError(f"{argument}: expected a GeoPackage with one raster, got {names} in {file}")
     size = dataset.width, dataset.height
     own = None if transform.is_identity else _centred(transform)
     if own is not None:

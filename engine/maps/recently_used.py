@@ -28,9 +28,6 @@ class RecentlyUsed(Generic[K, V]):
         with self._lock:
             return iter(list(self._entries))
 
-    def __len__(self) -> int:
-        return len(self._entries)
-
     def __setitem__(self, key: K, entry: V) -> None:
         """Add an existing entry, or replace one."""
         with self._lock:

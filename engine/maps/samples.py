@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.dense import Samples
-from engine.maps.prepared import WHOLE_LEVEL_PX, FloatImage
+from engine.maps.prepared import FloatImage
+from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
-from engine.maps.tiles import TILE_PX, tile_at, tiles_under
+from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, tile_at, tiles_under
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -24,7 +25,6 @@ Enhanced = Callable[[Window, int], tuple[FloatImage, NDArray[np.bool_] | None]]
 
 BLOCK_PX = 4
 """Every block with this side gives one sample: the pixel with the steepest gradient."""
-MAX_CELLS = 256
 MAX_SAMPLES = 2000
 ROUGH_REACH_PX = 1.5
 """Distance from a point of the map, in pixels, at which the roughness of its surface is measured."""
@@ -37,16 +37,14 @@ class SampleMap:
         site: the map.
         enhanced: a window of a level of the same map, enhanced, and its mask; see
             :func:`engine.maps.prepared.enhanced_part`.
+
+    Attributes:
+        cells: sampled so far, by level and window; the least recently used are evicted.
     """
 
     def __init__(self, site: OrthoMap, enhanced: Enhanced) -> None:
         self._site, self._enhanced = site, enhanced
-        self._cells: RecentlyUsed[tuple[int, Window], tuple[Samples, tuple[int, int]]] = RecentlyUsed()
-
-    @property
-    def created(self) -> int:
-        """Cells sampled so far."""
-        return self._cells.created
+        self.cells: RecentlyUsed[tuple[int, Window], tuple[Samples, tuple[int, int]]] = RecentlyUsed()
 
     def find(self, window: Window, level: int, max_samples: int = MAX_SAMPLES) -> Samples:
         """Samples of a window.
@@ -86,8 +84,8 @@ class SampleMap:
 
     def _cell(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
         """Samples of a cell, row by row, and the number of their rows and columns."""
-        found = self._cells.get((level, cell), partial(self._sampled, cell, level))
-        self._cells.evict(lambda *_: 1, MAX_CELLS, keep=0)
+        found = self.cells.get((level, cell), partial(self._sampled, cell, level))
+        self.cells.evict(lambda key, _: key[1].area_px, COARSE_LIMIT_PX, keep=1)
         return found
 
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.maps.grids import Array, Grid, Warp, square_lattice, warp_between
-from engine.maps.heights import SURFACE_LIMIT_PX, part_grid, read_heights, read_surface, surface_part
-from engine.maps.rasters import COARSE_LIMIT_PX, Source
+from engine.errors import MapError
+from engine.maps.grids import Array, Grid, Warp, overlap, part_grid, square_lattice, warp_between
+from engine.maps.rasters import COARSE_LIMIT_PX, MEMORY_LIMIT_PX, Source, map_errors
 from engine.maps.tiles import TILE_PX
 from engine.values import Window
 
 Heights = NDArray[np.float32]
 
+SURFACE_LIMIT_PX = MEMORY_LIMIT_PX // 4
+"""Surfaces of up to this many pixels are held in memory; heights take four times the memory of grey values."""
+HEIGHT_RANGE_M = (-1000.0, 20000.0)
+"""Surface heights outside are nodata, whether tagged or not (-9999, -32768, 3e38)."""
 GROUND_PERCENT = 20.0
 """Percentile of the surface used as the ground level."""
 MAX_SPAN = 6
@@ -29,11 +34,11 @@ _ON_PLANE_M = 0.3  # residual below which a height counts as on the plane
 
 
 class HeightTiles:
-    """Heights of a large surface model, indexed like an array (H, W) and read from the file on demand.
+    """Heights of a large surface model, read from the file on demand.
 
     Args:
         source: the model.
-        part: window of it, in its pixels, that is indexed.
+        part: window of it, in its pixels, whose heights these are.
     """
 
     def __init__(self, source: Source, part: Window) -> None:
@@ -41,23 +46,33 @@ class HeightTiles:
         self._patch = lru_cache(MAX_PATCHES)(self._read)
         self.shape = (part.height_px, part.width_px)
 
-    def __getitem__(self, index: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Heights:
-        rows, columns = index
-        if rows.size == 0:
-            return np.empty(rows.shape, np.float32)
-        y0, x0, y1, x1 = (int(v) // TILE_PX for v in (rows.min(), columns.min(), rows.max(), columns.max()))
-        if max(y1 - y0, x1 - x0) < MAX_SPAN:
-            return self._patch(y0, x0, y1, x1)[rows - y0 * TILE_PX, columns - x0 * TILE_PX]
-        out = np.empty(rows.shape, np.float32)
-        tiles = (rows // TILE_PX << 32) + columns // TILE_PX
-        for y, x in (divmod(int(tile), 1 << 32) for tile in np.unique(tiles)):
-            here = tiles == (y << 32) + x
-            out[here] = self._patch(y, x, y, x)[rows[here] - y * TILE_PX, columns[here] - x * TILE_PX]
+    def sample(self, at: Array) -> Array:
+        """Bilinear heights.
+
+        Args:
+            at: (N, 2) places in pixels of the part.
+
+        Returns:
+            (N,) metres, NaN outside and next to nodata.
+        """
+        out, last = np.full(len(at), np.nan), np.array(self.shape[::-1]) - 1
+        inside = np.flatnonzero(((at >= -0.5) & (at <= last + 0.5)).all(axis=1))
+        if len(inside) == 0:
+            return out
+        pixels = np.clip(at[inside], 0, last).astype(np.intp)
+        low, high = pixels.min(axis=0) // TILE_PX, np.minimum(pixels.max(axis=0) + 1, last) // TILE_PX
+        if (high - low).max() < MAX_SPAN:
+            out[inside] = _bilinear(self._patch(*low.tolist(), *high.tolist()), at[inside] - low * TILE_PX)
+            return out
+        tiles = pixels // TILE_PX
+        for tile in np.unique(tiles, axis=0):
+            here = inside[(tiles == tile).all(axis=1)]
+            out[here] = self.sample(at[here])
         return out
 
-    def _read(self, top: int, left: int, bottom: int, right: int) -> Heights:
-        """The heights from one row and column of tiles to another."""
-        y, x = top * TILE_PX, left * TILE_PX
+    def _read(self, left: int, top: int, right: int, bottom: int) -> Heights:
+        """The heights from one column and row of tiles to another."""
+        x, y = left * TILE_PX, top * TILE_PX
         size = min((bottom + 1) * TILE_PX, self.shape[0]) - y, min((right + 1) * TILE_PX, self.shape[1]) - x
         window = Window(self._part.x0 + x, self._part.y0 + y, size[1], size[0])
         with self._lock:  # a GDAL dataset serves one thread at a time
@@ -106,19 +121,10 @@ class SurfaceModel:
             (...,) metres, NaN outside and next to nodata.
         """
         at = self._from_map(map_xy)
-        if isinstance(self._heights_m, np.ndarray):
-            from engine.kernels.map_points import bilinear_heights  # numba takes a while to import
-
-            out = np.empty(at.shape[:-1])
-            bilinear_heights(self._heights_m, np.ascontiguousarray(at, np.float64).reshape(-1, 2), out.reshape(-1))
-            return out
-        height, width = self._heights_m.shape
-        x0, x1, u, in_x = _neighbours(at[..., 0], width)
-        y0, y1, v, in_y = _neighbours(at[..., 1], height)
-        grid = self._heights_m
-        top = grid[y0, x0] * (1.0 - u) + grid[y0, x1] * u
-        bottom = grid[y1, x0] * (1.0 - u) + grid[y1, x1] * u
-        return np.where(in_x & in_y, top * (1.0 - v) + bottom * v, np.nan)
+        flat = np.ascontiguousarray(at, np.float64).reshape(-1, 2)
+        heights = self._heights_m
+        found = _bilinear(heights, flat) if isinstance(heights, np.ndarray) else heights.sample(flat)
+        return found.reshape(at.shape[:-1])
 
     def ground_plane(self, map_xy: Array, reach_px: float) -> tuple[float, Array] | None:
         """The plane with a fifth of the surface below it in a square about one map pixel (2,).
@@ -148,12 +154,13 @@ class SurfaceModel:
         return float(np.nanmin(self._heights_m)), float(np.nanmax(self._heights_m))
 
 
-def _neighbours(at: Array, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, NDArray[np.bool_]]:
-    """Indices before and after places along one axis, the share of the latter, and which places are inside."""
-    inside = (at >= -0.5) & (at <= size - 0.5)
-    at = np.clip(np.where(inside, at, 0.0), 0.0, size - 1.0)
-    low = at.astype(np.intp)
-    return low, np.minimum(low + 1, size - 1), at - low, inside
+def _bilinear(heights_m: Heights, at: Array) -> Array:
+    """Heights (N,) at places (N, 2) in pixels of a grid, NaN outside and next to nodata."""
+    from engine.kernels.map_points import bilinear_heights  # numba takes a while to import
+
+    out = np.empty(len(at))
+    bilinear_heights(heights_m, at, out)
+    return out
 
 
 def open_surface(source: Source, grid: Grid) -> tuple[SurfaceModel, Grid]:
@@ -174,3 +181,73 @@ def open_surface(source: Source, grid: Grid) -> tuple[SurfaceModel, Grid]:
         tiles = HeightTiles(source, part)
         surface = SurfaceModel(tiles, warp_between(grid, part_grid(source.grid, part, tiles.shape)), surface)
     return surface, surface_grid
+
+
+def read_surface(source: Source, grid: Grid, limit_px: int = SURFACE_LIMIT_PX) -> tuple[Heights, Grid]:
+    """The part of a surface model under a map, averaged down if it exceeds a limit.
+
+    Args:
+        source: the model.
+        grid: of the map.
+        limit_px: largest number of pixels of the result.
+
+    Returns:
+        (H, W) float32 heights in metres, NaN where unknown, and their grid.
+
+    Raises:
+        MapError: it cannot be read, or does not overlap the map.
+    """
+    part = surface_part(source, grid)
+    factor = max(1.0, math.sqrt(float(part.area_px) / limit_px))
+    shape = (math.ceil(part.height_px / factor), math.ceil(part.width_px / factor))
+    return read_heights(source, part, shape), part_grid(source.grid, part, shape)
+
+
+def surface_part(source: Source, grid: Grid) -> Window:
+    """The part of a surface model under a map, in the model's pixels.
+
+    Raises:
+        MapError: it has no heights (a picture, complex numbers), or does not overlap the map.
+    """
+    dtypes = source.dataset.dtypes
+    dtype = dtypes[0]
+    if np.dtype(dtype).kind not in "iuf":
+        raise MapError(f"surface: expected heights as real numbers, got {dtype} in {source.path}")
+    if len(dtypes) >= 3 and set(dtypes) == {"uint8"}:  # the map given twice: its red would become relief
+        raise MapError(
+            f"surface: expected one band of heights, got a picture of {len(dtypes)} bands, {source.path}"
+        )
+    part = overlap(grid, source.grid)
+    if part is None:
+        raise MapError(f"surface: expected one that overlaps the map, got {source.path}")
+    return part
+
+
+def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> Heights:
+    """Heights of a window of a surface model, averaged if the result is coarser.
+
+    Args:
+        source: the model.
+        part: window in its pixels.
+        shape: rows and columns of the result.
+
+    Returns:
+        ``shape`` float32 heights in metres, NaN where unknown.
+
+    Raises:
+        MapError: it cannot be read.
+    """
+    from rasterio.enums import Resampling
+
+    whole = shape == (part.height_px, part.width_px)
+    with map_errors("surface", source.path):
+        data = source.dataset.read(
+            1,
+            window=part.slices,
+            out_shape=shape,
+            masked=True,
+            resampling=Resampling.nearest if whole else Resampling.average,
+        )
+    heights = data.astype(np.float32).filled(np.nan) * source.dataset.scales[0] + source.dataset.offsets[0]
+    heights[~((heights > HEIGHT_RANGE_M[0]) & (heights < HEIGHT_RANGE_M[1]))] = np.nan
+    return np.asarray(heights, np.float32)

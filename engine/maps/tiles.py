@@ -8,6 +8,8 @@ from engine.values import Window
 
 TILE_PX = 256
 """Side of the tiles of a level in which it is prepared, described and sampled, and of those of a surface."""
+WHOLE_LEVEL_PX = 8 << 20
+"""Levels of at most this many pixels are prepared and sampled as a whole; also the largest picture or window."""
 HALO_PX = 64
 """Margin around a tile that is read for description; the descriptor of nearly every keypoint ends within it."""
 

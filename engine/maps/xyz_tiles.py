@@ -14,6 +14,7 @@ import hashlib
 import itertools
 import math
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as Xml
@@ -39,6 +40,8 @@ RESOURCE = "tilemapresource.xml"
 _MERCATOR_CODES = ("3857", "3785", "900913", "41001", "102100", "102113")  # of Web Mercator, now and formerly
 _HALF_WORLD_M = math.pi * WGS84_A_M
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # Pillow's, of eight bits or fewer
+_NUMBER = re.compile("0|[1-9][0-9]{0,9}")  # as it is printed, so that the name can be restored from it
+_TILE = re.compile(rf"({_NUMBER.pattern})\.({'|'.join(ENDINGS)})")
 _NO_TILE_CODES = "200,204,404"  # of HTTP; of a file, 200 says that it is empty
 
 
@@ -96,17 +99,15 @@ def description_of(folder: Path, argument: str) -> str:
     coarser, template = 0, f"{folder.absolute().as_uri()}/${{z}}/${{x}}/${{y}}.{endings[0]}"
     if not south_up:  # GDAL aligns overviews with the north
         levels = itertools.takewhile(
-            lambda k: _is_complete(places.get(zoom - k), low >> k, high >> k), range(zoom)
+            lambda k: zoom - k in places and _is_complete(places[zoom - k], low >> k, high >> k), range(zoom)
         )
         coarser = max(len(list(levels)) - 1, 0)
     low = low >> coarser << coarser
     return _xml(template, zoom, (*low.tolist(), *(high + 1).tolist()), tile_px, coarser, south_up=south_up)
 
 
-def _is_complete(places: NDArray[np.int64] | None, low: NDArray[np.int64], high: NDArray[np.int64]) -> bool:
+def _is_complete(places: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]) -> bool:
     """Whether a level has a tile at every place from one column and row to another."""
-    if places is None:
-        return False
     inside = places[((places >= low) & (places <= high)).all(axis=1)]
     return len(np.unique(inside, axis=0)) == int(np.prod(high - low + 1))
 
@@ -155,31 +156,23 @@ def _paths(folder: Path, zoom: int, tiles: NDArray[np.int64]) -> Iterator[Path]:
 
 
 def _zoom_folders(folder: Path) -> dict[int, Path]:
-    return {zoom: path for zoom, path in _numbered(folder) if zoom <= MAX_ZOOM and path.is_dir()}
+    return {zoom: path for zoom, path in _numbered(folder) if zoom <= MAX_ZOOM}
 
 
 def _numbered(folder: Path) -> Iterator[tuple[int, Path]]:
-    """Entries of a folder that are named by a whole number."""
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if _is_number(entry.name):
-                yield int(entry.name), Path(entry.path)
-
-
-def _is_number(name: str) -> bool:
-    """Whether it is a whole number as it would be printed, so that the name can be restored from it."""
-    return name.isascii() and name.isdecimal() and len(name) < 11 and (name == "0" or name[0] != "0")
+    """Folders in a folder that are named by a whole number."""
+    for path in folder.iterdir():
+        if _NUMBER.fullmatch(path.name) and path.is_dir():
+            yield int(path.name), path
 
 
 def _tiles_in(folder: Path) -> Iterator[tuple[int, int, int]]:
     """Column, row as named, and index of the ending of each tile of a zoom level."""
     for column, path in _numbered(folder):
-        if path.is_dir():
-            with os.scandir(path) as entries:
-                for entry in entries:
-                    row, _, ending = entry.name.partition(".")
-                    if ending in ENDINGS and _is_number(row):
-                        yield column, int(row), ENDINGS.index(ending)
+        for name in os.listdir(path):
+            found = _TILE.fullmatch(name)
+            if found:
+                yield column, int(found[1]), ENDINGS.index(found[2])
 
 
 def _first_side_px(folder: Path, zoom: int, tiles: NDArray[np.int64], argument: str) -> int:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.geo import inverse_2x2
+from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.values import Attitude, Frame
 
 Array = NDArray[np.float64]
@@ -210,7 +211,7 @@ MIN_PICTURE_PX = 32
 """Least extent of an orthorectified frame."""
 SIDE_STEP_PX = 16
 """Its sides are multiples of this, so that a flight uses few sizes and plans none in the air."""
-MAX_PICTURE_PX = 8 << 20
+MAX_PICTURE_PX = WHOLE_LEVEL_PX
 """Most pixels of one; if it would need more, the height is out of proportion to the map."""
 _NODES = 17  # per side of the grid on which the projection is computed; bilinear in between
 RIM_PX = 5

@@ -50,7 +50,7 @@ class Learned(Method):
     @property
     def cache_counters(self) -> dict[str, int]:
         """How many entries of each cache were created so far."""
-        return {} if self.keypoints is None else {"keypoint tiles": self.keypoints.created}
+        return {} if self.keypoints is None else {"keypoint tiles": self.keypoints.tiles.created}
 
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that time allows."""

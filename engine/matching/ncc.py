@@ -9,6 +9,7 @@ import numpy as np
 
 from engine.maps.prepared import PreparedMap
 from engine.maps.samples import SampleMap
+from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.matching import hypothesis_search
 from engine.matching.acceptance import agree_in_place, judge_peak, offset_between_m
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
@@ -31,7 +32,7 @@ from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
 from engine.values import Fix, NoFix, Prior, Reason, Result, Window
 
-MAX_WINDOW_PX = 8 << 20
+MAX_WINDOW_PX = WHOLE_LEVEL_PX
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
 _SEARCH, _STRUCTURE, _HYPOTHESES = "ncc search", "ncc structure", "ncc hypotheses"  # steps
 _AT_ONCE, _REFINEMENT = "refinement at once", "refinement"
@@ -65,7 +66,7 @@ class Ncc(Method):
     @property
     def cache_counters(self) -> dict[str, int]:
         """How many entries of each cache were created so far."""
-        return {"map regions": self.prepared.created, "sampled cells": self.samples.created}
+        return {"map regions": self.prepared.regions.created, "sampled cells": self.samples.cells.created}
 
     def warmup(self, query: Query) -> None:
         """Run every variant of every step, so that it is compiled and its cost known."""

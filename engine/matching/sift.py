@@ -74,7 +74,7 @@ class Sift(Method):
     @property
     def cache_counters(self) -> dict[str, int]:
         """How many entries of each cache were created so far."""
-        return {"landmark tiles": self.landmarks.created, "sampled cells": self.samples.created}
+        return {"landmark tiles": self.landmarks.tiles.created, "sampled cells": self.samples.cells.created}
 
     def prepare(self) -> None:
         """Find the map's features on every level that is small enough, or load those of an earlier start."""

@@ -11,9 +11,9 @@ import numpy as np
 
 from engine.errors import MapError
 from engine.maps.grids import Grid, warp_between
-from engine.maps.heights import read_surface
 from engine.maps.metric_copy import open_metric_copy
 from engine.maps.rasters import GrayReader, Source, map_errors, open_source
+from engine.maps.surface import read_surface
 from engine.values import Window
 from scenematch.simulator.canvas import ASPHALT, CANOPY, GRASS, ROOF
 from scenematch.simulator.conditions import CONDITIONS, Condition, apply_season, condition_by_name

@@ -261,7 +261,7 @@ def test_samples_of_the_map_are_taken_once_and_lie_where_the_map_shows_them(grou
     samples = SampleMap(site, prepared.enhanced)
     window = Window(100, 60, 200, 160)
     first, second = samples.find(window, 0), samples.find(window, 0)
-    assert samples.created == 1
+    assert samples.cells.created == 1
     np.testing.assert_array_equal(first.points_m, second.points_m)
     xy = site.pixel_from_enu(first.points_m[:, :2])
     np.testing.assert_allclose(xy, np.round(xy), atol=1e-3)

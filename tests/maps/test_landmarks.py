@@ -126,7 +126,7 @@ def test_memory_is_bounded_and_what_was_given_up_comes_back_the_same(site, marks
         np.testing.assert_array_equal(
             table(small.find(window, 0, upright=True)), table(marks.find(window, 0, upright=True))
         )
-        kept = [len(tile["rank"]) for tile in small._tiles.values()]
+        kept = [len(tile["rank"]) for tile in small.tiles.values()]
         assert sum(kept) <= 700 or len(kept) == len(landmarks._keys(window, 0, True))
 
 
@@ -240,17 +240,17 @@ def test_levels_are_prepared_from_the_coarsest_as_far_as_the_bound_goes(site, mo
     monkeypatch.setattr(landmarks, "PREPARED_PX", 300 * 280 + 150 * 140 + 100_00)
     marks = LandmarkMap(site, CPU)
     marks.prepare()
-    assert {level for level, *_ in marks._tiles} == set(range(1, site.levels))
+    assert {level for level, *_ in marks.tiles} == set(range(1, site.levels))
 
 
 def test_what_was_prepared_is_not_given_up_in_flight(site, monkeypatch):
     monkeypatch.setattr(landmarks, "MAX_LANDMARKS", 300)
     marks = LandmarkMap(site, CPU)
     marks.prepare()
-    made = marks.created
+    made = marks.tiles.created
     for level in reversed(range(site.levels)):
         for upright in (False, True):
             for window in (Window(0, 0, 60, 60), whole(site, level)):
                 marks.find(window, level, upright=upright)
-    assert sum(len(tile["rank"]) for tile in marks._tiles.values()) > 300
-    assert marks.created == made
+    assert sum(len(tile["rank"]) for tile in marks.tiles.values()) > 300
+    assert marks.tiles.created == made

@@ -1,4 +1,4 @@
-"""Large maps: matched as a small one is, in bounded memory; copies that are carried on; searches refused."""
+"""Large maps: matched as a small one is, in bounded memory; copies made once; searches refused."""
 
 import io
 import tracemalloc
@@ -171,11 +171,10 @@ def test_a_surface_of_a_small_part_of_the_map_gives_its_ground(large_path, tmp_p
 
 @pytest.fixture
 def tiny_limits(monkeypatch):
-    """A map of a few hundred pixels a side counts as large, and its copy has tiles of 128."""
-    for module in ("maps.metric_copy", "maps.pyramid"):
-        monkeypatch.setattr(f"engine.{module}.MEMORY_LIMIT_PX", 20_000)
-    monkeypatch.setattr(metric_copy, "TILE_PX", 128)
-    monkeypatch.setattr(metric_copy, "COARSEST_PX", 64)
+    """A map of a few hundred pixels a side counts as large, and its copy is written in blocks of 128."""
+    monkeypatch.setattr("engine.maps.rasters.MEMORY_LIMIT_PX", 20_000)
+    monkeypatch.setattr("engine.maps.pyramid.COARSE_LIMIT_PX", 20_000)
+    monkeypatch.setattr(metric_copy, "BLOCK_PX", 128)
 
 
 @pytest.fixture
@@ -198,15 +197,15 @@ def copy_in(cache):
 
 @pytest.fixture
 def made(monkeypatch):
-    """The names of the tiles that are written from now on."""
-    names, write = [], metric_copy._write
+    """The files that are written from now on."""
+    paths, write = [], metric_copy._write
 
-    def noted(target, *arguments, **options):
-        names.append(target.name)
-        return write(target, *arguments, **options)
+    def noted(path, *arguments):
+        paths.append(path)
+        return write(path, *arguments)
 
     monkeypatch.setattr(metric_copy, "_write", noted)
-    return names
+    return paths
 
 
 def same(one, other):
@@ -233,32 +232,24 @@ def test_a_large_map_without_overviews_is_copied_and_is_the_same(picture, tmp_pa
         assert both.mean() > 0.5
         assert np.abs(apart).mean() < 1.0
     folder = copy_in(tmp_path / "cache")
-    names = sorted(path.name for path in folder.iterdir())
-    assert "tiles.txt" in names
-    assert not [name for name in names if name.endswith(".part")]
-    if small.info()["resampled"] is False:
-        assert "0001-0002.tif" not in names  # nothing but nodata lies there
-        assert "0000-0000.tif" in names  # nor here, but the map begins with it
+    assert sorted(path.name for path in folder.iterdir()) == ["map.sha256", "map.tif"]
+    with rasterio.open(folder / "map.tif") as dataset:
+        assert dataset.overviews(1) == [2, 4, 8, 16, 32]
 
 
-def test_a_copy_that_was_interrupted_is_carried_on(picture, tmp_path, tiny_limits, made, monkeypatch):
-    cache, write = tmp_path / "cache", metric_copy._write
+def test_a_copy_that_was_interrupted_leaves_nothing_and_is_made_anew(picture, tmp_path, tiny_limits, made):
+    cache = tmp_path / "cache"
 
-    def interrupted(target, *arguments, **options):
-        if len(made) == 5:
-            target.with_suffix(".part").write_bytes(b"II*\0 half a tile")
+    def interrupt(done_px, all_px):
+        if 2 * done_px > all_px:
             raise KeyboardInterrupt
-        return write(target, *arguments, **options)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(metric_copy, "_write", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            OrthoMap.open(picture, cache_dir=cache)
+    with pytest.raises(KeyboardInterrupt):
+        OrthoMap.open(picture, cache_dir=cache, on_copy=interrupt)
+    assert list(copy_in(cache).iterdir()) == []
     site = OrthoMap.open(picture, cache_dir=cache)
-    assert len(made) == len(set(made)) > 5  # none was made twice
-    count = len(made)
     same(OrthoMap.open(picture, cache_dir=cache), site)
-    assert len(made) == count
+    assert len(made) == 2
 
 
 @pytest.fixture
@@ -286,14 +277,8 @@ def test_a_copy_says_how_far_it_is_and_one_that_is_there_says_nothing(opened, ti
     assert (done[0], done[-1]) == (0, area_px)  # the first before anything is read
     assert done == sorted(done)
     assert {total for _, total in stated} == {area_px}
-    assert len(stated) == 2 * -(-site.width_px // 128) * -(-site.height_px // 128)
+    assert len(stated) == 1 + -(-site.width_px // 128) * -(-site.height_px // 128)
     assert opened()[1] == []
-
-
-def test_a_copy_that_is_carried_on_begins_where_it_was(opened, tmp_path, tiny_limits):
-    opened()
-    (copy_in(tmp_path / "cache") / "0003-0003.tif").unlink()  # the last one: 116 x 16 px
-    assert opened()[1] == [(500 * 400 - 116 * 16, 500 * 400), (500 * 400, 500 * 400)]
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -308,29 +293,26 @@ def test_a_terminal_shows_the_copying_and_a_pipe_does_not(picture, tmp_path, tin
     assert stream.getvalue() == shown  # the copy is there
 
 
-@pytest.mark.parametrize("damage", ["bytes", "cut", "gone", "list cut off", "no list"])
-def test_a_tile_that_is_not_what_the_list_says_is_made_anew(picture, tmp_path, tiny_limits, made, damage):
+@pytest.mark.parametrize("damage", ["bytes", "cut", "gone", "hash cut off", "no hash"])
+def test_a_copy_that_is_not_what_its_hash_says_is_made_anew(picture, tmp_path, tiny_limits, made, damage):
     cache = tmp_path / "cache"
     site = OrthoMap.open(picture, cache_dir=cache)
     pixels, valid = site.gray(whole(site)), site.valid(whole(site))
-    folder = copy_in(cache)
-    tile, stated = folder / "0002-0001.tif", folder / "tiles.txt"
-    content, lines = tile.read_bytes(), stated.read_text()
+    copy, noted = copy_in(cache) / "map.tif", copy_in(cache) / "map.sha256"
+    content, digest = copy.read_bytes(), noted.read_text()
     if damage == "bytes":
-        tile.write_bytes(content[:-40] + bytes(40))
+        copy.write_bytes(content[:-40] + bytes(40))
     elif damage == "cut":
-        tile.write_bytes(content[: len(content) // 2])
+        copy.write_bytes(content[: len(content) // 2])
     elif damage == "gone":
-        tile.unlink()
+        copy.unlink()
     else:
-        stated.write_text("" if damage == "no list" else lines[: len(lines) - 20])
+        noted.write_text("" if damage == "no hash" else digest[:20])
     made.clear()
     again = OrthoMap.open(picture, cache_dir=cache)
     assert made
     assert np.array_equal(again.valid(whole(again)), valid)
     assert np.array_equal(again.gray(whole(again))[valid], pixels[valid])
-    if damage in ("bytes", "cut", "gone"):
-        assert made == [tile.name]
 
 
 def test_an_all_valid_file_says_so_without_being_read(tmp_path, large_path):

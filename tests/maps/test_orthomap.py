@@ -305,7 +305,8 @@ def test_map_too_large_for_memory_reads_the_same_from_the_file(tmp_path, monkeyp
     data[:, :, :20] = 0
     path = write(tmp_path / "map.tif", data, photometric="rgb")
     kept = OrthoMap.open(path)
-    monkeypatch.setattr("engine.maps.pyramid.MEMORY_LIMIT_PX", 3000)
+    monkeypatch.setattr("engine.maps.rasters.MEMORY_LIMIT_PX", 3000)
+    monkeypatch.setattr("engine.maps.pyramid.COARSE_LIMIT_PX", 3000)
     monkeypatch.setattr("engine.maps.rasters.OVERVIEW_PX", 64)
     streamed = OrthoMap.open(path)
     assert streamed.levels == kept.levels

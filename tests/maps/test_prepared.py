@@ -116,10 +116,10 @@ def test_memory_stays_within_its_bound_and_what_was_given_up_comes_back_the_same
         for x in range(0, 450, 50):
             window = Window(x, y, 64, 64)
             assert maps.cut(window, 0).window.width_px >= 64
-            kept = [key[1] for key in maps._regions]
+            kept = [key[1] for key in maps.regions]
             newest = kept[-1].area_px
             assert sum(part.area_px for part in kept) <= max(3 * 128 * 128, newest)
-    assert (0, Window(0, 0, 128, 128)) not in maps._regions
+    assert (0, Window(0, 0, 128, 128)) not in maps.regions
     np.testing.assert_array_equal(maps.cut(Window(10, 10, 60, 60), 0).search.image, first.search.image)
 
 
@@ -129,7 +129,7 @@ def test_a_level_that_is_small_is_prepared_once_and_kept(gray, monkeypatch):
     for _ in range(2):
         for level in (0, 1, 2):
             maps.cut(Window(8, 8, 40, 40), level)
-    assert sorted(level for level, _ in maps._regions) == [0, 1, 2]
+    assert sorted(level for level, _ in maps.regions) == [0, 1, 2]
     parts = [maps.cut(Window(0, 0, side, side), 0).search.image for side in (9, 8)]
     assert np.shares_memory(*parts)
 
@@ -149,4 +149,4 @@ def test_several_threads_may_cut_at_once(gray, monkeypatch, by_cells):
     finally:
         sys.setswitchinterval(before)
     assert all(cut.window.x0 == x & -8 for cut, (x, _) in zip(cuts, places, strict=True))
-    assert len(maps._regions) <= 2
+    assert len(maps.regions.values()) <= 2

@@ -79,10 +79,9 @@ def own(picture, tmp_path):
 
 @pytest.fixture
 def tiny_limits(monkeypatch):
-    """A map of a few tiles is too large for memory, and for its coarsest level."""
-    for module in ("maps.metric_copy", "maps.pyramid"):
-        monkeypatch.setattr(f"engine.{module}.MEMORY_LIMIT_PX", 20_000)
-    monkeypatch.setattr("engine.maps.metric_copy.COARSEST_PX", 200)
+    """A map of a few tiles is too large for memory."""
+    monkeypatch.setattr("engine.maps.rasters.MEMORY_LIMIT_PX", 20_000)
+    monkeypatch.setattr("engine.maps.pyramid.COARSE_LIMIT_PX", 20_000)
 
 
 def there():
