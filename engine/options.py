@@ -268,7 +268,7 @@ class NavigatorOptions:
     attitude_lag_s: float = 0.1
     attitude_jitter_s: float = 0.03
     tilt_bias_deg: float = 1.0
-    heading_bias_deg: float = 5.0
+    heading_bias_deg: float = 8.0
     healthy_s: float = 1.0
     odometry: bool = False
 

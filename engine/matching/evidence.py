@@ -24,6 +24,9 @@ SEARCHED = (2.0 * SPREAD_SIGMAS) ** 2 / (2.0 * math.pi)
 """Area of a window over that of the prior's Gaussian: how much more probable its middle is than other places."""
 _MAX_NATS = 30.0  # above it a probability is 1 to the last digit
 _PLACE_PX = 4.0  # side of the area that counts as one place: enhanced pictures vary on this scale
+# Shares of right and of wrong places where the pose could be refined: 186 of 190 that chance gives less than once
+# in 400, and 2 of 51 that it gives less than once in 8, over six simulated towns in all lights and seasons.
+_REFINED_RIGHT, _REFINED_WRONG = 0.98, 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +102,12 @@ def _of_height(chi_square: float | None) -> float:
 
 def _gaussian(chi_square: float) -> float:
     return RELIABILITY * math.exp(-0.5 * min(chi_square, 1e3))
+
+
+def refined_nats(*, is_refined: bool) -> float:
+    """Evidence for a place by whether the pose of a known attitude can be refined there over a surface model."""
+    right, wrong = _REFINED_RIGHT, _REFINED_WRONG
+    return math.log(right / wrong) if is_refined else math.log((1.0 - right) / (1.0 - wrong))
 
 
 def probability(nats: float) -> float:

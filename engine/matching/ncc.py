@@ -13,7 +13,7 @@ from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.matching import hypothesis_search
 from engine.matching.acceptance import agree_in_place, judge_peak, offset_between_m
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
-from engine.matching.evidence import is_beyond_doubt
+from engine.matching.evidence import is_beyond_doubt, refined_nats
 from engine.matching.explanation import Explanation, explain_correlation
 from engine.matching.ladder import Rung, Works, climb, is_coarse, is_late, rehearse
 from engine.matching.method import Method
@@ -227,11 +227,15 @@ class Efforts:
         self._refused: PeakCandidate | None = None  # the newest peak, if it was not accepted
         self._is_new = False  # whether its structure was not matched yet
         self._refusal: NoFix | None = None  # of the frame at its own heading and height
+        self._doubtful: PeakCandidate | None = None  # that it refuses, which a refined pose may confirm
         self._works, frame_px = ncc.works(query), float(query.gray.size)
         self.coarsest = Rung(self._if_coarse_suffices, self._search_coarsely)
         self.at_once = Rung(lambda answer: {_AT_ONCE: frame_px} if is_coarse(answer) else {}, self._refine_at_once)
         self.levels = Rung(self._finer, self._correlate)
         self.structure = Rung(self._if_unseen, self._match_structure)
+        self.doubted = Rung(
+            lambda answer: {_REFINEMENT: frame_px} if self._is_doubtful(answer) else {}, self._refine_doubtful
+        )
         self.search = Rung(self._if_refused, self._search)
         self.refinement = Rung(
             lambda answer: {_REFINEMENT: frame_px} if self._is_refinable(answer) else {}, self._refine
@@ -240,7 +244,8 @@ class Efforts:
     def rungs(self, *, widely: bool) -> list[Rung]:
         """In their order; ``widely`` is that of :meth:`Ncc.locate`."""
         wide = [self.search, self.structure] if widely else []
-        return [self.coarsest, self.at_once, self.levels, self.structure, *wide, self.refinement]
+        own = [self.coarsest, self.at_once, self.levels, self.structure, self.doubted]
+        return [*own, *wide, self.refinement]
 
     def settled(self, answer: Result) -> Result:
         """The ladder's answer, or the refusal of the finer level if that contradicts a coarse fix."""
@@ -319,6 +324,7 @@ class Efforts:
         result = self._ncc.judge(query, found)
         if isinstance(result, NoFix):
             self._refusal = replace(result, match=None if isinstance(first, NoFix) else first.fix)
+            self._doubtful = found if isinstance(found, PeakCandidate) else self._doubtful
             return None if isinstance(answer, Fix) else self._refusal
         assert isinstance(found, PeakCandidate)
         assert height_m is not None
@@ -358,6 +364,23 @@ class Efforts:
 
     def _is_refinable(self, answer: Result | None) -> bool:
         return isinstance(answer, Fix) and answer.stage == "fine" and self._ncc.can_refine(self.query)
+
+    def _is_doubtful(self, answer: Result | None) -> bool:
+        """Whether a refused peak lacks no more evidence than a refined pose over a surface model gives."""
+        query, found = self.query, self._doubtful
+        if isinstance(answer, Fix) or found is None or not found.peak.curvature.any():
+            return False
+        can_confirm = self._ncc.can_refine(query) and query.telemetry.has_tilt and query.site.has_surface
+        return can_confirm and found.evidence.nats + refined_nats(is_refined=True) >= query.needed_nats
+
+    def _refine_doubtful(self, answer: Result | None, step: Hashable) -> Fix | None:
+        """The pose of a refused peak, if it can be refined."""
+        assert self._doubtful is not None  # or it was not offered
+        refined = self._refinement.refine(self._doubtful.fix)
+        if isinstance(refined, NoFix):
+            return None
+        self._refused = None
+        return refined
 
     @property
     def _refinement(self) -> Refinement:

@@ -27,6 +27,8 @@ from engine.maps.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
 from engine.matching.acceptance import CHANCE, agree_in_height, are_consistent
 from engine.matching.align import shrink
 from engine.matching.covariance import tilt_covariance
+from engine.matching.evidence import nats_of, probability, refined_nats
+from engine.matching.oblique import is_oblique
 from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.options import NccOptions
@@ -84,12 +86,17 @@ class Refinement:
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
         refined = self._through_all(fix)
-        if not _is_confirmed(refined) and has_tilt and query.site.has_surface:
-            try:
-                refined = self._doubting()._through_all(fix) or refined
-            except OutOfTime:
-                if refined is None:
-                    raise
+        if has_tilt and query.site.has_surface:
+            if not _is_confirmed(refined):
+                try:
+                    refined = self._doubting()._through_all(fix) or refined
+                except OutOfTime:
+                    if refined is None:
+                        raise
+            weighed = self._weighed(refined or fix, is_refined=refined is not None)
+            if isinstance(weighed, NoFix):
+                return weighed
+            return weighed if _is_confirmed(refined) else self._unconfirmed(weighed)
         if _is_confirmed(refined):
             return refined
         if has_tilt:
@@ -98,6 +105,22 @@ class Refinement:
             return fix
         detail = "roll and pitch are unknown, and the picture does not determine them"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
+
+    def _weighed(self, fix: Fix, *, is_refined: bool) -> Fix | NoFix:
+        """The fix with the evidence of whether its pose can be refined, if that is still enough.
+
+        That of an oblique frame fails at right places as well: near ground hides what is far.
+        """
+        query, attitude = self.query, self.query.telemetry.grid_attitude
+        assert attitude is not None  # a fix by correlation had one
+        if is_oblique(query, attitude):
+            return fix
+        assert fix.confidence is not None  # each peak has one
+        nats = nats_of(fix.confidence) + refined_nats(is_refined=is_refined)
+        if nats >= query.needed_nats:
+            return replace(fix, confidence=probability(nats))
+        detail = f"wrong with probability {1.0 - probability(nats):.1g}: the pose cannot be refined there"
+        return fix.refused(Reason.AMBIGUOUS, detail)
 
     def _unconfirmed(self, fix: Fix) -> Fix | NoFix:
         """The fix of a known attitude that the picture does not confirm, refined or not, if the prior agrees."""

@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 from engine.budget import Budget
@@ -125,7 +125,7 @@ class Live:
         self._number = 0  # of the current worker
         self._creating_since_ns: int | None = None  # start of creation; None with a navigator or in a pause
         self._hung_creations = 0  # in a row
-        self._counts = Counts()
+        self._counts = dict.fromkeys(Counts.__dataclass_fields__, 0)
         self._closed = False
         self._threads: list[threading.Thread] = []
         check_realtime(self._options.realtime)
@@ -136,7 +136,7 @@ class Live:
     def counts(self) -> Counts:
         """The counts so far."""
         with self._changed:
-            return self._counts
+            return Counts(**self._counts)
 
     def submit(self, frame: Frame, prior: Prior | None = None, captured_ns: int | None = None) -> None:
         """Submit the newest frame; one still waiting is dropped. Blocks only as long as a lock is held.
@@ -153,9 +153,8 @@ class Live:
         with self._changed:
             if self._closed:
                 raise StateError("submit: expected an open pipeline, got one that was closed")
-            self._count("submitted")
-            if self._waiting is not None:
-                self._count("dropped")
+            self._counts["submitted"] += 1
+            self._counts["dropped"] += self._waiting is not None
             self._waiting = job
             self._changed.notify_all()
 
@@ -167,9 +166,8 @@ class Live:
         """
         with self._changed:
             self._closed = True
-            if self._waiting is not None:
-                self._count("dropped")
-                self._waiting = None
+            self._counts["dropped"] += self._waiting is not None
+            self._waiting = None
             self._changed.notify_all()
             job, due_s = self._working, (self._options.deadline_ms + self._options.patience_ms) * 1e-3
             self._changed.wait_for(lambda: self._working is None and (job is None or job.answered), timeout=due_s)
@@ -287,7 +285,8 @@ class Live:
                 if job.answered:
                     return
                 job.answered = True
-                self._count("answered", *(["late"] if late else []))
+                self._counts["answered"] += 1
+                self._counts["late"] += late
                 self._changed.notify_all()
             if late and isinstance(result, Fix):
                 result = _refusal(job, Reason.LATE, f"the fix came {age_ms:.0f} ms after capture")
@@ -307,7 +306,7 @@ class Live:
             self._hung_creations += self._creating_since_ns is not None
             self._creating_since_ns = self._machine_ns()
             self._number += 1
-            self._count("workers_replaced")
+            self._counts["workers_replaced"] += 1
         self._start_thread(self._work, None, number + 1)
 
     def _resume(self) -> Prior | None:
@@ -319,9 +318,6 @@ class Live:
         fix, captured_ns, navigator = last
         moved_m = navigator.options.max_speed_mps * max(self._clock_ns() - captured_ns, 0) * 1e-9
         return Prior(east_m=fix.east_m, north_m=fix.north_m, sigma_m=fix.sigma_m + moved_m)
-
-    def _count(self, *names: str) -> None:
-        self._counts = replace(self._counts, **{name: getattr(self._counts, name) + 1 for name in names})
 
     def _start_thread(self, target: Callable[..., None], *args: object, above: int = 0) -> None:
         name = f"scenematch-{target.__name__}"

@@ -196,7 +196,7 @@ class Navigator:
         self._take(frame, None if late else moment)
         if isinstance(result, Fix):
             given = None if prior is None else position_of(prior, self._matcher.site)
-            match = self._match(result, frame, searched, None if is_given else given)
+            match = self._match(result, frame, searched, given, is_about_given=is_given)
             result = self._judge(match, moment, late=late)
             if isinstance(result, Fix) and given is not None:
                 self._map_offset.add(result, given, moment.time_s)
@@ -290,13 +290,23 @@ class Navigator:
 
     # ---------------------------------------------------------------------------------------------- acceptance
 
-    def _match(self, fix: Fix, frame: Frame, searched: Prior | None, given: PositionEstimate | None) -> Match:
+    def _match(
+        self,
+        fix: Fix,
+        frame: Frame,
+        searched: Prior | None,
+        given: PositionEstimate | None,
+        *,
+        is_about_given: bool,
+    ) -> Match:
         """A match, with what it is to be judged by."""
         about = PositionEstimate(en_m(fix), 0.0 if searched is None else searched.sigma_m, on_map=True)
         area_m2 = SEARCHED * about.spread_m2(fix)
         if searched is None or fix.confidence is None:  # without a confidence it has not weighed the prior
             area_m2 = max(area_m2, fix.window.area_px * self._matcher.site.gsd_m_per_px**2)
-        return Match(fix, area_m2, frame.height_agl_m, self._velocity(frame), self._refusals, given)
+        other = None if is_about_given else given
+        velocity = self._velocity(frame)
+        return Match(fix, area_m2, frame.height_agl_m, velocity, self._refusals, other, is_about_given)
 
     def _velocity(self, frame: Frame) -> tuple[Array, float] | None:
         """The frame's velocity and its standard deviation."""

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 # States: what to add to roll, pitch and heading (deg) and to the height (a share); how late the attitude is (s).
 _ANGLES, _HEIGHT, _LAG = slice(0, 3), 3, 4
 _NO_RATES_DPS: Array = np.zeros(3)  # if they are unknown
-_FIRST_SHARE = 0.2  # error of the height before a picture measured it
+_FIRST_SHARE = 0.07  # error of the height before a picture measured it
 _WALK = np.array([0.2, 0.2, 0.5, 1e-3, 0.01])  # standard deviations of the states' change in one second
 # Standard deviations of a measured attitude, refined or by features alone; of a measured height, and a share.
 _REFINED_DEG, _FEATURES_DEG, _HEIGHT_M, _HEIGHT_SHARE = 0.6, 2.0, 1.0, 0.01
@@ -36,7 +36,6 @@ _MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
 _MAX_LAG_DEG = 180.0  # timestamps in a wrong unit make rates of any size
 _MIN_SIGMAS, _MIN_SHARE = 2.0, 0.03  # of an error before it is corrected: every frame's matching allows for less
 _SEARCH_GROWTH = 1.5  # of the refusals in a row before the next search
-_DOUBTED_HEADING_DEG, _DOUBTED_SHARE = 8.0, 0.07  # standard deviations of a heading and a height to search for
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,10 +172,11 @@ class TelemetryErrors:
         return self._doubted(shown) if self._settling else shown
 
     def _doubted(self, frame: Frame) -> Frame:
-        """The frame with standard deviations of heading and height so wide that both are searched."""
+        """The frame with heading and height as uncertain as before the flight, so that both are searched."""
         assert frame.height_agl_m is not None
-        height_m = max(frame.height_sigma_m or 0.0, _DOUBTED_SHARE * frame.height_agl_m)
-        heading_deg = max(frame.heading_sigma_deg or 0.0, _DOUBTED_HEADING_DEG)
+        _, _, first_deg, first_share, _ = self._first.tolist()
+        height_m = max(frame.height_sigma_m or 0.0, first_share * frame.height_agl_m)
+        heading_deg = max(frame.heading_sigma_deg or 0.0, first_deg)
         return replace(frame, heading_sigma_deg=heading_deg, height_sigma_m=height_m)
 
     def without_errors(self, frame: Frame, rates_dps: Array = _NO_RATES_DPS) -> Frame:
@@ -238,7 +238,6 @@ class TelemetryErrors:
         if self._searched:  # earlier estimates were wrong
             self._searched = False
             self.forget()
-            self._covariance[2, 2] = max(self._covariance[2, 2], _DOUBTED_HEADING_DEG**2)
         seen, known = fix.attitude, self._angles_deg
         if fix.up_m is None:
             return

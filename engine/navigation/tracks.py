@@ -174,6 +174,7 @@ class Match:
         refusals: frames in a row before it without a fix.
         given: another source's position, unless it was searched about; it speaks for or against a place that no
             track predicted.
+        is_about_given: whether it was searched about another source's position, so that the two agree.
     """
 
     fix: Fix
@@ -182,15 +183,16 @@ class Match:
     velocity: tuple[Array, float] | None = None
     refusals: int = 0
     given: PositionEstimate | None = None
+    is_about_given: bool = False
 
     @property
     def support(self) -> float:
         """What it adds to the log-odds of a place that no track predicted.
 
         Its own evidence takes every second frame to show a place. After n refusals it is one in n + 2 (Laplace). A
-        position that rests on the telemetry's attitude is as reliable as any other source's.
+        position that rests on the telemetry's attitude alone is as reliable as any other source's.
         """
-        most = RELIABLE if self.fix.rests_on_attitude else CERTAIN
+        most = RELIABLE if self.fix.rests_on_attitude and not self.is_about_given else CERTAIN
         own = min(stated_nats(self.fix) - math.log1p(self.refusals), most)
         if self.given is None:
             return own

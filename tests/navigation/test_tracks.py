@@ -273,6 +273,13 @@ def test_an_attitude_that_nothing_confirmed_is_believed_where_the_start_predicts
     assert len(flown(ScriptedMatcher(*fixes), start, every_s=0.2, velocity=(7.0, 0.0)).fixed) == 20
 
 
+@pytest.mark.parametrize("stage", ["coarse", "unconfirmed"])
+def test_an_attitude_that_nothing_confirmed_is_believed_where_another_source_says(stage):
+    """A flight's first photograph: the attitude and the position of the other source agree."""
+    navigator = Navigator(ScriptedMatcher(replace(fix_at(2.0), stage=stage)))
+    assert isinstance(navigator.update(at(0.0), Prior(east_m=5.0, north_m=0.0, sigma_m=15.0)), Fix)
+
+
 def test_telemetry_that_leads_nowhere_is_left_in_turns():
     """It is right 99 times in 100: after seven refusals every third frame searches the whole map."""
     run = flown(ScriptedMatcher(*[None] * 18), given=[Prior(east_m=0.0, north_m=0.0, sigma_m=15.0)] * 18)
