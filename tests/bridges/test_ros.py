@@ -285,7 +285,7 @@ def test_a_time_that_goes_back_begins_again(maker):
         *((partial(odometry_message, yaw_deg=77.0), {"child": name}) for name in ("base_link", "", "odom")),
         *((twist_message, {"frame": name}) for name in ("base_link", "/base_link", "uav1/base_link")),
     ],
-    ids=str,
+    ids=lambda value: None if callable(value) else str(value),
 )
 def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, make, frame, variances, sigma_mps):
     """Wherever the odometry has its own north, and along whichever of the two frames its twist is."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 import torch
@@ -15,6 +12,7 @@ from engine.maps import prepared
 from engine.maps.prepared import PreparedMap, Region
 from engine.ncc_fft import prepare
 from engine.values import Window
+from tests.support.threads import called_at_once
 
 RADIUS_PX = 8
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])
@@ -141,12 +139,6 @@ def test_several_threads_may_cut_at_once(gray, monkeypatch, by_cells):
     search = prepare(torch.zeros(400, 550))
     monkeypatch.setattr(maps, "_prepare", lambda window, level: Region(window, search, None))
     places = np.random.default_rng(0).integers(0, 400 - 64, (4000, 2)).tolist()
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)  # they take turns as often as the interpreter lets them
-    try:
-        with ThreadPoolExecutor(4) as pool:
-            cuts = list(pool.map(lambda place: maps.cut(Window(*place, 64, 64), 0), places))
-    finally:
-        sys.setswitchinterval(before)
+    cuts = called_at_once(lambda place: maps.cut(Window(*place, 64, 64), 0), places)
     assert all(cut.window.x0 == x & -8 for cut, (x, _) in zip(cuts, places, strict=True))
     assert len(maps.regions.values()) <= 2

@@ -276,8 +276,8 @@ def test_an_attitude_that_nothing_confirmed_is_believed_where_the_start_predicts
 @pytest.mark.parametrize("stage", ["coarse", "unconfirmed"])
 def test_an_attitude_that_nothing_confirmed_is_believed_where_another_source_says(stage):
     """A flight's first photograph: the attitude and the position of the other source agree."""
-    navigator = Navigator(ScriptedMatcher(replace(fix_at(2.0), stage=stage)))
-    assert isinstance(navigator.update(at(0.0), Prior(east_m=5.0, north_m=0.0, sigma_m=15.0)), Fix)
+    prior = Prior(east_m=5.0, north_m=0.0, sigma_m=15.0)
+    assert flown(ScriptedMatcher(replace(fix_at(2.0), stage=stage)), given=[prior]).fixed == [0]
 
 
 def test_telemetry_that_leads_nowhere_is_left_in_turns():
