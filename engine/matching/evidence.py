@@ -47,6 +47,7 @@ class Evidence:
         height_chi_square: of the height against the telemetry's, with one degree of freedom; None if it was not
             measured, or the telemetry's is unknown or doubted.
         null: the surprise of the mirrored frame; 0 if it was not matched, or is among the rivals.
+        elsewhere: the evidence for the best other place under another hypothesis about the telemetry.
     """
 
     surprise: float
@@ -56,13 +57,15 @@ class Evidence:
     prior_chi_square: float | None
     height_chi_square: float | None = None
     null: float = 0.0
+    elsewhere: float = 0.0
 
     @property
     def nats(self) -> float:
         """The sum of all of it."""
         alike = max(1.0, min(max(self.rival, self.null), self.surprise) / math.log(self.measured))
         seen = self.surprise / alike - math.log(self.tried)
-        return max(seen, 0.0) + _of_position(self.prior_chi_square) + _of_height(self.height_chi_square)
+        known = _of_position(self.prior_chi_square) + _of_height(self.height_chi_square)
+        return max(seen, 0.0) + known - self.elsewhere
 
 
 def independent_places(positions: float) -> float:

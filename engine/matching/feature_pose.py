@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from engine.geo import attitude_from_rotation
 from engine.maps.landmarks import LandmarkMap
-from engine.matching.acceptance import judge_pose
+from engine.matching.acceptance import agree_in_place, judge_pose
 from engine.matching.covariance import tilt_covariance
 from engine.matching.evidence import Evidence, is_beyond_doubt, probability
 from engine.matching.feature_matching import Matched, match_views
@@ -73,19 +73,27 @@ class FeatureMatcher:
         flat = query.refuse_flat(self.method)
         if flat is not None:
             return flat
-        first: PoseCandidate | NoFix | None = None
+        first: NoFix | PoseCandidate | None = None
+        found: list[tuple[PoseCandidate, FeatureMatcher, TelemetryHypothesis]] = []
         deadline = query.scheduler.deadline
         for matcher, hypothesis in self._attempts():
             if first is not None and deadline.remaining_ms < deadline.elapsed_ms:
                 break
-            found = matcher._find_with(hypothesis)
-            if isinstance(found, PoseCandidate) and not self.is_doubtful(found):
-                return matcher._null_tested(found, hypothesis)
-            if isinstance(found, NoFix) and found.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
-                return first or found
-            first = first or found
-        assert first is not None  # the telemetry's own hypothesis is always tried
-        return first
+            result = matcher._find_with(hypothesis)
+            first = first or result
+            if isinstance(result, PoseCandidate):
+                found.append((result, matcher, hypothesis))
+                if is_beyond_doubt(result.evidence.nats, query.risk):
+                    break
+            elif result.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
+                break
+        if not found:
+            assert first is not None  # the telemetry's own hypothesis is always tried
+            return first
+        best, matcher, hypothesis = max(found, key=lambda each: each[0].evidence.nats)
+        if len(found) == 1 and is_beyond_doubt(best.evidence.nats, query.risk):
+            return best
+        return matcher._null_tested(_against(best, [each for each, _, _ in found]), hypothesis)
 
     def find_at_once(self) -> PoseCandidate | NoFix:
         """The pose of a frame by its own telemetry, with no second attempt and no null hypothesis."""
@@ -102,9 +110,7 @@ class FeatureMatcher:
         return self.query.refuse(*refusal, self.method, score=fix.score, window=fix.window)
 
     def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
-        """The candidate; unless beyond doubt, compared with the mirrored frame under the same telemetry."""
-        if is_beyond_doubt(found.evidence.nats, self.query.risk):
-            return found
+        """The candidate compared with the mirrored frame under the same telemetry."""
         mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
         null = replace(self, query=mirrored)._find_with(hypothesis)
         if isinstance(null, NoFix):
@@ -125,10 +131,6 @@ class FeatureMatcher:
         wide = TelemetryHypothesis(unknown if height_m is None else (height_m / factor, height_m * factor), None)
         if options.search_widely and wide != known:
             yield self, wide
-
-    def is_doubtful(self, found: PoseCandidate) -> bool:
-        """Whether there is too little evidence for a pose."""
-        return found.evidence.nats < self.query.needed_nats
 
     def matches_in(self, window: Window) -> tuple[Array, Array, PoseStats | None]:
         """The matches in a window at the frame's own height and heading, and their pose: for reports.
@@ -251,6 +253,13 @@ class FeatureMatcher:
             rival, tried = 0.0, 10.0**stats.log10_tried
         evidence = Evidence(surprise, rival, tried, tried, query.prior_chi_square(fix), height_chi_square)
         return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
+
+
+def _against(best: PoseCandidate, all_found: list[PoseCandidate]) -> PoseCandidate:
+    """The best candidate, with the evidence for any other place against it."""
+    others = [each.evidence.nats for each in all_found if not agree_in_place(each.fix, best.fix)]
+    evidence = replace(best.evidence, elsewhere=max([0.0, *others]))
+    return PoseCandidate(replace(best.fix, confidence=probability(evidence.nats)), evidence)
 
 
 def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:
