@@ -83,8 +83,9 @@ class FeatureMatcher:
             first = first or result
             if isinstance(result, PoseCandidate):
                 found.append((result, matcher, hypothesis))
-                if is_beyond_doubt(result.evidence.nats, query.risk):
-                    break
+                nats = result.evidence.nats
+                if nats >= query.needed_nats if result is first else is_beyond_doubt(nats, query.risk):
+                    break  # what is found after the telemetry failed may be as wrong as that
             elif result.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
                 break
         if not found:
