@@ -31,12 +31,14 @@ from engine import (
 )
 from engine.budget import Deadline
 from engine.features import match, sift
-from engine.matching.feature_pose import FeatureMatcher
+from engine.matching.align import to_gray
+from engine.matching.evidence import Evidence, probability
+from engine.matching.feature_pose import FeatureMatcher, PoseCandidate
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
 from engine.options import AssumedErrors, LearnedOptions, NccOptions, PoseOptions, SiftOptions
 from engine.values import GridPose
-from tests.support.fixes import px_off, values_of
+from tests.support.fixes import a_fix, px_off, values_of
 from tests.support.ground import Ground
 from tests.support.landmarks import landmarks_of
 from tests.support.matches import pairs_of
@@ -253,6 +255,37 @@ def test_a_wide_search_is_not_begun_where_the_budget_does_not_hold_it(
     assert result.reason is Reason.TOO_FEW_MATCHES
     expected = [(False, (150.0, 150.0))] * 2 + [(True, (75.0, 300.0))]  # whether the heading is unknown, heights
     assert [(tried.x_axis_deg is None, tried.heights_m) for tried in hypotheses] == expected[:looks]
+
+
+@pytest.mark.parametrize(
+    ("found_nats", "looks", "fixed_at_m"),
+    [
+        ([12.0], 1, 0.0),  # as the telemetry has it
+        ([None, 12.0, 500.0], 3, 200.0),  # a place found after it failed gives way to another
+        ([None, 12.0, 15.0], 3, None),
+        ([None, 12.0, None], 3, 100.0),
+    ],
+)
+def test_what_is_found_after_the_telemetry_failed_is_weighed_against_other_places(
+    ground, camera, frame, prior, monkeypatch, found_nats, looks, fixed_at_m
+):
+    mirrored, tried = np.ascontiguousarray(frame.image[:, ::-1]), []
+
+    def look(matcher, hypothesis):
+        if len(tried) == looks:
+            assert np.array_equal(matcher.query.gray, to_gray(replace(frame, image=mirrored)))
+            return matcher.query.refuse(Reason.BAD_POSE, "the null hypothesis", "sift")
+        tried.append(hypothesis)
+        nats = found_nats[len(tried) - 1]
+        if nats is None:
+            return matcher.query.refuse(Reason.BAD_POSE, "none", "sift")
+        evidence = Evidence(nats + math.log(1000.0), 0.0, 1000.0, 1000.0, None)
+        return PoseCandidate(a_fix(100.0 * (len(tried) - 1), confidence=probability(nats)), evidence)
+
+    monkeypatch.setattr(FeatureMatcher, "_find_with", look)
+    answer = with_sift(ground, camera, refine=False).locate(frame, prior)
+    assert len(tried) == looks
+    assert (answer.east_m if isinstance(answer, Fix) else None) == fixed_at_m
 
 
 # The null hypothesis of SIFT: what the mirrored frame reaches is chance, and counts against the pose

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, Reason, SceneMatcher
+from engine import Fix, NoFix, Reason, SceneMatcher
+from engine.matching.evidence import Evidence, probability, refined_nats
 from engine.matching.refinement import Refinement
 from engine.runtime.scheduler import OutOfTime
 
@@ -75,3 +76,30 @@ def test_a_pose_that_is_hardly_confirmed_gives_way_to_one_that_is(ground, site, 
     frame = ground.frame(camera, NADIR, 150.0, **TRUE)
     fix = SceneMatcher(site, camera, "ncc", "cpu").locate(frame, ground.prior(NADIR))
     assert (fix.stage, fix.score) == (("refined", 0.9) if knows_better else ("unconfirmed", 0.3))
+
+
+@pytest.mark.parametrize(
+    ("nats", "is_refined", "stage"),
+    [
+        (7.0, True, "refined"),
+        (7.0, False, None),
+        (11.0, True, "refined"),
+        (11.0, False, None),
+        (14.0, False, "unconfirmed"),
+    ],
+)
+def test_whether_the_pose_can_be_refined_speaks_for_or_against_the_place(
+    ground, site, camera, monkeypatch, nats, is_refined, stage
+):
+    """The usual risk asks for 9.2 nats: less is made up for, and a little more is not enough where it fails."""
+    refined = (lambda _, fix: replace(fix, stage="refined", score=0.9)) if is_refined else lambda _self, _fix: None
+    monkeypatch.setattr(Evidence, "nats", nats)
+    monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
+    monkeypatch.setattr(Refinement, "_through_all", refined)
+    frame = ground.frame(camera, NADIR, 150.0, **TRUE)
+    answer = SceneMatcher(site, camera, "ncc", "cpu").locate(frame, ground.prior(NADIR))
+    if stage is None:
+        assert isinstance(answer, NoFix)
+        return
+    assert answer.stage == stage
+    assert answer.confidence == pytest.approx(probability(nats + refined_nats(is_refined=is_refined)))
