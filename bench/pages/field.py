@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from bench.accuracy.field import Figures
 
 TITLES = {
-    "brighton": "`brighton`: nine photographs of a beach, 14 s apart",
+    "brighton": "`brighton`: nine photographs of a wooded park, 14 s apart",
     "seneca": "`seneca`: near-infrared survey photographs of fields, 10 s apart, up to 22 degrees off nadir",
     "caliterra": "`caliterra`: survey photographs of bare ground from 30 to 50 m",
     "nust": "`nust`: video of a campus on a satellite map of another date",
@@ -27,22 +27,20 @@ NAMES = {
 COLUMNS = ["method", "frames", "fixed", "within 1, 5, 10 m", "median, m", "RMS, m", "wrong", "outside", "ms"]
 INTRO = (
     "Made by `python -m bench.accuracy.field` on {machine}, one thread, beside other work: its milliseconds are "
-    "upper bounds. Each flight goes through `track` with default settings and the telemetry that was recorded; a "
-    "flight without positions in its telemetry starts at its true place (sigma 15 m)."
+    "upper bounds. Each flight goes through `track` with default settings; a flight without positions in its "
+    "telemetry starts at its true place (sigma 15 m)."
 )
 FIGURES = (
     "Median and RMS are over all fixes, wrong ones too; **wrong** are those more than 10 m off, **outside** those "
-    "outside the ellipse of three of their own sigmas. The campus's truth is good to about a metre and is the "
-    "ground in the middle of each frame, not what lies below the vehicle: fixes there that have a pose are moved "
-    "to where their own axis meets the ground."
+    "outside the ellipse of three of their own sigmas. The truth of `nust` is the ground in the middle of each "
+    "frame, good to about a metre, and its fixes are moved there."
 )
 PEERS = (
     "`paper's NCC` and `paper's SIFT` are `--profile paper`: the paper's recipe by OpenCV, which refuses almost "
     "nothing and follows its own last answer. The plain classical recipe (`bench/accuracy/classical.py`) takes "
-    "each frame by itself, its window of 45 m about the telemetry's position (else a drawn one, sigma 15 m): "
-    "the frame rectified by attitude and height onto the map's grid, upright RootSIFT without a cap, contrast "
-    "0.01, ratio 0.9, and a vote for the translation within 3 % of the height. It answers always, and states no "
-    "sigma."
+    "each frame by itself, its window of 45 m about the telemetry's position (else a drawn one, sigma 15 m): the "
+    "frame rectified by attitude and height onto the map's grid, upright RootSIFT without a cap, contrast 0.01, "
+    "ratio 0.9, and a vote for the translation within 3 % of the height. It always answers, and states no sigma."
 )
 
 
@@ -57,7 +55,7 @@ def write(docs: Path, rows: list[Figures]) -> None:
 
 
 def _cells(row: Figures) -> list[str]:
-    every = f", every {row.step}th" if row.step > 1 else ""
+    every = "" if row.step == 1 else f", every {row.step}{'nd' if row.step == 2 else 'th'}"
     return [NAMES[row.method] + every, str(row.frames), *outcome(row, row)]
 
 
