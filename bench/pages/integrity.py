@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binomtest
 
 from bench.accuracy.judged import METHODS, SCORES, Row
 from bench.accuracy.trials import ANSWERABLE, SUITABLE, UNANSWERABLE, UNSUITABLE
@@ -20,6 +21,7 @@ BEGIN, END = "<!-- bench.accuracy.integrity begins -->", "<!-- bench.accuracy.in
 TPR, COVERAGE = 0.95, 0.75
 THRESHOLDS = (0.93, 0.95, 0.97, 0.98, 0.99, 0.995)
 IN_95 = 5.991  # chi-square of two degrees of freedom that holds 95 %
+RISKS = (1e-2, 1e-3, 1e-4)
 BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0])
 
 
@@ -51,6 +53,12 @@ def section(rows: list[Row]) -> list[str]:
         "would have lost NCC's fix it is counted as lost, though SIFT might have had one."
     )
     lines += table(["`confidence` of at least", *METHODS, "all wrong"], _by_threshold(rows))
+    lines += paragraph(
+        "Errors beyond `Fix.protection_level_m(risk)`, of the suitable fixes: how many of those with a finite "
+        "level, the 95 % interval of their share, and the median level. It is infinite if a wrong place alone is "
+        "more probable than the risk."
+    )
+    lines += table(["method", "fixes", *(f"risk {risk:g}" for risk in RISKS)], _by_risk(rows))
     lines += paragraph("By kind; each cell: matches, share that got a fix, wrong fixes.")
     lines += table(["kind", *METHODS], _crossed(rows, (*ANSWERABLE, *UNANSWERABLE), lambda row: row.kind, _fixes))
     lines += paragraph("By ground; each cell: availability, wrong fixes of all matches, NEES, inside the ellipse.")
@@ -103,6 +111,23 @@ def _by_threshold(rows: list[Row]) -> list[list[str]]:
             wrong = sum(map(_is_wrong, _of(kept, method)))
             cells.append(f"{_share(right / max(1, suitable))}, {wrong}")
         out.append([f"{threshold:g}", *cells, str(sum(map(_is_wrong, kept)))])
+    return out
+
+
+def _by_risk(rows: list[Row]) -> list[list[str]]:
+    """A line for each method: of its fixes with a finite level, what lies beyond it."""
+    out = []
+    for method in METHODS:
+        fixes = [row for row in _of(rows, method) if row.fixed and row.kind in SUITABLE]
+        left, sigma_m, error_m = np.array([(row.scores[0] - 1.0, row.sigma_m, row.error_m) for row in fixes]).T
+        cells = []
+        for risk in RISKS:
+            known = left + risk > 0.0
+            level_m = sigma_m[known] * np.sqrt(-2.0 * np.log(left[known] + risk))
+            beyond, count = int((error_m[known] > level_m).sum()), int(known.sum())
+            least, most = binomtest(beyond, count).proportion_ci()
+            cells.append(f"{beyond} of {count:,}, {least:.1g} to {most:.1g}, {np.median(level_m):.1f} m")
+        out.append([method, f"{len(fixes):,}", *cells])
     return out
 
 
