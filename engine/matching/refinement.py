@@ -85,18 +85,9 @@ class Refinement:
         determine them over a surface model. Without one, where relief may be the reason, the fix stays as it was.
         """
         query, has_tilt = self.query, self.query.telemetry.has_tilt
-        refined = self._through_all(fix)
         if has_tilt and query.site.has_surface:
-            if not _is_confirmed(refined):
-                try:
-                    refined = self._doubting()._through_all(fix) or refined
-                except OutOfTime:
-                    if refined is None:
-                        raise
-            weighed = self._weighed(refined or fix, is_refined=refined is not None)
-            if isinstance(weighed, NoFix):
-                return weighed
-            return weighed if _is_confirmed(refined) else self._unconfirmed(weighed)
+            return self._over_surface(fix)
+        refined = self._through_all(fix)
         if _is_confirmed(refined):
             return refined
         if has_tilt:
@@ -106,21 +97,29 @@ class Refinement:
         detail = "roll and pitch are unknown, and the picture does not determine them"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
-    def _weighed(self, fix: Fix, *, is_refined: bool) -> Fix | NoFix:
-        """The fix with the evidence of whether its pose can be refined, if that is still enough.
+    def _over_surface(self, fix: Fix) -> Fix | NoFix:
+        """The same for a known attitude over a surface model, where a pose that can be refined is evidence.
 
-        That of an oblique frame fails at right places as well: near ground hides what is far.
+        Of an oblique frame it often cannot be at right places as well, so that says nothing.
         """
-        query, attitude = self.query, self.query.telemetry.grid_attitude
+        query, refined = self.query, self._through_all(fix)
+        if not _is_confirmed(refined):
+            try:
+                refined = self._doubting()._through_all(fix) or refined
+            except OutOfTime:
+                if refined is None:
+                    raise
+        attitude = query.telemetry.grid_attitude
         assert attitude is not None  # a fix by correlation had one
-        if is_oblique(query, attitude):
-            return fix
-        assert fix.confidence is not None  # each peak has one
-        nats = nats_of(fix.confidence) + refined_nats(is_refined=is_refined)
-        if nats >= query.needed_nats:
-            return replace(fix, confidence=probability(nats))
-        detail = f"wrong with probability {1.0 - probability(nats):.1g}: the pose cannot be refined there"
-        return fix.refused(Reason.AMBIGUOUS, detail)
+        assert fix.confidence is not None
+        nats = nats_of(fix.confidence)
+        if refined or not is_oblique(query, attitude):
+            nats += refined_nats(is_refined=refined is not None)
+        if nats < query.needed_nats:
+            detail = f"wrong with probability {1.0 - probability(nats):.1g}: the pose cannot be refined there"
+            return fix.refused(Reason.AMBIGUOUS, detail)
+        weighed = replace(refined or fix, confidence=probability(nats))
+        return weighed if _is_confirmed(refined) else self._unconfirmed(weighed)
 
     def _unconfirmed(self, fix: Fix) -> Fix | NoFix:
         """The fix of a known attitude that the picture does not confirm, refined or not, if the prior agrees."""

@@ -79,27 +79,32 @@ def test_a_pose_that_is_hardly_confirmed_gives_way_to_one_that_is(ground, site, 
 
 
 @pytest.mark.parametrize(
-    ("nats", "is_refined", "stage"),
+    ("is_oblique", "nats", "is_refined", "stage"),
     [
-        (7.0, True, "refined"),
-        (7.0, False, None),
-        (11.0, True, "refined"),
-        (11.0, False, None),
-        (14.0, False, "unconfirmed"),
+        (False, 7.0, True, "refined"),
+        (False, 7.0, False, None),
+        (False, 11.0, True, "refined"),
+        (False, 11.0, False, None),
+        (False, 14.0, False, "unconfirmed"),
+        (True, 7.0, True, "refined"),
+        (True, 7.0, False, None),
+        (True, 11.0, False, "unconfirmed"),  # it says nothing
     ],
 )
 def test_whether_the_pose_can_be_refined_speaks_for_or_against_the_place(
-    ground, site, camera, monkeypatch, nats, is_refined, stage
+    ground, site, camera, monkeypatch, is_oblique, nats, is_refined, stage
 ):
     """The usual risk asks for 9.2 nats: less is made up for, and a little more is not enough where it fails."""
     refined = (lambda _, fix: replace(fix, stage="refined", score=0.9)) if is_refined else lambda _self, _fix: None
     monkeypatch.setattr(Evidence, "nats", nats)
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
     monkeypatch.setattr(Refinement, "_through_all", refined)
+    monkeypatch.setattr("engine.matching.refinement.is_oblique", lambda *_: is_oblique)
     frame = ground.frame(camera, NADIR, 150.0, **TRUE)
     answer = SceneMatcher(site, camera, "ncc", "cpu").locate(frame, ground.prior(NADIR))
     if stage is None:
         assert isinstance(answer, NoFix)
         return
     assert answer.stage == stage
-    assert answer.confidence == pytest.approx(probability(nats + refined_nats(is_refined=is_refined)))
+    says = 0.0 if is_oblique and not is_refined else refined_nats(is_refined=is_refined)
+    assert answer.confidence == pytest.approx(probability(nats + says))
