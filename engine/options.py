@@ -131,7 +131,7 @@ class SiftOptions:
         map_features: "prepared" once for the map, or found "per_frame" in the window, as the paper does.
         max_map_keypoints: upper limit for a window that is described per frame.
         tolerance_px: distance, in pixels of the map's level, within which a match agrees with the voted pose.
-        search_widely: if nothing is found, search again without the heading and with heights off by up to
+        search_widely: if too little is found, search again without the heading and with heights off by up to
             ``height_factor``.
         height_factor: see above; 1 trusts the height even then.
         max_height_m: the largest height to search if the height is unknown.

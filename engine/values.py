@@ -53,8 +53,8 @@ class Frame:
         timestamp_ns: capture time on the vehicle's clock, or None.
         height_agl_m: height above the ground, positive, or None if unknown.
         heading_deg: clockwise from true north, or None if unknown.
-        roll_deg: positive right side down; None is treated as level.
-        pitch_deg: positive nose up; None is treated as level.
+        roll_deg: positive right side down; None is a wide guess about level.
+        pitch_deg: positive nose up; None is a wide guess about level.
         east_velocity_mps: velocity over ground, or None if unknown.
         north_velocity_mps: velocity over ground, or None if unknown.
         height_sigma_m: standard deviation of the height; None takes the matcher's assumption, as for the next two.
@@ -236,8 +236,9 @@ class Peak:
         x: sub-pixel column of the template's top-left pixel in the window.
         y: sub-pixel row of the same.
         score: NCC at the best whole pixel, in [-1, 1].
-        second_score: the highest NCC outside the peak's exclusion zone, or -1 where nothing is outside.
-        curvature: (2, 2) second derivatives of the score at the peak, per square pixel (negative definite).
+        second_score: the highest NCC outside the peak's exclusion zone, or of a null hypothesis if that is higher;
+            -1 where there is none.
+        curvature: (2, 2) second derivatives of the score at the peak, per square pixel; 0 at the window's edge.
     """
 
     x: float

@@ -1,4 +1,4 @@
-"""Acceptance: decides whether to accept a match by either method, or why to refuse it.
+"""Acceptance: whether a peak or a pose has enough evidence, or why to refuse it; and whether estimates agree.
 
 The evidence for the match and the allowed risk decide, see :mod:`engine.matching.evidence`.
 """

@@ -23,7 +23,7 @@ from engine.values import Fix, NoFix, Reason, Result, Window
 
 
 class Auto(Method):
-    """NCC if height and heading are known, then SIFT if time remains; two fixes must agree.
+    """NCC if height and heading are known, then SIFT if time remains; two fixes must be of one place.
 
     Args:
         site: the map.
@@ -65,9 +65,9 @@ class Auto(Method):
             self.ncc.warmup_search(query)
 
     def locate(self, query: Query) -> Result:
-        """The more accurate of two agreeing fixes, or the only fix.
+        """The more accurate of two agreeing fixes, a wider one if they hardly agree, or the only fix.
 
-        The second method makes a fix more certain. It runs last, so that it never takes time from the first.
+        The second method checks a fix. It runs last, so that it never takes time from the first.
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)

@@ -3,7 +3,8 @@
 Evidence, in nats, is log p(match | the frame was taken there) - log p(match | it was taken elsewhere, by chance).
 Independent evidence adds up, and a fix is accepted if its probability of being wrong is at most the allowed risk.
 Chance is measured on the frame itself: by pairs of its own matches that are known to be wrong, by the best rival
-elsewhere and, in doubt, by the mirrored frame, which shows no place on Earth.
+elsewhere and, in doubt, by the mirrored frame, which shows no place on Earth. Only what a refinement is worth was
+measured once for all.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Evidence:
         height_chi_square: of the height against the telemetry's, with one degree of freedom; None if it was not
             measured, or the telemetry's is unknown or doubted.
         null: the surprise of the mirrored frame; 0 if it was not matched, or is among the rivals.
-        elsewhere: the evidence for the best other place under another hypothesis about the telemetry.
+        elsewhere: the evidence for the best other place that another attempt found.
     """
 
     surprise: float
@@ -61,7 +62,7 @@ class Evidence:
 
     @property
     def nats(self) -> float:
-        """The sum of all of it."""
+        """What was seen, by how much places look alike, and what was known before; without any refinement."""
         alike = max(1.0, min(max(self.rival, self.null), self.surprise) / math.log(self.measured))
         seen = self.surprise / alike - math.log(self.tried)
         known = _of_position(self.prior_chi_square) + _of_height(self.height_chi_square)

@@ -1,4 +1,4 @@
-"""Multi-hypothesis search: NCC over headings, heights and whole maps, coarse for all, fine for the best.
+"""Multi-hypothesis search: NCC over headings and heights, or a whole map, coarse for all, fine for the best.
 
 A hypothesis is a height and a heading of the frame. All are aligned on a coarse level of the map and scored
 against one spectrum. The best places are then matched level by level, and the winner's heading and height are

@@ -34,7 +34,7 @@ class Rung:
 def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Result:
     """The answer after every rung that can change it and that time allows.
 
-    A fix is never lost to what might improve it: with one, work ends before a deadline that would make it late.
+    With a fix, work ends before a deadline that would make it late; no fix is lost to a lack of time.
 
     Args:
         query: the frame.

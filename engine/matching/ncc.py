@@ -69,7 +69,7 @@ class Ncc(Method):
         return {"map regions": self.prepared.regions.created, "sampled cells": self.samples.cells.created}
 
     def warmup(self, query: Query) -> None:
-        """Run every variant of every step, so that it is compiled and its cost known."""
+        """Run every variant of every step but the searches, so that it is compiled and its cost known."""
         untilted = replace(query, frame=replace(query.frame, roll_deg=None, pitch_deg=None))
         for efforts in (Efforts(self, query), Efforts(self, untilted)):
             for answer in rehearse(efforts.query, efforts.levels, None):
@@ -89,7 +89,7 @@ class Ncc(Method):
             rehearse(query, efforts.structure, None)
 
     def locate(self, query: Query, *, widely: bool = True) -> Result:
-        """A fix on the finest level of the map that time allows, refined if time remains.
+        """The fix of a coarse peak whose pose the picture confirms, else of the finest level that time allows.
 
         Args:
             query: the frame.
@@ -120,8 +120,8 @@ class Ncc(Method):
 
         Args:
             query: the frame.
-            coarser: see :meth:`correlate`.
-            widely: whether to try all headings and heights within three sigmas, as a search of the map does.
+            coarser: levels of the map above the frame's own.
+            widely: whether to try all headings and heights within three sigmas.
         """
         refusal = self._refuse_unusable(query)
         if refusal is not None:
@@ -324,7 +324,8 @@ class Efforts:
         result = self._ncc.judge(query, found)
         if isinstance(result, NoFix):
             self._refusal = replace(result, match=None if isinstance(first, NoFix) else first.fix)
-            self._doubtful = found if isinstance(found, PeakCandidate) else self._doubtful
+            if isinstance(found, PeakCandidate) and found.is_tested:
+                self._doubtful = found  # structure's, if it was matched: it sees what grey levels see, and more
             return None if isinstance(answer, Fix) else self._refusal
         assert isinstance(found, PeakCandidate)
         assert height_m is not None

@@ -204,7 +204,7 @@ class Query:
         """A fix of this frame; its heading is from true north at the fix.
 
         Args:
-            method: "ncc" or "sift".
+            method: "ncc", "sift" or "learned".
             nadir_px: (2,) the camera's nadir in map pixels.
             covariance_m2: (3, 3) east, north, up.
             score: of the match.

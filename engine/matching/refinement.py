@@ -68,7 +68,7 @@ class Refinement:
         query: the frame, with height and heading.
         samples: of the map.
         options: of the correlation.
-        knows_tilt: whether to use the roll and pitch that came with the frame.
+        knows_tilt: whether to trust the roll and pitch that came with the frame, or only to start from them.
     """
 
     query: Query
@@ -77,7 +77,7 @@ class Refinement:
     knows_tilt: bool = True
 
     def refine(self, fix: Fix) -> Fix | NoFix:
-        """The fix with its whole pose refined, or a less certain one if refinement does not confirm it.
+        """The fix with its whole pose refined, or a less certain one, or a refusal.
 
         If the picture hardly confirms the telemetry's attitude, the pose is refined once more as if roll and pitch
         were hardly known; the result counts if the picture confirms it. An attitude that it does not confirm
@@ -135,7 +135,7 @@ class Refinement:
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
     def refine_at_once(self, fix: Fix) -> Fix | None:
-        """The fix of a known tilt refined on the frame's own level; None if the result is not beyond doubt."""
+        """The fix of a known tilt refined on the frame's own level; None if the picture does not confirm it."""
         prior = self._prior(fix)
         return self._refined(fix, prior, self._at_once(prior))
 

@@ -11,7 +11,7 @@ from engine.maps.landmarks import LandmarkMap
 from engine.maps.prepared import enhanced_part
 from engine.maps.samples import SampleMap
 from engine.matching.align import SIDE_STEP_PX
-from engine.matching.evidence import is_beyond_doubt, nats_of
+from engine.matching.evidence import is_beyond_doubt
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate
 from engine.matching.ladder import SHARES, Rung, Works, climb, rehearse
@@ -187,6 +187,7 @@ class Efforts:
     def __init__(self, sift: Sift, query: Query, agrees: Callable[[Fix], bool] | None = None) -> None:
         self._sift, self._query, self._agrees = sift, query, agrees
         self._few: Fix | None = None
+        self._is_certain = False  # whether few features are so much evidence that no null hypothesis is needed
         self._few_options = sift.few_options(query)
         self._is_settled = self._is_unrefinable = False
         self._works, frame_px = sift.works(query), float(query.gray.size)
@@ -228,12 +229,12 @@ class Efforts:
         return {}
 
     def _by_few(self, answer: Result | None, step: Hashable) -> Fix | None:
-        """The fix by few features, if it is beyond doubt and agrees."""
+        """The fix by few features, if it is beyond doubt and agrees; one with less evidence may be refined."""
         assert self._few_options is not None  # or it was not offered
         found = self._sift.find_few(self._query, self._few_options)
         if isinstance(found, NoFix) or found.evidence.nats < self._query.needed_nats:
             return None
-        self._few = found.fix
+        self._few, self._is_certain = found.fix, is_beyond_doubt(found.evidence.nats, self._query.risk)
         if not self._is_certain or (self._agrees and not self._agrees(found.fix)):
             return None
         self._is_settled = self._agrees is not None
@@ -267,10 +268,3 @@ class Efforts:
         """The fix by all features refined."""
         assert isinstance(answer, Fix)
         return self._sift.refined(self._query, answer)
-
-    @property
-    def _is_certain(self) -> bool:
-        """Whether few features are so much evidence that no null hypothesis is needed."""
-        assert self._few is not None
-        assert self._few.confidence is not None  # each pose has one
-        return is_beyond_doubt(nats_of(self._few.confidence), self._query.risk)

@@ -8,6 +8,7 @@ import pytest
 
 from engine import Fix, NoFix, Reason, SceneMatcher
 from engine.matching.evidence import Evidence, probability, refined_nats
+from engine.matching.ncc import Ncc
 from engine.matching.refinement import Refinement
 from engine.runtime.scheduler import OutOfTime
 
@@ -108,3 +109,14 @@ def test_whether_the_pose_can_be_refined_speaks_for_or_against_the_place(
     assert answer.stage == stage
     says = 0.0 if is_oblique and not is_refined else refined_nats(is_refined=is_refined)
     assert answer.confidence == pytest.approx(probability(nats + says))
+
+
+def test_a_refined_pose_does_not_stand_for_the_structure_that_a_search_must_show(
+    ground, site, camera, monkeypatch
+):
+    """Of a place found without a prior, the best of a whole map."""
+    monkeypatch.setattr(Evidence, "nats", 20.0)
+    monkeypatch.setattr(Ncc, "match_structure", lambda *_: None)
+    monkeypatch.setattr(Refinement, "_through_all", lambda _, fix: replace(fix, stage="refined", score=0.9))
+    frame = ground.frame(camera, NADIR, 150.0, **TRUE)
+    assert SceneMatcher(site, camera, "ncc", "cpu").locate(frame).reason is Reason.UNCONFIRMED
