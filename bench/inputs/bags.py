@@ -139,3 +139,14 @@ def _write_truth(write: Any, make: BagMessages, row: Truth) -> None:
         write(bags.TRUTH_HEIGHT, time_ns, make.float64(row.height_agl_m))
     if row.alt_amsl_m is not None:
         write(bags.TRUTH_ALTITUDE, time_ns, make.float64(row.alt_amsl_m))
+
+
+def flight_bag(folder: Path, path: Path) -> None:
+    """Write a flight folder of the simulator as a bag of ROS 1, as ``.ci/extras`` does."""
+    from scenematch.files.flight import open_flight
+    from scenematch.files.truth import read_truth
+
+    camera = Camera.load(folder / "camera.yaml")
+    flight = open_flight(folder / "frames", folder / "telemetry.csv", camera)
+    frames = ((item.frame, item.prior) for item in flight)
+    write_bag(path, frames, camera, kind="ros1", truth=read_truth(folder / "truth.csv"))

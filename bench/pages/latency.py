@@ -51,8 +51,8 @@ SOAK = (
     "`ncc` and `sift` with a budget of 40 ms; `auto` is all of its frames above, its times those at 121 ms. "
     "Growth of the resident memory is the slope of a line through all samples after the first tenth; open files"
     " and threads are those at the first and at the last frame. Cache growth is what is planned, compiled or "
-    "prepared for the first time: after the warm-up there should be none. Memory of `auto` grows in steps where "
-    "its budget does: more steps become affordable, and take their memory once."
+    "prepared for the first time: after the warm-up there should be none. Memory grows in steps where "
+    "a budget does: more steps become affordable, and take their memory once."
 )
 CURVE = "Every budget flies the same frames. What RMS leaves out, refused frames, is in the middle picture."
 TABLE_ONE = (

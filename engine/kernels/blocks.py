@@ -195,7 +195,8 @@ def _write_scores(
     out: FloatImage, block: NDArray[np.floating], model: NDArray[np.floating], inverse_norms: FloatImage
 ) -> None:
     """Write the scores by the transforms of part of a window and of a template, both of one type."""
-    products = own_array("products", block.shape, block.dtype)
+    is_kept = max(block.shape) <= _CACHED_SIDE  # a larger one takes longer to transform than fresh pages do
+    products = own_array("products", block.shape, block.dtype) if is_kept else np.empty_like(block)
     cv2.mulSpectrums(block, model, 0, products, True)
     transform(products, cv2.DFT_INVERSE, out.shape[0])
     if products.dtype != np.float32:

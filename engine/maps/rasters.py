@@ -253,16 +253,16 @@ class GrayReader:
 
     def __init__(self, source: Source, *, find_collar: bool = True) -> None:
         self._source, self._lock = source, threading.Lock()
-        dataset = source.dataset
+        dataset, grid = source.dataset, source.grid  # a copy's file is padded beyond its grid
         self.dtype = dataset.dtypes[0]
         if self.dtype not in DTYPES:
             raise MapError(f"map: expected pixels of {', '.join(DTYPES)}, got {self.dtype} in {source.path}")
         self.levels = stored_levels(source)
         self._bands = [1, 2, 3] if dataset.count >= 3 else [1]
         self._palette = palette_of(dataset)
-        shrink = max(1.0, max(dataset.width, dataset.height) / OVERVIEW_PX)
-        size = (math.ceil(dataset.height / shrink), math.ceil(dataset.width / shrink))
-        data, valid = self._read(Window(0, 0, dataset.width, dataset.height), size)
+        shrink = max(1.0, max(grid.width_px, grid.height_px) / OVERVIEW_PX)
+        size = (math.ceil(grid.height_px / shrink), math.ceil(grid.width_px / shrink))
+        data, valid = self._read(Window(0, 0, grid.width_px, grid.height_px), size)
         self._collars = _collars(data) if find_collar and valid.all() else {}
         for value, area in self._collars.items():
             valid &= ~((data == value).all(axis=0) & area)

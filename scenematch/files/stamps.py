@@ -89,11 +89,13 @@ def _dated(
 def _utc_ns(date: re.Match[str]) -> int | None:
     """Nanoseconds since 1970 of a date; None if there is no such date."""
     zone = "+00:00" if date[4] in (None, "Z", "UTC") else date[4]
+    is_leap = date[2].endswith(":60")  # the second that datetime does not have
     try:
-        time = datetime.fromisoformat(f"{date[1].replace('/', '-')}T{date[2]}{zone}")
+        clock = date[2][:6] + ("59" if is_leap else date[2][6:])
+        time = datetime.fromisoformat(f"{date[1].replace('/', '-')}T{clock}{zone}")
     except ValueError:
         return None
-    stamp_ns = since_1970_ns(time, date[3] or "")
+    stamp_ns = since_1970_ns(time, date[3] or "") + is_leap * 1_000_000_000
     return stamp_ns if 0 <= stamp_ns < 2**63 else None
 
 
