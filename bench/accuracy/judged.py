@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple, TypeVar
@@ -35,6 +35,8 @@ SCORES = {
 }
 GREY, STRUCTURE = "NCC, grey levels", "NCC, structure"
 """Methods for fits: the parts of NCC, of which the second is asked where the first is refused."""
+RISKS = (1e-2, 1e-3, 1e-4)
+"""Of the protection levels that are kept."""
 LOOSE = PoseOptions(min_inliers=4, max_log10_nfa=2.0)  # poses that chance may make, so that there is what to judge
 _PSR_PX = 11.0
 
@@ -55,6 +57,7 @@ class Row(NamedTuple):
     error_m: float
     sigma_m: float
     squared: float  # squared Mahalanobis distance from the truth
+    levels_m: Sequence[float] = ()  # protection levels of what was found, by RISKS
 
 
 class Bench:
@@ -160,13 +163,14 @@ class Bench:
         name, kind = self.here.name, made.kind
         if fix is None:
             return Row(name, kind, method, False, False, [], [], np.inf, np.nan, np.nan)
+        levels_m = [fix.protection_level_m(risk) for risk in RISKS]
         if made.truth_m is None:
-            return Row(name, kind, method, fixed, False, scores, values, np.inf, fix.sigma_m, np.nan)
+            return Row(name, kind, method, fixed, False, scores, values, np.inf, fix.sigma_m, np.nan, levels_m)
         error = self.here.seen_m(fix) - made.truth_m
         error_m = float(np.hypot(*error))
         squared = float(error @ np.linalg.solve(fix.covariance_m2[:2, :2], error))
         right = error_m <= WRONG_M or error_m <= FALSE_SIGMAS * fix.sigma_m
-        return Row(name, kind, method, fixed, right, scores, values, error_m, fix.sigma_m, squared)
+        return Row(name, kind, method, fixed, right, scores, values, error_m, fix.sigma_m, squared, levels_m)
 
 
 def _query(matcher: SceneMatcher, frame: Frame, prior: Prior | None) -> Query:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from bench.accuracy.judged import METHODS, SCORES, Row
+from bench.accuracy.judged import METHODS, RISKS, SCORES, Row
 from bench.accuracy.trials import ANSWERABLE, SUITABLE, UNANSWERABLE, UNSUITABLE
 from bench.pages.text import paragraph, rewrite, table
 from engine.geo import Array
@@ -21,7 +21,6 @@ BEGIN, END = "<!-- bench.accuracy.integrity begins -->", "<!-- bench.accuracy.in
 TPR, COVERAGE = 0.95, 0.75
 THRESHOLDS = (0.93, 0.95, 0.97, 0.98, 0.99, 0.995)
 IN_95 = 5.991  # chi-square of two degrees of freedom that holds 95 %
-RISKS = (1e-2, 1e-3, 1e-4)
 BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0])
 
 
@@ -119,14 +118,13 @@ def _by_risk(rows: list[Row]) -> list[list[str]]:
     out = []
     for method in METHODS:
         fixes = [row for row in _of(rows, method) if row.fixed and row.kind in SUITABLE]
-        left, sigma_m, error_m = np.array([(row.scores[0] - 1.0, row.sigma_m, row.error_m) for row in fixes]).T
         cells = []
-        for risk in RISKS:
-            known = left + risk > 0.0
-            level_m = sigma_m[known] * np.sqrt(-2.0 * np.log(left[known] + risk))
-            beyond, count = int((error_m[known] > level_m).sum()), int(known.sum())
+        for k in range(len(RISKS)):
+            known = [row for row in fixes if np.isfinite(row.levels_m[k])]
+            beyond, count = sum(row.error_m > row.levels_m[k] for row in known), len(known)
             least, most = binomtest(beyond, count).proportion_ci()
-            cells.append(f"{beyond} of {count:,}, {least:.1g} to {most:.1g}, {np.median(level_m):.1f} m")
+            level_m = np.median([row.levels_m[k] for row in known])
+            cells.append(f"{beyond} of {count:,}, {least:.1g} to {most:.1g}, {level_m:.1f} m")
         out.append([method, f"{len(fixes):,}", *cells])
     return out
 
