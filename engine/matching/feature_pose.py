@@ -83,9 +83,10 @@ class FeatureMatcher:
             first = first or result
             if isinstance(result, PoseCandidate):
                 found.append((result, matcher, hypothesis))
-                nats = result.evidence.nats
-                if nats >= query.needed_nats if result is first else is_beyond_doubt(nats, query.risk):
-                    break  # what is found after the telemetry failed may be as wrong as that
+                nats, is_own = result.evidence.nats, result is first
+                # What is found after the telemetry failed may be as wrong as that.
+                if is_beyond_doubt(nats, query.risk) or (is_own and nats >= query.needed_nats):
+                    break
             elif result.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
                 break
         if not found:
@@ -116,8 +117,7 @@ class FeatureMatcher:
         null = replace(self, query=mirrored)._find_with(hypothesis)
         if isinstance(null, NoFix):
             return found
-        evidence = replace(found.evidence, null=null.evidence.surprise)
-        return PoseCandidate(replace(found.fix, confidence=probability(evidence.nats)), evidence)
+        return _candidate(found.fix, replace(found.evidence, null=null.evidence.surprise))
 
     def _attempts(self) -> Iterator[tuple[FeatureMatcher, TelemetryHypothesis]]:
         """Hypotheses to try in turn: the telemetry, the same at the frame's full resolution, then wider ones."""
@@ -252,15 +252,19 @@ class FeatureMatcher:
         else:
             surprise = (stats.log10_tried - stats.log10_nfa) * math.log(10.0)
             rival, tried = 0.0, 10.0**stats.log10_tried
-        evidence = Evidence(surprise, rival, tried, tried, query.prior_chi_square(fix), height_chi_square)
-        return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
+        prior_chi_square = query.prior_chi_square(fix)
+        return _candidate(fix, Evidence(surprise, rival, tried, tried, prior_chi_square, height_chi_square))
+
+
+def _candidate(fix: Fix, evidence: Evidence) -> PoseCandidate:
+    """The candidate of a fix, whose confidence is that of the evidence."""
+    return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
 
 
 def _against(best: PoseCandidate, all_found: list[PoseCandidate]) -> PoseCandidate:
     """The best candidate, with the evidence for any other place against it."""
     others = [each.evidence.nats for each in all_found if not agree_in_place(each.fix, best.fix)]
-    evidence = replace(best.evidence, elsewhere=max([0.0, *others]))
-    return PoseCandidate(replace(best.fix, confidence=probability(evidence.nats)), evidence)
+    return _candidate(best.fix, replace(best.evidence, elsewhere=max([0.0, *others])))
 
 
 def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:

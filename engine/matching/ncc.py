@@ -268,8 +268,7 @@ class Efforts:
         """
         query, (*finer, (coarsest, work)) = self.query, self._works.items()
         is_wide = query.site.is_large and work > MAX_WINDOW_PX
-        is_known = query.telemetry.has_tilt and query.site.has_surface and self._ncc.can_refine(query)
-        if is_wide or not (finer and is_known and query.scheduler.can_afford({coarsest: work})):
+        if is_wide or not (finer and self._can_confirm and query.scheduler.can_afford({coarsest: work})):
             return {}
         if not query.scheduler.can_afford({coarsest: work, _AT_ONCE: float(query.gray.size)}):
             query.scheduler.note_refusal(_AT_ONCE)
@@ -371,8 +370,7 @@ class Efforts:
         query, found = self.query, self._doubtful
         if isinstance(answer, Fix) or found is None or not found.peak.curvature.any():
             return False
-        can_confirm = self._ncc.can_refine(query) and query.telemetry.has_tilt and query.site.has_surface
-        return can_confirm and found.evidence.nats + refined_nats(is_refined=True) >= query.needed_nats
+        return self._can_confirm and found.evidence.nats + refined_nats(is_refined=True) >= query.needed_nats
 
     def _refine_doubtful(self, answer: Result | None, step: Hashable) -> Fix | None:
         """The pose of a refused peak, if it can be refined."""
@@ -382,6 +380,12 @@ class Efforts:
             return None
         self._refused = None
         return refined
+
+    @property
+    def _can_confirm(self) -> bool:
+        """Whether refinement may confirm a place: with a known attitude over a surface model."""
+        query = self.query
+        return query.telemetry.has_tilt and query.site.has_surface and self._ncc.can_refine(query)
 
     @property
     def _refinement(self) -> Refinement:

@@ -304,9 +304,8 @@ class Navigator:
         area_m2 = SEARCHED * about.spread_m2(fix)
         if searched is None or fix.confidence is None:  # without a confidence it has not weighed the prior
             area_m2 = max(area_m2, fix.window.area_px * self._matcher.site.gsd_m_per_px**2)
-        other = None if is_about_given else given
         velocity = self._velocity(frame)
-        return Match(fix, area_m2, frame.height_agl_m, velocity, self._refusals, other, is_about_given)
+        return Match(fix, area_m2, frame.height_agl_m, velocity, self._refusals, given, is_about_given)
 
     def _velocity(self, frame: Frame) -> tuple[Array, float] | None:
         """The frame's velocity and its standard deviation."""

@@ -172,9 +172,8 @@ class Match:
         height_m: above the ground, if known.
         velocity: (2,) m/s told with the frame and its standard deviation; None if none came.
         refusals: frames in a row before it without a fix.
-        given: another source's position, unless it was searched about; it speaks for or against a place that no
-            track predicted.
-        is_about_given: whether it was searched about another source's position, so that the two agree.
+        given: another source's position; it speaks for or against a place that no track predicted.
+        is_about_given: whether it was searched about that position, so that the two agree and it has spoken.
     """
 
     fix: Fix
@@ -194,7 +193,7 @@ class Match:
         """
         most = RELIABLE if self.fix.rests_on_attitude and not self.is_about_given else CERTAIN
         own = min(stated_nats(self.fix) - math.log1p(self.refusals), most)
-        if self.given is None:
+        if self.given is None or self.is_about_given:
             return own
         here = min(self.given.log_likelihood_ratio(self.fix, self.searched_m2), CERTAIN)
         return own + float(np.logaddexp(math.log(RELIABILITY) + here, math.log(1.0 - RELIABILITY)))
