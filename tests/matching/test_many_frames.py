@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.support.threads import called_at_once
 
 from engine import (
     BackendError,
@@ -32,6 +31,7 @@ from engine import (
 from engine.runtime import workers as processes
 from engine.runtime.scheduler import Costs
 from tests.support.fixes import values_of
+from tests.support.threads import called_at_once
 
 PLACES = [np.array([300.0 + 6.0 * k, 290.0 + 4.0 * (k % 3)]) for k in range(6)]
 
