@@ -76,10 +76,12 @@ def is_late(answer: Result | None) -> bool:
 
 
 def _affordable(scheduler: Scheduler, works: Works) -> Hashable | None:
-    """The first variant that time allows; if there is none, the last counts as refused."""
+    """The first variant that time allows, else the last one unless that is hopeless; then it counts as refused."""
     for step, work in works.items():
         if scheduler.can_afford({step: work}):
             return step
+    if works and not scheduler.is_hopeless(step, work):
+        return step
     if works:
         scheduler.note_refusal(step)
     return None

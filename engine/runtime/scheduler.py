@@ -1,7 +1,8 @@
 """The scheduler: times the stages of one frame and decides which steps time allows.
 
 A step's cost is the median processor time of its last runs plus some deviations. Multiplied by the machine's load,
-it must fit into the time left. No single run decides: a step with fewer than two runs is always started.
+it must fit into the time left. No single run decides: a step with fewer than two runs is always started. If a
+frame's last resort does not fit, it is started nevertheless unless even its quickest recent run would be too long.
 """
 
 from __future__ import annotations
@@ -66,7 +67,15 @@ class Costs:
         usual = median_low([used for used, _ in runs])
         bound = self.load() * (usual + DEVIATIONS[has_fix] * median_low([abs(used - usual) for used, _ in runs]))
         bound = min(bound, SEVERAL * median_low([took for _, took in runs]))
-        return bound * max(work, 1.0) * FADE ** self._refusals.get(step, 0)
+        return bound * self._faded(step, work)
+
+    def least_ms(self, step: Hashable, work: float) -> float:
+        """Processor time that a step needs by its quickest recent run; 0 with fewer than two."""
+        runs = tuple(self._runs.get(step, ()))
+        return min(used for used, _ in runs) * self._faded(step, work) if len(runs) > 1 else 0.0
+
+    def _faded(self, step: Hashable, work: float) -> float:
+        return max(work, 1.0) * FADE ** self._refusals.get(step, 0)
 
     def load(self) -> float:
         """Elapsed over processor time of recent stages, without the longest wait; 1 on an idle machine."""
@@ -92,6 +101,10 @@ class Scheduler:
         """Whether time allows successive steps of this work; with a fix, also for one scheduling delay."""
         needed_ms = sum(self.costs.needed_ms(step, work, has_fix=self.has_fix) for step, work in works.items())
         return needed_ms + (self.costs.wait_ms() if self.has_fix else 0.0) <= self.deadline.remaining_ms
+
+    def is_hopeless(self, step: Hashable, work: float) -> bool:
+        """Whether no recent run of a step was quick enough for the time left, or a fix would be at stake."""
+        return self.has_fix or self.costs.least_ms(step, work) > self.deadline.remaining_ms
 
     def note_refusal(self, step: Hashable) -> None:
         """Record that a step was refused for its cost, once a frame."""

@@ -84,6 +84,16 @@ def test_steps_do_not_mix_and_more_work_costs_in_proportion():
     assert costs.needed_ms("other", 30.0) == pytest.approx(30.0)
 
 
+@given(st.lists(RUN, min_size=2, max_size=60), st.floats(1e-3, 1e7), st.booleans())
+def test_the_last_resort_of_a_frame_is_hopeless_only_if_no_recent_run_was_quick_enough(runs, left_ms, has_fix):
+    """However busy the machine was: a refusal for lack of time gains nothing, unless a fix is at stake."""
+    one = Scheduler(Deadline(Budget(total_ms=left_ms), lambda: 0), Device("cpu"), learned(runs))
+    one.has_fix = has_fix
+    for step in "abc":
+        used = [took_ms * share for name, took_ms, share in runs if name == step][-RUNS:]
+        assert one.is_hopeless(step, 1.0) == (has_fix or (len(used) > 1 and min(used) > left_ms))
+
+
 def test_what_is_needed_is_rarely_exceeded():
     rng = np.random.default_rng(0)
     costs, exceeded = Costs(), 0
