@@ -13,7 +13,7 @@ import numpy as np
 from bench.accuracy.trials import Ground, Trial, prior_about, trial
 from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.budget import Budget, Deadline
-from engine.matching.feature_pose import PoseCandidate
+from engine.matching.evidence import Candidate
 from engine.matching.ncc import Ncc
 from engine.matching.peak_evidence import PeakCandidate
 from engine.matching.query import Query
@@ -144,7 +144,7 @@ class Bench:
         query = _query(matcher, frame, prior)
         sift = _part(matcher, "sift", Sift)
         found = sift.find(query, options)
-        fixed = isinstance(found, PoseCandidate) and isinstance(sift.judge(query, found), Fix)
+        fixed = isinstance(found, Candidate) and isinstance(sift.judge(query, found), Fix)
         if isinstance(found, NoFix):
             found = sift.find(replace(query, risk=1.0 - 1e-9), replace(options, pose=LOOSE))
         if isinstance(found, NoFix):

@@ -25,12 +25,10 @@ from engine import MatcherOptions, OrthoMap, Prior
 from engine.budget import Budget, Deadline
 from engine.kernels.scores import SCORES, enhance
 from engine.maps.prepared import PreparedMap
-from engine.matching.acceptance import judge_peak
 from engine.matching.align import to_gray
 from engine.matching.correlation import Aligned, Correlator
 from engine.matching.covariance import score_sigma
-from engine.matching.evidence import Evidence, surprise_of
-from engine.matching.peak_evidence import places_in
+from engine.matching.peak_evidence import candidate_of
 from engine.matching.query import Query
 from engine.ncc_fft import match_template, prepare
 from engine.options import NccOptions
@@ -117,9 +115,8 @@ def search(query: Query, prepared: PreparedMap, options: NccOptions, truth: NDAr
     nadir = site.full_from_level(np.array([peak.x, peak.y]) - aligned.patch.offset_px, level)
     error_m = float(np.hypot(*(site.enu_from_pixel(nadir) - truth)))
     lead = (peak.score - peak.second_score) / score_sigma(pixels)
-    surprise, rival = (surprise_of(score, score_sigma(pixels)) for score in (peak.score, peak.second_score))
-    places = places_in(aligned, window)
-    accepted = judge_peak(peak, Evidence(surprise, rival, places, places, None), RISK) is None
+    found = candidate_of(correlator, aligned, peak, window)
+    accepted = found.is_inside and replace(found.evidence, prior_chi_square=None).suffices(RISK)
     return Trial(error_m, lead if error_m <= WRONG_M else -lead, accepted)
 
 

@@ -1,6 +1,6 @@
-"""Acceptance: whether a peak or a pose has enough evidence, or why to refuse it; and whether estimates agree.
+"""Acceptance: why a peak or a pose without enough evidence is refused, and whether estimates agree.
 
-The evidence for the match and the allowed risk decide, see :mod:`engine.matching.evidence`.
+The evidence for the match and the allowed risk decide (:meth:`engine.matching.evidence.Evidence.suffices`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from engine.geo import chi_square, chi_square_of
 from engine.matching.evidence import Evidence, needed_nats, probability
-from engine.values import Fix, Peak, Reason
+from engine.values import Fix, Reason
 
 Array = NDArray[np.float64]
 
@@ -23,37 +23,39 @@ Refusal = tuple[Reason, str]
 """Why a match is not accepted, and the figures behind it."""
 
 
-def judge_peak(peak: Peak, evidence: Evidence, risk: float, *, is_tested: bool = True) -> Refusal | None:
-    """The reason to refuse a correlation peak, or None if it is accepted.
+def edge_refusal(score: float) -> Refusal:
+    """Of a correlation peak at the edge of its window.
 
     Args:
-        peak: the peak.
+        score: of the peak.
+    """
+    return Reason.AMBIGUOUS, f"NCC {score:.3f} still rises at the window's edge"
+
+
+def peak_refusal(score: float, evidence: Evidence, risk: float) -> Refusal:
+    """Why the evidence for a correlation peak does not suffice.
+
+    Args:
+        score: of the peak.
         evidence: for it.
         risk: allowed probability of a wrong fix.
-        is_tested: whether the evidence was tested by the null hypothesis.
     """
-    if not peak.curvature.any():
-        return Reason.AMBIGUOUS, f"NCC {peak.score:.3f} still rises at the window's edge"
-    if is_tested and evidence.nats >= needed_nats(risk):
-        return None
-    sigmas, rival = (math.sqrt(2.0 * surprise) for surprise in (evidence.surprise, evidence.rival))
-    if replace(evidence, rival=0.0, prior_chi_square=None).nats < needed_nats(risk):
-        return Reason.LOW_SCORE, f"best NCC {peak.score:.3f}, {sigmas:.1f} sigmas, may be chance"
+    sigmas, rival = (math.sqrt(2.0 * surprise) for surprise in (evidence.surprise, evidence.chance))
+    if replace(evidence, rival=0.0, null=0.0, prior_chi_square=None).nats < needed_nats(risk):
+        return Reason.LOW_SCORE, f"best NCC {score:.3f}, {sigmas:.1f} sigmas, may be chance"
     figures = f"NCC {sigmas:.1f} sigmas, rival at {rival:.1f}, {_known(evidence)}"
-    if not is_tested:
+    if not evidence.is_tested:
         return Reason.UNCONFIRMED, f"found by a search, not confirmed by the structure about the place ({figures})"
     return Reason.AMBIGUOUS, f"{_wrong(evidence.nats, risk)} ({figures})"
 
 
-def judge_pose(evidence: Evidence, risk: float) -> Refusal | None:
-    """The reason to refuse a pose by matched features, or None if it is accepted.
+def pose_refusal(evidence: Evidence, risk: float) -> Refusal:
+    """Why the evidence for a pose by matched features does not suffice.
 
     Args:
         evidence: for it.
         risk: allowed probability of a wrong fix.
     """
-    if evidence.nats >= needed_nats(risk):
-        return None
     by_chance = f"by chance once in 10^{evidence.surprise / math.log(10):.1f}"
     wrong = _wrong(evidence.nats, risk)
     if replace(evidence, null=0.0).nats >= needed_nats(risk):

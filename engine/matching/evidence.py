@@ -10,7 +10,8 @@ measured once for all.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +48,12 @@ class Evidence:
         prior_chi_square: of the position against the prior, with two degrees of freedom; None without a prior.
         height_chi_square: of the height against the telemetry's, with one degree of freedom; None if it was not
             measured, or the telemetry's is unknown or doubted.
-        null: the surprise of the mirrored frame; 0 if it was not matched, or is among the rivals.
+        null: the surprise of the null hypothesis, the mirrored frame; 0 if it was not matched, or is a rival.
         elsewhere: the evidence for the best other place that another attempt found.
+        is_tested: whether the null hypothesis was tested, or would change nothing. A score maximised by a fit of
+            heading and height is no evidence until the structure around the place confirms it.
+        refined: whether the pose of a known attitude could be refined there over a surface; None if that was not
+            tried, or says nothing.
     """
 
     surprise: float
@@ -59,14 +64,42 @@ class Evidence:
     height_chi_square: float | None = None
     null: float = 0.0
     elsewhere: float = 0.0
+    is_tested: bool = True
+    refined: bool | None = None
+
+    @property
+    def chance(self) -> float:
+        """The surprise that chance reached: of the rival or of the null hypothesis."""
+        return max(self.rival, self.null)
 
     @property
     def nats(self) -> float:
-        """What was seen, by how much places look alike, and what was known before; without any refinement."""
-        alike = max(1.0, min(max(self.rival, self.null), self.surprise) / math.log(self.measured))
+        """What was seen, by how much places look alike; what was known before; and what refinement said."""
+        alike = max(1.0, min(self.chance, self.surprise) / math.log(self.measured))
         seen = self.surprise / alike - math.log(self.tried)
         known = _of_position(self.prior_chi_square) + _of_height(self.height_chi_square)
-        return max(seen, 0.0) + known - self.elsewhere
+        return max(seen, 0.0) + known - self.elsewhere + _of_refinement(self.refined)
+
+    def suffices(self, risk: float) -> bool:
+        """Whether a fix may be handed out: it is wrong with at most this probability."""
+        return self.is_tested and self.nats >= needed_nats(risk)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A fix that has not been accepted yet.
+
+    Attributes:
+        fix: that it gives if accepted, with its probability.
+        evidence: for it.
+    """
+
+    fix: Fix
+    evidence: Evidence
+
+    def weighed(self, evidence: Evidence) -> Self:
+        """The candidate by other evidence."""
+        return replace(self, evidence=evidence, fix=replace(self.fix, confidence=probability(evidence.nats)))
 
 
 def independent_places(positions: float) -> float:
@@ -108,10 +141,12 @@ def _gaussian(chi_square: float) -> float:
     return RELIABILITY * math.exp(-0.5 * min(chi_square, 1e3))
 
 
-def refined_nats(*, is_refined: bool) -> float:
+def _of_refinement(refined: bool | None) -> float:
     """Evidence for a place by whether the pose of a known attitude can be refined there over a surface model."""
     right, wrong = _REFINED_RIGHT, _REFINED_WRONG
-    return math.log(right / wrong) if is_refined else math.log((1.0 - right) / (1.0 - wrong))
+    if refined is None:
+        return 0.0
+    return math.log(right / wrong) if refined else math.log((1.0 - right) / (1.0 - wrong))
 
 
 def probability(nats: float) -> float:

@@ -11,9 +11,9 @@ from engine.maps.prepared import PreparedMap
 from engine.maps.samples import SampleMap
 from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.matching import hypothesis_search
-from engine.matching.acceptance import agree_in_place, judge_peak, offset_between_m
+from engine.matching.acceptance import agree_in_place, edge_refusal, offset_between_m, peak_refusal
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
-from engine.matching.evidence import is_beyond_doubt, refined_nats
+from engine.matching.evidence import is_beyond_doubt
 from engine.matching.explanation import Explanation, explain_correlation
 from engine.matching.ladder import Rung, Works, climb, is_coarse, is_late, rehearse
 from engine.matching.method import Method
@@ -157,16 +157,18 @@ class Ncc(Method):
         found = candidate_of(correlator, aligned, peak, window, searched=searched, tried=tried)
         if is_window:
             return null_tested(correlator, found)
-        return replace(found, is_tested=not searched and is_beyond_doubt(found.evidence.nats, query.risk))
+        is_tested = not searched and is_beyond_doubt(found.evidence.nats, query.risk)
+        return found.weighed(replace(found.evidence, is_tested=is_tested))
 
     def judge(self, query: Query, found: PeakCandidate | NoFix) -> Result:
-        """The fix if there is a peak and it is accepted, else a refusal."""
+        """The fix if there is a peak with enough evidence, else a refusal."""
         if isinstance(found, NoFix):
             return found
-        refusal = judge_peak(found.peak, found.evidence, query.risk, is_tested=found.is_tested)
-        if refusal is not None:
-            return query.refuse(*refusal, METHOD, score=found.peak.score, window=found.fix.window)
-        return found.fix
+        peak, evidence = found.peak, found.evidence
+        if found.is_inside and evidence.suffices(query.risk):
+            return found.fix
+        why = peak_refusal(peak.score, evidence, query.risk) if found.is_inside else edge_refusal(peak.score)
+        return query.refuse(*why, METHOD, score=peak.score, window=found.fix.window)
 
     def match_structure(self, query: Query, found: PeakCandidate, window: Window) -> PeakCandidate | None:
         """The highest peak by structure as well, see :mod:`engine.matching.structure`.
@@ -184,7 +186,7 @@ class Ncc(Method):
 
     def surroundings(self, query: Query, found: PeakCandidate) -> Window:
         """The window to match structure in: the first one's; after a search, the surroundings of the place."""
-        if found.is_tested:
+        if found.evidence.is_tested:
             return found.fix.window
         place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
         return self._correlator(replace(query, prior=place)).window(found.aligned) or found.fix.window
@@ -224,6 +226,7 @@ class Efforts:
 
     def __init__(self, ncc: Ncc, query: Query) -> None:
         self.query, self._ncc = query, ncc
+        self._accepted: PeakCandidate | None = None  # the peak of the answer
         self._refused: PeakCandidate | None = None  # the newest peak, if it was not accepted
         self._is_new = False  # whether its structure was not matched yet
         self._refusal: NoFix | None = None  # of the frame at its own heading and height
@@ -312,7 +315,7 @@ class Efforts:
         result = self._ncc.judge(query, again)
         if isinstance(result, NoFix):
             return None
-        self.query, self._refused = query.at(again.aligned.pose), None
+        self.query, self._refused, self._accepted = query.at(again.aligned.pose), None, again
         return result
 
     def _judged(
@@ -323,12 +326,12 @@ class Efforts:
         result = self._ncc.judge(query, found)
         if isinstance(result, NoFix):
             self._refusal = replace(result, match=None if isinstance(first, NoFix) else first.fix)
-            if isinstance(found, PeakCandidate) and found.is_tested:
+            if isinstance(found, PeakCandidate) and found.evidence.is_tested:
                 self._doubtful = found  # structure's, if it was matched: it sees what grey levels see, and more
             return None if isinstance(answer, Fix) else self._refusal
         assert isinstance(found, PeakCandidate)
         assert height_m is not None
-        self._refused = None
+        self._refused, self._accepted = None, found
         if found.aligned.level == query.level_of(height_m):
             return result
         result = replace(result, stage="coarse")
@@ -360,22 +363,23 @@ class Efforts:
     def _refine(self, answer: Result | None, step: Hashable) -> Result:
         """The pose of a fine peak refined."""
         assert isinstance(answer, Fix)
-        return self._refinement.refine(answer)
+        assert self._accepted is not None  # a fine peak was
+        return self._refinement.refine(replace(self._accepted, fix=answer))
 
     def _is_refinable(self, answer: Result | None) -> bool:
         return isinstance(answer, Fix) and answer.stage == "fine" and self._ncc.can_refine(self.query)
 
     def _is_doubtful(self, answer: Result | None) -> bool:
         """Whether a refused peak lacks no more evidence than a refined pose over a surface model gives."""
-        query, found = self.query, self._doubtful
-        if isinstance(answer, Fix) or found is None or not found.peak.curvature.any():
+        found = self._doubtful
+        if isinstance(answer, Fix) or found is None or not found.is_inside or not self._can_confirm:
             return False
-        return self._can_confirm and found.evidence.nats + refined_nats(is_refined=True) >= query.needed_nats
+        return replace(found.evidence, refined=True).suffices(self.query.risk)
 
     def _refine_doubtful(self, answer: Result | None, step: Hashable) -> Fix | None:
         """The pose of a refused peak, if it can be refined."""
         assert self._doubtful is not None  # or it was not offered
-        refined = self._refinement.refine(self._doubtful.fix)
+        refined = self._refinement.refine(self._doubtful)
         if isinstance(refined, NoFix):
             return None
         self._refused = None

@@ -14,6 +14,7 @@ from engine.matching.covariance import (
     score_sigma,
 )
 from engine.matching.evidence import (
+    Candidate,
     Evidence,
     independent_places,
     is_beyond_doubt,
@@ -25,25 +26,23 @@ from engine.values import Fix, Peak, Window
 
 
 @dataclass(frozen=True, slots=True)
-class PeakCandidate:
-    """A peak that has not been accepted yet.
+class PeakCandidate(Candidate):
+    """The fix of a correlation peak.
 
     Attributes:
         peak: in pixels of the aligned level.
         aligned: the hypothesis that it belongs to.
-        fix: the fix that the peak gives if accepted, with its probability.
-        evidence: for it.
         searched: whether heading and height were fitted to the picture.
-        is_tested: whether the null hypothesis is among its rivals, or would change nothing. A score maximised by a
-            fit is no evidence until the structure around the place confirms it.
     """
 
     peak: Peak
     aligned: Aligned
-    fix: Fix
-    evidence: Evidence
     searched: bool
-    is_tested: bool
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether it is a summit, and no slope at the window's edge."""
+        return bool(self.peak.curvature.any())
 
 
 def early_stop(correlator: Correlator, aligned: Aligned, window: Window) -> EarlyStop:
@@ -89,9 +88,10 @@ def candidate_of(
     sigma = score_sigma(rows * columns) if sigma is None else sigma
     measured = places_in(aligned, window)
     surprise, rival = surprise_of(peak.score, sigma), surprise_of(peak.second_score, sigma)
-    evidence = Evidence(surprise, rival, measured, max(tried, measured), query.prior_chi_square(fix))
+    off = query.prior_chi_square(fix)
+    evidence = Evidence(surprise, rival, measured, max(tried, measured), off, is_tested=is_tested)
     fix = replace(fix, confidence=probability(evidence.nats))
-    return PeakCandidate(peak, aligned, fix, evidence, searched, is_tested)
+    return PeakCandidate(fix, evidence, peak, aligned, searched)
 
 
 def places_in(aligned: Aligned, window: Window) -> float:
@@ -105,15 +105,12 @@ def places_in(aligned: Aligned, window: Window) -> float:
 def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
     """The candidate; unless beyond doubt, compared with its frame upside down and mirrored."""
     query, peak, aligned, window = correlator.query, found.peak, found.aligned, found.fix.window
-    if is_beyond_doubt(found.evidence.nats, query.risk):
-        return replace(found, is_tested=True)
-    matters = found.evidence.nats >= query.needed_nats
+    evidence = replace(found.evidence, is_tested=True)
+    if is_beyond_doubt(evidence.nats, query.risk):
+        return found.weighed(evidence)
+    matters = evidence.nats >= query.needed_nats
     null_score = _null_score(correlator, aligned, window, peak.second_score, matters=matters)
-    peak = replace(peak, second_score=max(peak.second_score, null_score))
-    rival = surprise_of(peak.second_score, score_sigma(aligned.template.size))
-    evidence = replace(found.evidence, rival=rival)
-    fix = replace(found.fix, confidence=probability(evidence.nats))
-    return replace(found, peak=peak, fix=fix, evidence=evidence, is_tested=True)
+    return found.weighed(replace(evidence, null=surprise_of(null_score, score_sigma(aligned.template.size))))
 
 
 def _null_score(

@@ -27,7 +27,7 @@ from engine.maps.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
 from engine.matching.acceptance import CHANCE, agree_in_height, are_consistent
 from engine.matching.align import shrink
 from engine.matching.covariance import tilt_covariance
-from engine.matching.evidence import nats_of, probability, refined_nats
+from engine.matching.evidence import Candidate, probability
 from engine.matching.oblique import is_oblique
 from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
@@ -76,17 +76,17 @@ class Refinement:
     options: NccOptions
     knows_tilt: bool = True
 
-    def refine(self, fix: Fix) -> Fix | NoFix:
-        """The fix with its whole pose refined, or a less certain one, or a refusal.
+    def refine(self, found: Candidate) -> Fix | NoFix:
+        """The fix of a candidate with its whole pose refined, or a less certain one, or a refusal.
 
         If the picture hardly confirms the telemetry's attitude, the pose is refined once more as if roll and pitch
         were hardly known; the result counts if the picture confirms it. An attitude that it does not confirm
         counts only if the position agrees with the prior. If roll and pitch are unknown, the picture must
         determine them over a surface model. Without one, where relief may be the reason, the fix stays as it was.
         """
-        query, has_tilt = self.query, self.query.telemetry.has_tilt
+        query, has_tilt, fix = self.query, self.query.telemetry.has_tilt, found.fix
         if has_tilt and query.site.has_surface:
-            return self._over_surface(fix)
+            return self._over_surface(found)
         refined = self._through_all(fix)
         if _is_confirmed(refined):
             return refined
@@ -97,12 +97,13 @@ class Refinement:
         detail = "roll and pitch are unknown, and the picture does not determine them"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
-    def _over_surface(self, fix: Fix) -> Fix | NoFix:
+    def _over_surface(self, found: Candidate) -> Fix | NoFix:
         """The same for a known attitude over a surface model, where a pose that can be refined is evidence.
 
         Of an oblique frame it often cannot be at right places as well, so that says nothing.
         """
-        query, refined = self.query, self._through_all(fix)
+        query, fix, evidence = self.query, found.fix, found.evidence
+        refined = self._through_all(fix)
         if not _is_confirmed(refined):
             try:
                 refined = self._doubting()._through_all(fix) or refined
@@ -111,14 +112,13 @@ class Refinement:
                     raise
         attitude = query.telemetry.grid_attitude
         assert attitude is not None  # a fix by correlation had one
-        assert fix.confidence is not None
-        nats = nats_of(fix.confidence)
         if refined or not is_oblique(query, attitude):
-            nats += refined_nats(is_refined=refined is not None)
-        if nats < query.needed_nats:
-            detail = f"wrong with probability {1.0 - probability(nats):.1g}: the pose cannot be refined there"
+            evidence = replace(evidence, refined=refined is not None)
+        likely = probability(evidence.nats)
+        if not evidence.suffices(query.risk):
+            detail = f"wrong with probability {1.0 - likely:.1g}: the pose cannot be refined there"
             return fix.refused(Reason.AMBIGUOUS, detail)
-        weighed = replace(refined or fix, confidence=probability(nats))
+        weighed = replace(refined or fix, confidence=likely)
         return weighed if _is_confirmed(refined) else self._unconfirmed(weighed)
 
     def _unconfirmed(self, fix: Fix) -> Fix | NoFix:

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import partial
+from typing import TypeGuard
 
 from engine.features import chosen_backend, prepare_plans
 from engine.maps.landmarks import LandmarkMap
 from engine.maps.prepared import enhanced_part
 from engine.maps.samples import SampleMap
 from engine.matching.align import SIDE_STEP_PX
-from engine.matching.evidence import is_beyond_doubt
+from engine.matching.evidence import Candidate
 from engine.matching.explanation import Explanation, explain_features
-from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher, PoseCandidate
+from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher
 from engine.matching.ladder import SHARES, Rung, Works, climb, rehearse
 from engine.matching.method import Method
 from engine.matching.query import Query
@@ -120,7 +121,7 @@ class Sift(Method):
         scale = coarser_scale(query, height_m, self.options.scale)
         return None if scale is None else replace(self._few, scale=scale)
 
-    def find_few(self, query: Query, options: SiftOptions) -> PoseCandidate | NoFix:
+    def find_few(self, query: Query, options: SiftOptions) -> Candidate | NoFix:
         """The pose by half as many keypoints, a level coarser and not upsampled."""
         return FeatureMatcher(query, self.landmarks, options).find_at_once()
 
@@ -144,7 +145,7 @@ class Sift(Method):
         """The matches in a window at the frame's own height and heading."""
         return explain_features(FeatureMatcher(query, self.landmarks, self.options), window)
 
-    def find(self, query: Query, options: SiftOptions | None = None) -> PoseCandidate | NoFix:
+    def find(self, query: Query, options: SiftOptions | None = None) -> Candidate | NoFix:
         """The pose of one frame, or a refusal if there is none.
 
         Args:
@@ -153,7 +154,7 @@ class Sift(Method):
         """
         return FeatureMatcher(query, self.landmarks, options or self.options).find()
 
-    def judge(self, query: Query, found: PoseCandidate | NoFix) -> Result:
+    def judge(self, query: Query, found: Candidate | NoFix) -> Result:
         """The fix if there is a pose and it is accepted, else a refusal."""
         return FeatureMatcher(query, self.landmarks, self.options).judge(found)
 
@@ -186,8 +187,7 @@ class Efforts:
 
     def __init__(self, sift: Sift, query: Query, agrees: Callable[[Fix], bool] | None = None) -> None:
         self._sift, self._query, self._agrees = sift, query, agrees
-        self._few: Fix | None = None
-        self._is_certain = False  # whether few features are so much evidence that no null hypothesis is needed
+        self._few: Candidate | None = None
         self._few_options = sift.few_options(query)
         self._is_settled = self._is_unrefinable = False
         self._works, frame_px = sift.works(query), float(query.gray.size)
@@ -210,9 +210,9 @@ class Efforts:
 
         Few features of a coarse picture follow the telemetry's attitude.
         """
-        if answer is not self._few or self._is_settled:
+        if not self._is_by_few(answer) or self._is_settled:
             return answer
-        return replace(with_unconfirmed_tilt(self._query, self._few), stage="coarse")
+        return replace(with_unconfirmed_tilt(self._query, answer), stage="coarse")
 
     # ------------------------------------------------------------------------------------------------ rungs
 
@@ -234,18 +234,19 @@ class Efforts:
         found = self._sift.find_few(self._query, self._few_options)
         if isinstance(found, NoFix) or found.evidence.nats < self._query.needed_nats:
             return None
-        self._few, self._is_certain = found.fix, is_beyond_doubt(found.evidence.nats, self._query.risk)
-        if not self._is_certain or (self._agrees and not self._agrees(found.fix)):
+        self._few = found
+        if not found.evidence.suffices(self._query.risk) or (self._agrees and not self._agrees(found.fix)):
             return None
         self._is_settled = self._agrees is not None
         return found.fix
 
     def _refine_few(self, answer: Result | None, step: Hashable) -> Fix | None:
-        """The fix by few features refined, if it is beyond doubt or the picture confirms it."""
+        """The fix by few features refined, if they suffice or the picture confirms it."""
         assert self._few is not None  # or it was not offered
-        refined = self._sift.refined(self._query, self._few)
+        refined = self._sift.refined(self._query, self._few.fix)
         self._is_unrefinable = refined is None
-        if refined is None or not (self._is_certain or refined.score >= CONFIRMING_CORRELATION):
+        suffices = self._few.evidence.suffices(self._query.risk)
+        if refined is None or not (suffices or refined.score >= CONFIRMING_CORRELATION):
             return None
         self._is_settled = True
         return refined
@@ -259,10 +260,13 @@ class Efforts:
         is_done = self._is_settled or self._is_unrefinable or self._agrees is not None
         return (
             isinstance(answer, Fix)
-            and answer is not self._few
+            and not self._is_by_few(answer)
             and not is_done
             and self._sift.can_refine(self._query)
         )
+
+    def _is_by_few(self, answer: Result | None) -> TypeGuard[Fix]:
+        return self._few is not None and answer is self._few.fix
 
     def _refine(self, answer: Result | None, step: Hashable) -> Fix | None:
         """The fix by all features refined."""

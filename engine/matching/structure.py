@@ -49,7 +49,7 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
         return None
     peak = find_peak(scores[0], exclusion_px=correlator.exclusion_px(aligned.level))
     rival = max(peak.second_score, float(chance.max()))
-    if not found.is_tested and found.peak.score > 0.0:  # only the search knows the rest of the map
+    if not found.evidence.is_tested and found.peak.score > 0.0:  # only the search knows the rest of the map
         rival = max(rival, found.peak.second_score / found.peak.score * peak.score)
     own = candidate_of(
         correlator,

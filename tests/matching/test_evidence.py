@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engine import Reason
-from engine.matching.acceptance import judge_peak, judge_pose
+from engine.matching.acceptance import peak_refusal, pose_refusal
 from engine.matching.evidence import (
     Evidence,
     independent_places,
@@ -21,7 +21,6 @@ from engine.matching.evidence import (
     probability,
     surprise_of,
 )
-from engine.values import Peak
 from tests.support.fixes import a_fix
 
 PLAIN = Evidence(40.0, 8.0, 1000.0, 1000.0, 2.0, 1.0)
@@ -69,7 +68,7 @@ def test_a_probability_tells_its_evidence(nats):
 @given(st.floats(1e-12, 0.5), st.floats(0, 300), known, known)
 def test_what_is_handed_out_is_wrong_with_no_more_than_the_risk(risk, surprise, prior, height):
     evidence = Evidence(surprise, 0.0, 1000.0, 1000.0, prior, height)
-    handed_out = judge_pose(evidence, risk) is None
+    handed_out = evidence.suffices(risk)
     assert handed_out == (evidence.nats >= needed_nats(risk))
     if handed_out and evidence.nats < 30.0:
         assert 1.0 - probability(evidence.nats) <= risk * (1 + 1e-6) + 1e-15
@@ -77,17 +76,17 @@ def test_what_is_handed_out_is_wrong_with_no_more_than_the_risk(risk, surprise, 
 
 def test_a_refusal_of_a_pose_tells_its_figures():
     weak = Evidence(3.5 * math.log(10.0), 0.0, 1000.0, 1000.0, None)
-    reason, text = judge_pose(weak, 1e-4)
+    assert not weak.suffices(1e-4)
+    reason, text = pose_refusal(weak, 1e-4)
     assert reason is Reason.BAD_POSE
     for figure in ("0.0001 is allowed", "10^3.5", "rival once in 10^0.0", "chi-square unknown"):
         assert figure in text
-    assert "chi-square 3.2" in judge_pose(replace(weak, prior_chi_square=3.2), 1e-4)[1]
+    assert "chi-square 3.2" in pose_refusal(replace(weak, prior_chi_square=3.2), 1e-4)[1]
 
 
 # ------------------------------------------------------------------------------------------------------- peaks
 
 PEAK = Evidence(32.0, 10.0, 1000.0, 1000.0, 2.0)
-SHARP = Peak(10.0, 12.0, 0.8, 0.2, -0.02 * np.eye(2))
 
 
 def test_the_best_of_many_places_is_worth_what_chance_makes_of_so_many():
@@ -143,17 +142,21 @@ def test_a_place_is_held_against_the_errors_of_both():
     ],
 )
 def test_a_peak_is_believed_if_the_risk_allows_it(evidence, risk, reason):
-    verdict = judge_peak(SHARP, evidence, risk)
-    assert (verdict and verdict[0]) is reason
-    if verdict:
-        assert f"{math.sqrt(2.0 * evidence.surprise):.1f}" in verdict[1]  # the figures behind the reason
-
-
-def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_not_believed():
-    reason, _ = judge_peak(Peak(10.0, 12.0, 0.9, -1.0, np.zeros((2, 2))), PEAK, 0.5)
-    assert reason is Reason.AMBIGUOUS
+    assert evidence.suffices(risk) == (reason is None)
+    if reason is not None:
+        why, figures = peak_refusal(0.8, evidence, risk)
+        assert why is reason
+        assert f"{math.sqrt(2.0 * evidence.surprise):.1f}" in figures
 
 
 def test_what_a_search_fitted_waits_for_the_structure_about_the_place():
-    reason, _ = judge_peak(SHARP, replace(PEAK, surprise=1250.0), 1e-4, is_tested=False)
-    assert reason is Reason.UNCONFIRMED
+    searched = replace(PEAK, surprise=1250.0, is_tested=False)
+    assert not searched.suffices(1e-4)
+    assert peak_refusal(0.8, searched, 1e-4)[0] is Reason.UNCONFIRMED
+
+
+def test_a_pose_that_can_be_refined_is_evidence_for_its_place_and_one_that_cannot_against_it():
+    right, unknown, wrong = (replace(PLAIN, refined=refined).nats for refined in (True, None, False))
+    assert right > unknown > wrong
+    assert math.exp(right - unknown) == pytest.approx(0.98 / 0.04)
+    assert math.exp(wrong - unknown) == pytest.approx(0.02 / 0.96)

@@ -149,7 +149,7 @@ def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_coarser_level(
 ):
     """And no level is correlated twice."""
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
-    monkeypatch.setattr(Refinement, "refine", lambda _self, fix: fix)
+    monkeypatch.setattr(Refinement, "refine", lambda _self, found: found.fix)
     correlated, find = [], Ncc.find
 
     def noted(self, query, *, coarser=0, **options):

@@ -1,13 +1,14 @@
 """A telemetry whose roll and pitch are wrong: the picture outweighs it, by each method."""
 
 import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from engine import Fix, NoFix, Reason, SceneMatcher
-from engine.matching.evidence import Evidence, probability, refined_nats
+from engine.matching.evidence import Evidence, probability
 from engine.matching.ncc import Ncc
 from engine.matching.refinement import Refinement
 from engine.runtime.scheduler import OutOfTime
@@ -97,7 +98,8 @@ def test_whether_the_pose_can_be_refined_speaks_for_or_against_the_place(
 ):
     """The usual risk asks for 9.2 nats: less is made up for, and a little more is not enough where it fails."""
     refined = (lambda _, fix: replace(fix, stage="refined", score=0.9)) if is_refined else lambda _self, _fix: None
-    monkeypatch.setattr(Evidence, "nats", nats)
+    says = {None: 0.0, True: math.log(0.98 / 0.04), False: math.log(0.02 / 0.96)}
+    monkeypatch.setattr(Evidence, "nats", property(lambda evidence: nats + says[evidence.refined]))
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
     monkeypatch.setattr(Refinement, "_through_all", refined)
     monkeypatch.setattr("engine.matching.refinement.is_oblique", lambda *_: is_oblique)
@@ -107,8 +109,8 @@ def test_whether_the_pose_can_be_refined_speaks_for_or_against_the_place(
         assert isinstance(answer, NoFix)
         return
     assert answer.stage == stage
-    says = 0.0 if is_oblique and not is_refined else refined_nats(is_refined=is_refined)
-    assert answer.confidence == pytest.approx(probability(nats + says))
+    heard = None if is_oblique and not is_refined else is_refined
+    assert answer.confidence == pytest.approx(probability(nats + says[heard]))
 
 
 def test_a_refined_pose_does_not_stand_for_the_structure_that_a_search_must_show(
