@@ -17,7 +17,6 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from engine.errors import MapError
-from engine.maps import xyz_tiles
 
 SIGNATURES = (
     ("GTiff", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
@@ -103,8 +102,6 @@ def openable(path: Path, argument: str) -> tuple[str | Path, str]:
     Raises:
         MapError: it is not a raster, or its tiles do not fit together.
     """
-    if path.is_dir() and xyz_tiles.is_tile_cache(path):
-        return xyz_tiles.description_of(path, argument), xyz_tiles.DRIVER
     if path.is_dir():
         return vrt_of_folder(path, argument), "VRT"
     driver = driver_of(path, argument)
@@ -123,7 +120,8 @@ def vrt_of_folder(folder: Path, argument: str) -> str:
     tiles = [_read_tile(file, driver, argument) for file, driver in _rasters_in(folder)]
     if not tiles:
         raise MapError(
-            f"{argument}: expected raster files in the folder {folder}, or tiles as z/x/y.png below it, found none"
+            f"{argument}: expected georeferenced raster files in the folder {folder}, found none; "
+            "of web tiles (z/x/y.png) give MBTiles or a GeoTIFF"
         )
     first = tiles[0]
     for tile in tiles[1:]:

@@ -172,6 +172,14 @@ def test_a_vrt_that_does_more_than_to_lay_local_files_side_by_side_is_refused(tm
     assert re.search(words, refusal(OrthoMap.open, tmp_path / "map.vrt", error=MapError))
 
 
+def test_a_folder_of_web_tiles_is_refused_with_what_to_give_instead(tmp_path):
+    (tmp_path / "18" / "143000").mkdir(parents=True)
+    (tmp_path / "18" / "143000" / "90500.png").write_bytes(b"\x89PNG")
+    (tmp_path / "leaflet.html").write_text("a viewer")
+    words = r"expected georeferenced raster files in the folder .*, found none; .* give MBTiles or a GeoTIFF"
+    assert re.search(words, refusal(OrthoMap.open, tmp_path, error=MapError))
+
+
 # ------------------------------------------------------------------------------------ MBTiles and GeoPackages
 
 
