@@ -1,7 +1,7 @@
-"""Raster files that may be opened: a local file by its first bytes, a folder of tiles or a VRT as one picture.
+"""Raster files that may be opened: a local file by its first bytes, or a folder of tiles as one picture.
 
-A folder of tiles becomes the text of a VRT, GDAL's mosaic format. A user's VRT is read too, after a check that it
-refers only to local raster files.
+A folder of tiles becomes the text of a VRT, GDAL's mosaic format. A user's VRT is not read: it could warp, compute
+and fetch.
 """
 
 from __future__ import annotations
@@ -37,14 +37,6 @@ OWN_TAGS = "SCENEMATCH_"
 OFF_GRID_PX = 0.05
 """Largest offset of a tile from whole pixels of the first tile's grid; a larger one would need resampling."""
 _VRT_HEAD = b"<VRTDataset"
-_VRT_TAGS = frozenset(
-    (
-        *("VRTDataset", "SRS", "GeoTransform", "Metadata", "MDI", "OverviewList", "MaskBand"),
-        *("VRTRasterBand", "Description", "NoDataValue", "ColorInterp", "ColorTable", "Entry", "Offset", "Scale"),
-        *("UnitType", "SimpleSource", "ComplexSource", "SourceFilename", "SourceBand", "SourceProperties"),
-        *("SrcRect", "DstRect", "NODATA", "UseMaskBand"),
-    )
-)
 DTYPES = {"uint8": "Byte", "uint16": "UInt16", "int16": "Int16", "float32": "Float32", "float64": "Float64"}
 """Element types of a map, with GDAL's names."""
 
@@ -80,7 +72,7 @@ def local_path(path: str | os.PathLike[str], argument: str) -> Path:
 
 
 def driver_of(file: Path, argument: str) -> str:
-    """GDAL's driver for a file, or "VRT".
+    """GDAL's driver for a file.
 
     Raises:
         MapError: its format is not supported.
@@ -91,24 +83,22 @@ def driver_of(file: Path, argument: str) -> str:
         if head.startswith(starts):
             return "GPKG" if driver == "MBTiles" and head[_GEOPACKAGE[0]] in _GEOPACKAGE[1] else driver
     if _VRT_HEAD in head:
-        return "VRT"
-    formats = ", ".join([*(driver for driver, _ in SIGNATURES), "GPKG", "VRT"])
+        raise MapError(
+            f"{argument}: expected no VRT, got {file}; give its folder of tiles, or a GeoTIFF by gdal_translate"
+        )
+    formats = ", ".join([*(driver for driver, _ in SIGNATURES), "GPKG"])
     raise MapError(f"{argument}: expected a raster file ({formats}), got {file}, which is none of these")
 
 
 def openable(path: Path, argument: str) -> tuple[str | Path, str]:
-    """What to give GDAL for a file or folder, the file itself or a description of the folder; and the driver.
+    """What to give GDAL for a file or folder, the file itself or the text of a VRT; and the driver.
 
     Raises:
         MapError: it is not a raster, or its tiles do not fit together.
     """
     if path.is_dir():
         return vrt_of_folder(path, argument), "VRT"
-    driver = driver_of(path, argument)
-    return (_vrt_of_file(path, argument), driver) if driver == "VRT" else (path, driver)
-
-
-# ------------------------------------------------------------------------------------------ a folder of tiles
+    return path, driver_of(path, argument)
 
 
 def vrt_of_folder(folder: Path, argument: str) -> str:
@@ -126,14 +116,11 @@ def vrt_of_folder(folder: Path, argument: str) -> str:
     first = tiles[0]
     for tile in tiles[1:]:
         _check_beside(first, tile, argument)
-    positions = [_position(first, tile, argument) for tile in tiles]
-    left, top = (min(position[axis] for position in positions) for axis in (0, 1))
-    right, bottom = (
-        max(position[axis] + tile.size[axis] for position, tile in zip(positions, tiles, strict=True))
-        for axis in (0, 1)
+    corners = np.array([_position(first, tile, argument) for tile in tiles])
+    low, high = corners.min(axis=0), (corners + [tile.size for tile in tiles]).max(axis=0)
+    return _vrt_text(
+        tiles, (corners - low).tolist(), (high - low).tolist(), _moved(first.transform, *low.tolist())
     )
-    corners = [(x - left, y - top) for x, y in positions]
-    return _vrt_text(tiles, corners, (right - left, bottom - top), _moved(first.transform, left, top))
 
 
 def _moved(transform: Any, x: int, y: int) -> list[float]:
@@ -149,7 +136,7 @@ def _rasters_in(folder: Path) -> list[tuple[Path, str]]:
         if file.is_file() and file.suffix.lower() not in NO_TILES and not file.name.startswith("."):
             with contextlib.suppress(MapError):  # a licence, a world file, an index: not every file is a tile
                 found.append((file, driver_of(file, "")))
-    return [(file, driver) for file, driver in found if driver not in ("VRT", "MBTiles", "GPKG")]
+    return [(file, driver) for file, driver in found if driver not in ("MBTiles", "GPKG")]
 
 
 def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
@@ -203,7 +190,7 @@ def _position(first: _Tile, tile: _Tile, argument: str) -> tuple[int, int]:
 
 
 def _vrt_text(
-    tiles: Sequence[_Tile], corners: Sequence[tuple[int, int]], size: tuple[int, int], transform: Sequence[float]
+    tiles: Sequence[_Tile], corners: Sequence[Sequence[int]], size: Sequence[int], transform: Sequence[float]
 ) -> str:
     """The VRT of tiles by their top-left corners.
 
@@ -218,7 +205,9 @@ def _vrt_text(
     metadata = Xml.SubElement(root, "Metadata")
     for key, value in sorted(frozenset.intersection(*(tile.own_tags for tile in tiles))):
         Xml.SubElement(metadata, "MDI", key=key).text = value
-    _add_overviews(root, max(tiles, key=lambda tile: tile.size[0] * tile.size[1]).overviews)
+    factors = max(tiles, key=lambda tile: tile.size[0] * tile.size[1]).overviews
+    if factors:  # those that a smaller tile lacks GDAL computes while reading
+        Xml.SubElement(root, "OverviewList", resampling="average").text = " ".join(map(str, factors))
     for band in range(1, bands + 1):
         element = Xml.SubElement(root, "VRTRasterBand", dataType=DTYPES[dtype], band=str(band))
         Xml.SubElement(element, "ColorInterp").text = ("Red", "Green", "Blue")[band - 1] if bands == 3 else "Gray"
@@ -232,14 +221,8 @@ def _vrt_text(
     return Xml.tostring(root, encoding="unicode")
 
 
-def _add_overviews(root: Xml.Element, factors: Sequence[int]) -> None:
-    """Declare the overviews of the largest tile; GDAL computes those that a smaller one lacks while reading."""
-    if factors:
-        Xml.SubElement(root, "OverviewList", resampling="average").text = " ".join(map(str, factors))
-
-
 def _add_sources(
-    element: Xml.Element, tiles: Sequence[_Tile], corners: Sequence[tuple[int, int]], band: str
+    element: Xml.Element, tiles: Sequence[_Tile], corners: Sequence[Sequence[int]], band: str
 ) -> None:
     for tile, (x, y) in zip(tiles, corners, strict=True):
         width, height = (str(n) for n in tile.size)
@@ -255,40 +238,3 @@ def _add_sources(
         Xml.SubElement(source, "DstRect", xOff=str(x), yOff=str(y), xSize=width, ySize=height)
         if nodata is not None:  # so that one tile's nodata does not hide another's pixels
             Xml.SubElement(source, "NODATA").text = nodata
-
-
-# ------------------------------------------------------------------------------------------------- a user's VRT
-
-
-def _vrt_of_file(file: Path, argument: str) -> str:
-    """The text of a VRT that refers only to local raster files, with their absolute paths.
-
-    Raises:
-        MapError: it does more than join rasters, or refers to files that may not be opened.
-    """
-    import rasterio
-
-    try:
-        root = Xml.fromstring(file.read_bytes())
-    except Xml.ParseError as error:
-        raise MapError(f"{argument}: cannot read {file}: {error}") from None
-    for element in root.iter():
-        if element.tag not in _VRT_TAGS or "subClass" in element.attrib:
-            what = element.attrib.get("subClass", element.tag)
-            raise MapError(f"{argument}: expected a VRT that only joins local files, got {what} in {file}")
-    largest, overviews = 0, ()
-    for element in root.iter("SourceFilename"):
-        name = element.text or ""
-        beside = element.attrib.get("relativeToVRT") == "1" and not os.path.isabs(name)
-        source = local_path(os.path.join(file.parent, name) if beside else name, f"{argument}: {file}")
-        driver = "VRT" if source.is_dir() else driver_of(source, argument)
-        if driver == "VRT":
-            raise MapError(f"{argument}: expected raster files in {file}, got {source}")
-        with rasterio.open(source, driver=driver) as dataset:
-            if dataset.width * dataset.height > largest:
-                largest, overviews = dataset.width * dataset.height, dataset.overviews(1)
-        element.text = str(source)
-        element.attrib["relativeToVRT"] = "0"
-    if root.find("OverviewList") is None:
-        _add_overviews(root, overviews)
-    return Xml.tostring(root, encoding="unicode")
