@@ -23,7 +23,7 @@ import numpy as np
 from engine.errors import MapError
 from engine.maps.grids import Grid, Warp, apply_affine, by_corner, wgs84, window_about
 from engine.maps.rasters import Gray, GrayReader, Source, is_large, map_errors, open_source, stored_levels
-from engine.maps.tiles import tile_at, tiles_under
+from engine.maps.tiles import tiles_under
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
 
@@ -68,9 +68,8 @@ def _needs_copy(source: Source) -> bool:
 
 def _copied(reader: GrayReader, source: Grid, grid: Grid) -> Iterator[_Block]:
     """The copy block by block, as (2, h, w) grey and alpha."""
-    shape = grid.height_px, grid.width_px
     whole = Window(0, 0, grid.width_px, grid.height_px)
-    windows = (tile_at(*place, BLOCK_PX, shape) for place in tiles_under(whole, BLOCK_PX))
+    windows = tiles_under(whole, BLOCK_PX, (grid.height_px, grid.width_px))
     if grid is not source:
         yield from _resampled(reader, source, grid, windows)
         return
