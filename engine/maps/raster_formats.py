@@ -163,17 +163,15 @@ def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
 
 
 def _check_beside(first: _Tile, tile: _Tile, argument: str) -> None:
-    (a, b, _, d, e, *_), (p, q, _, s, t, *_) = first.transform, tile.transform
-    pixels = [a, b, d, e], [p, q, s, t]
-    step = 1e-7 * max(map(abs, pixels[0]))
-    same_pixel = all(abs(one - other) <= step for one, other in zip(*pixels, strict=True))
-    for name, (one, other), same in (
-        ("CRS", (first.crs, tile.crs), first.crs == tile.crs),
-        ("size of a pixel", pixels, same_pixel),
-        ("bands, element type, nodata, scale and offset", (first.kind, tile.kind), first.kind == tile.kind),
+    own, other = ([at.a, at.b, at.d, at.e] for at in (first.transform, tile.transform))
+    same_pixel = np.allclose(own, other, rtol=0.0, atol=1e-7 * max(map(abs, own)))
+    for name, one, another, same in (
+        ("CRS", first.crs, tile.crs, first.crs == tile.crs),
+        ("size of a pixel", own, other, same_pixel),
+        ("bands, element type, nodata, scale and offset", first.kind, tile.kind, first.kind == tile.kind),
     ):
         if not same:
-            found = f"{one} in {first.path.name} and {other} in {tile.path}"
+            found = f"{one} in {first.path.name} and {another} in {tile.path}"
             raise MapError(f"{argument}: expected tiles of one {name}, got {found}")
 
 
@@ -224,9 +222,9 @@ def _vrt_text(
 def _add_sources(
     element: Xml.Element, tiles: Sequence[_Tile], corners: Sequence[Sequence[int]], band: str
 ) -> None:
+    nodata = element.findtext("NoDataValue")
     for tile, (x, y) in zip(tiles, corners, strict=True):
         width, height = (str(n) for n in tile.size)
-        nodata = element.findtext("NoDataValue")
         source = Xml.SubElement(element, "SimpleSource" if nodata is None else "ComplexSource")
         Xml.SubElement(source, "SourceFilename", relativeToVRT="0").text = str(tile.path)
         Xml.SubElement(source, "SourceBand").text = band
