@@ -151,7 +151,7 @@ class OrthoMap(Georeference):
             slope_sigma_deg: slope accuracy, None if unknown.
 
         Returns:
-            OrthoMap: without a file; the arrays are not copied.
+            OrthoMap: without a file; do not change the arrays while it is in use.
 
         Raises:
             OptionError: an accuracy is not a number above 0.

@@ -15,7 +15,7 @@ import numpy as np
 from engine.learned import KeypointMatcher, Keypoints
 from engine.maps.landmarks import MAX_LANDMARKS, as_picture
 from engine.maps.recently_used import RecentlyUsed
-from engine.maps.tiles import HALO_PX, tile_at, tiles_under, widened
+from engine.maps.tiles import HALO_PX, tiles_under, widened
 from engine.runtime.device import CPU, as_tensor
 from engine.runtime.tensors import torch
 from engine.values import Window
@@ -31,8 +31,6 @@ MAX_KEYPOINTS = MAX_LANDMARKS
 """Keypoints kept in memory, besides those of the last window; one takes up to 520 bytes."""
 _NODATA_PX = 5  # a keypoint this near to a pixel without data may be its edge
 
-_Key = tuple[int, int, int]  # level, row and column of the tile
-
 
 class KeypointMap:
     """Cache of the keypoints of one map.
@@ -42,12 +40,12 @@ class KeypointMap:
         matcher: its extractor describes the map.
 
     Attributes:
-        tiles: described so far; the least recently used are evicted.
+        tiles: described so far, by level and window; the least recently used are evicted.
     """
 
     def __init__(self, site: OrthoMap, matcher: KeypointMatcher) -> None:
         self._site, self._matcher = site, matcher
-        self.tiles: RecentlyUsed[_Key, Keypoints] = RecentlyUsed()
+        self.tiles: RecentlyUsed[tuple[int, Window], Keypoints] = RecentlyUsed()
 
     def find(self, window: Window, level: int, count: int) -> Keypoints:
         """The strongest keypoints of a window.
@@ -62,22 +60,20 @@ class KeypointMap:
         """
         corner = np.array([window.x0, window.y0], np.float32)
         size = np.array([window.width_px, window.height_px], np.float32)
-        keys = [(level, row, column) for row, column in tiles_under(window, TILE_PX)]
+        windows = tiles_under(window, TILE_PX, self._site.level_shape(level))
         parts = []
-        for tile in [self.tiles.get(key, partial(self._describe, *key)) for key in keys]:
+        for tile in [self.tiles.get((level, own), partial(self._describe, level, own)) for own in windows]:
             xy = tile.xy_px - tile.xy_px.new_tensor(corner)
             inside = ((xy >= 0.0) & (xy <= xy.new_tensor(size) - 1.0)).all(dim=1)
             parts.append(Keypoints(xy, tile.strength, tile.descriptors).only(inside))
-        self.tiles.evict(lambda _, tile: len(tile), MAX_KEYPOINTS, keep=len(keys))
+        self.tiles.evict(lambda _, tile: len(tile), MAX_KEYPOINTS, keep=len(windows))
         share = min(1.0, count / max(1, sum(map(len, parts))))
         parts = [part.only(torch.arange(int(share * len(part)), device=part.xy_px.device)) for part in parts]
         return Keypoints(*(torch.cat(v) for v in zip(*map(_fields, parts), strict=True)))
 
-    def _describe(self, level: int, row: int, column: int) -> Keypoints:
+    def _describe(self, level: int, tile: Window) -> Keypoints:
         """The keypoints of a tile, in pixels of the level."""
-        shape = self._site.level_shape(level)
-        tile = tile_at(row, column, TILE_PX, shape)
-        wide = widened(tile, HALO_PX, shape)
+        wide = widened(tile, HALO_PX, self._site.level_shape(level))
         picture = as_tensor(as_picture(self._site.gray(wide, level), CPU))
         found = self._matcher.extract(picture, math.ceil(wide.area_px / PX_PER_KEYPOINT))
         xy = found.xy_px + found.xy_px.new_tensor([wide.x0, wide.y0])

@@ -19,7 +19,7 @@ from engine.features import Features, chosen_backend, sift
 from engine.maps.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
 from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
-from engine.maps.tiles import HALO_PX, TILE_PX, tile_at, tiles_under, widened, within
+from engine.maps.tiles import HALO_PX, TILE_PX, tiles_under, widened, within
 from engine.runtime.device import Device, Picture, all_on_host, all_to_device, as_float, to_device
 from engine.values import Window
 
@@ -67,7 +67,7 @@ class Landmarks:
     points_m: Array
 
 
-_Key = tuple[int, bool, int, int]  # level, upright, row and column of the tile
+_Key = tuple[int, bool, Window]  # level, upright and window of the tile
 
 
 class LandmarkMap:
@@ -100,7 +100,7 @@ class LandmarkMap:
         Returns:
             Landmarks: those whose keypoint is inside the window.
         """
-        keys = _keys(window, level, upright)
+        keys = self._keys(window, level, upright)
         tiles = [self._tile(key) for key in keys]
         self.tiles.evict(lambda _, tile: _count(tile), self._max_landmarks, keep=len(keys))
         max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
@@ -125,7 +125,7 @@ class LandmarkMap:
     def _prepare(self, level: int, upright: bool) -> None:
         rows, columns = self._site.level_shape(level)
         whole = Window(0, 0, columns, rows)
-        keys = _keys(whole, level, upright)
+        keys = self._keys(whole, level, upright)
         if all(key in self.tiles for key in keys):
             return
         if not self._site.from_file:
@@ -139,21 +139,22 @@ class LandmarkMap:
             tiles = [self._tile(key) for key in keys]
             save_arrays(name, {field: np.concatenate([tile[field] for tile in tiles]) for field in _STORED})
             return
-        at = np.rint(stored["xy_px"]).astype(np.int64) // TILE_PX
+        corner = np.rint(stored["xy_px"]).astype(np.int64) // TILE_PX * TILE_PX  # of each one's tile
         for key in keys:
-            own = (at == (key[3], key[2])).all(axis=1)
+            own = (corner == (key[2].x0, key[2].y0)).all(axis=1)
             self.tiles[key] = self._with_points({field: values[own] for field, values in stored.items()}, level)
+
+    def _keys(self, window: Window, level: int, upright: bool) -> list[_Key]:
+        return [(level, upright, tile) for tile in tiles_under(window, TILE_PX, self._site.level_shape(level))]
 
     def _tile(self, key: _Key) -> NamedArrays:
         """Get a tile, which becomes the most recently used."""
         level = key[0]
         return self.tiles.get(key, lambda: self._with_points(self._detect(*key), level))
 
-    def _detect(self, level: int, upright: bool, row: int, column: int) -> NamedArrays:
+    def _detect(self, level: int, upright: bool, own: Window) -> NamedArrays:
         """Every keypoint on a tile, as detected in the whole level."""
-        shape = self._site.level_shape(level)
-        own = tile_at(row, column, TILE_PX, shape)
-        wide = widened(own, HALO_PX, shape)
+        wide = widened(own, HALO_PX, self._site.level_shape(level))
         inner = within(own, wide)
         mask = np.zeros((wide.height_px, wide.width_px), np.bool_)
         mask[inner] = True if self._site.fully_valid else self._site.valid(wide, level)[inner]
@@ -206,10 +207,6 @@ def as_picture(gray: NDArray[np.uint8], device: Device) -> Picture:
         (1, 1, H, W) float32 in [0, 1].
     """
     return as_float(to_device(np.ascontiguousarray(gray), device), "float32")[None, None] / 255.0
-
-
-def _keys(window: Window, level: int, upright: bool) -> list[_Key]:
-    return [(level, upright, row, column) for row, column in tiles_under(window, TILE_PX)]
 
 
 def _inside(tile: NamedArrays, window: Window, max_rank: int) -> NDArray[np.intp]:

@@ -21,10 +21,9 @@ from typing import Any
 import numpy as np
 
 from engine.errors import MapError
-from engine.maps import xyz_tiles
 from engine.maps.grids import Grid, Warp, apply_affine, by_corner, wgs84, window_about
 from engine.maps.rasters import Gray, GrayReader, Source, is_large, map_errors, open_source, stored_levels
-from engine.maps.tiles import tile_at, tiles_under
+from engine.maps.tiles import tiles_under
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
 
@@ -32,6 +31,8 @@ GRID_VERSION = 2
 """Part of the key of cached copies; raise it with every change in how they are created."""
 FACTORS = [2, 4, 8, 16, 32]
 """Of the overviews of a large copy. The file is padded to a multiple, so that their pixels lie on the levels'."""
+MAX_SIDE_PX = 1_000_000
+"""Largest side of a copy."""
 BLOCK_PX = 1024
 """Side of the blocks in which a copy is read, resampled and written."""
 ProgressCallback = Callable[[int, int], None]
@@ -54,10 +55,8 @@ def _metric_grid(source: Grid) -> Grid:
     with np.errstate(invalid="ignore"):  # outside UTM's range coordinates are infinite, and refused below
         step = float(min(np.linalg.norm(near[1] - near[0]), np.linalg.norm(near[3] - near[2])))
         size = (high - low) / step
-    if not (np.isfinite(size).all() and size.max() <= xyz_tiles.MAX_SIDE_PX):
-        raise MapError(
-            f"map: expected at most {xyz_tiles.MAX_SIDE_PX} px a side on a UTM grid, got {size} of {step:.3g} m"
-        )
+    if not (np.isfinite(size).all() and size.max() <= MAX_SIDE_PX):
+        raise MapError(f"map: expected at most {MAX_SIDE_PX} px a side on a UTM grid, got {size} of {step:.3g} m")
     matrix = np.array([[step, 0.0, low[0] + step / 2.0], [0.0, -step, high[1] - step / 2.0]])
     return Grid(math.ceil(size[0] - 1e-6), math.ceil(size[1] - 1e-6), matrix, utm)
 
@@ -69,9 +68,8 @@ def _needs_copy(source: Source) -> bool:
 
 def _copied(reader: GrayReader, source: Grid, grid: Grid) -> Iterator[_Block]:
     """The copy block by block, as (2, h, w) grey and alpha."""
-    shape = grid.height_px, grid.width_px
     whole = Window(0, 0, grid.width_px, grid.height_px)
-    windows = (tile_at(*place, BLOCK_PX, shape) for place in tiles_under(whole, BLOCK_PX))
+    windows = tiles_under(whole, BLOCK_PX, (grid.height_px, grid.width_px))
     if grid is not source:
         yield from _resampled(reader, source, grid, windows)
         return
@@ -164,9 +162,6 @@ def open_metric_copy(
 def _key(source: Source, cache: Path) -> str:
     digest = hashlib.sha256(f"{GRID_VERSION} {source.grid.crs.to_wkt()}".encode())
     digest.update(source.grid.pixel_to_crs.tobytes())
-    if source.dataset.driver == xyz_tiles.DRIVER:  # reading all files only for the key would take too long
-        digest.update(xyz_tiles.fingerprint(source.path))
-        return digest.hexdigest()
     if source.dataset.driver == "VRT":
         digest.update(source.dataset.name.encode())  # its XML: the positions of the tiles
     for name in source.dataset.files:

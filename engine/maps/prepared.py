@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from engine.kernels.scores import enhance
 from engine.kernels.search_levels import MAX_HALVINGS
 from engine.maps.recently_used import RecentlyUsed
-from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, widened, within
+from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, tiles_under, widened, within
 from engine.ncc_fft import MapRegion, prepare
 from engine.runtime.device import Device, Picture, on_host, to_device
 from engine.values import Window
@@ -106,9 +106,9 @@ class PreparedMap:
         found = next(held, None)
         if found is not None:
             return self.regions.get(found, partial(self._prepare, found[1], level))
-        rows, columns = self._site.level_shape(level)
+        rows, columns = shape = self._site.level_shape(level)
         is_whole = rows * columns <= WHOLE_LEVEL_PX
-        target = Window(0, 0, columns, rows) if is_whole else _on_grid(window, columns, rows)
+        target = Window(0, 0, columns, rows) if is_whole else _on_grid(window, shape)
         region = self.regions.get((level, target), partial(self._prepare, target, level))
         self.regions.evict(self._evictable_px, MAX_REGION_PX, keep=1)
         return region
@@ -158,10 +158,9 @@ def _contains(region: Window, window: Window) -> bool:
     return across and region.y0 <= window.y0 and window.y1 <= region.y1
 
 
-def _on_grid(window: Window, columns: int, rows: int) -> Window:
+def _on_grid(window: Window, shape: tuple[int, int]) -> Window:
     """The window extended by half a tile to each side, then to whole tiles, and clipped at the level's edge."""
-    ahead = TILE_PX // 2  # the next windows of a flight fall in the same region
-    x0, y0 = (max(0, low - ahead) // TILE_PX * TILE_PX for low in (window.x0, window.y0))
-    x1 = min(columns, -(-(window.x1 + ahead) // TILE_PX) * TILE_PX)
-    y1 = min(rows, -(-(window.y1 + ahead) // TILE_PX) * TILE_PX)
-    return Window(x0, y0, x1 - x0, y1 - y0)
+    ahead_px = TILE_PX // 2  # the next windows of a flight fall in the same region
+    tiles = tiles_under(widened(window, ahead_px, shape), TILE_PX, shape)
+    first, last = tiles[0], tiles[-1]
+    return Window(first.x0, first.y0, last.x1 - first.x0, last.y1 - first.y0)

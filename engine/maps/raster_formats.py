@@ -1,7 +1,7 @@
-"""Raster files that may be opened: a local file by its first bytes, a folder of tiles or a VRT as one picture.
+"""Raster files that may be opened: a local file by its first bytes, or a folder of tiles as one picture.
 
-A folder of tiles becomes the text of a VRT, GDAL's mosaic format. A user's VRT is read too, after a check that it
-refers only to local raster files.
+A folder of tiles becomes the text of a VRT, GDAL's mosaic format. A user's VRT is not read: it could warp, compute
+and fetch.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from engine.errors import MapError
-from engine.maps import xyz_tiles
 
 SIGNATURES = (
     ("GTiff", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
@@ -38,14 +37,6 @@ OWN_TAGS = "SCENEMATCH_"
 OFF_GRID_PX = 0.05
 """Largest offset of a tile from whole pixels of the first tile's grid; a larger one would need resampling."""
 _VRT_HEAD = b"<VRTDataset"
-_VRT_TAGS = frozenset(
-    (
-        *("VRTDataset", "SRS", "GeoTransform", "Metadata", "MDI", "OverviewList", "MaskBand"),
-        *("VRTRasterBand", "Description", "NoDataValue", "ColorInterp", "ColorTable", "Entry", "Offset", "Scale"),
-        *("UnitType", "SimpleSource", "ComplexSource", "SourceFilename", "SourceBand", "SourceProperties"),
-        *("SrcRect", "DstRect", "NODATA", "UseMaskBand"),
-    )
-)
 DTYPES = {"uint8": "Byte", "uint16": "UInt16", "int16": "Int16", "float32": "Float32", "float64": "Float64"}
 """Element types of a map, with GDAL's names."""
 
@@ -81,7 +72,7 @@ def local_path(path: str | os.PathLike[str], argument: str) -> Path:
 
 
 def driver_of(file: Path, argument: str) -> str:
-    """GDAL's driver for a file, or "VRT".
+    """GDAL's driver for a file.
 
     Raises:
         MapError: its format is not supported.
@@ -92,26 +83,22 @@ def driver_of(file: Path, argument: str) -> str:
         if head.startswith(starts):
             return "GPKG" if driver == "MBTiles" and head[_GEOPACKAGE[0]] in _GEOPACKAGE[1] else driver
     if _VRT_HEAD in head:
-        return "VRT"
-    formats = ", ".join([*(driver for driver, _ in SIGNATURES), "GPKG", "VRT"])
+        raise MapError(
+            f"{argument}: expected no VRT, got {file}; give its folder of tiles, or a GeoTIFF by gdal_translate"
+        )
+    formats = ", ".join([*(driver for driver, _ in SIGNATURES), "GPKG"])
     raise MapError(f"{argument}: expected a raster file ({formats}), got {file}, which is none of these")
 
 
 def openable(path: Path, argument: str) -> tuple[str | Path, str]:
-    """What to give GDAL for a file or folder, the file itself or a description of the folder; and the driver.
+    """What to give GDAL for a file or folder, the file itself or the text of a VRT; and the driver.
 
     Raises:
         MapError: it is not a raster, or its tiles do not fit together.
     """
-    if path.is_dir() and xyz_tiles.is_tile_cache(path):
-        return xyz_tiles.description_of(path, argument), xyz_tiles.DRIVER
     if path.is_dir():
         return vrt_of_folder(path, argument), "VRT"
-    driver = driver_of(path, argument)
-    return (_vrt_of_file(path, argument), driver) if driver == "VRT" else (path, driver)
-
-
-# ------------------------------------------------------------------------------------------ a folder of tiles
+    return path, driver_of(path, argument)
 
 
 def vrt_of_folder(folder: Path, argument: str) -> str:
@@ -123,19 +110,17 @@ def vrt_of_folder(folder: Path, argument: str) -> str:
     tiles = [_read_tile(file, driver, argument) for file, driver in _rasters_in(folder)]
     if not tiles:
         raise MapError(
-            f"{argument}: expected raster files in the folder {folder}, or tiles as z/x/y.png below it, found none"
+            f"{argument}: expected georeferenced raster files in the folder {folder}, found none; "
+            "of web tiles (z/x/y.png) give MBTiles or a GeoTIFF"
         )
     first = tiles[0]
     for tile in tiles[1:]:
         _check_beside(first, tile, argument)
-    positions = [_position(first, tile, argument) for tile in tiles]
-    left, top = (min(position[axis] for position in positions) for axis in (0, 1))
-    right, bottom = (
-        max(position[axis] + tile.size[axis] for position, tile in zip(positions, tiles, strict=True))
-        for axis in (0, 1)
+    corners = np.array([_position(first, tile, argument) for tile in tiles])
+    low, high = corners.min(axis=0), (corners + [tile.size for tile in tiles]).max(axis=0)
+    return _vrt_text(
+        tiles, (corners - low).tolist(), (high - low).tolist(), _moved(first.transform, *low.tolist())
     )
-    corners = [(x - left, y - top) for x, y in positions]
-    return _vrt_text(tiles, corners, (right - left, bottom - top), _moved(first.transform, left, top))
 
 
 def _moved(transform: Any, x: int, y: int) -> list[float]:
@@ -151,7 +136,7 @@ def _rasters_in(folder: Path) -> list[tuple[Path, str]]:
         if file.is_file() and file.suffix.lower() not in NO_TILES and not file.name.startswith("."):
             with contextlib.suppress(MapError):  # a licence, a world file, an index: not every file is a tile
                 found.append((file, driver_of(file, "")))
-    return [(file, driver) for file, driver in found if driver not in ("VRT", "MBTiles", "GPKG")]
+    return [(file, driver) for file, driver in found if driver not in ("MBTiles", "GPKG")]
 
 
 def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
@@ -178,17 +163,15 @@ def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
 
 
 def _check_beside(first: _Tile, tile: _Tile, argument: str) -> None:
-    (a, b, _, d, e, *_), (p, q, _, s, t, *_) = first.transform, tile.transform
-    pixels = [a, b, d, e], [p, q, s, t]
-    step = 1e-7 * max(map(abs, pixels[0]))
-    same_pixel = all(abs(one - other) <= step for one, other in zip(*pixels, strict=True))
-    for name, (one, other), same in (
-        ("CRS", (first.crs, tile.crs), first.crs == tile.crs),
-        ("size of a pixel", pixels, same_pixel),
-        ("bands, element type, nodata, scale and offset", (first.kind, tile.kind), first.kind == tile.kind),
+    own, other = ([at.a, at.b, at.d, at.e] for at in (first.transform, tile.transform))
+    same_pixel = np.allclose(own, other, rtol=0.0, atol=1e-7 * max(map(abs, own)))
+    for name, one, another, same in (
+        ("CRS", first.crs, tile.crs, first.crs == tile.crs),
+        ("size of a pixel", own, other, same_pixel),
+        ("bands, element type, nodata, scale and offset", first.kind, tile.kind, first.kind == tile.kind),
     ):
         if not same:
-            found = f"{one} in {first.path.name} and {other} in {tile.path}"
+            found = f"{one} in {first.path.name} and {another} in {tile.path}"
             raise MapError(f"{argument}: expected tiles of one {name}, got {found}")
 
 
@@ -205,7 +188,7 @@ def _position(first: _Tile, tile: _Tile, argument: str) -> tuple[int, int]:
 
 
 def _vrt_text(
-    tiles: Sequence[_Tile], corners: Sequence[tuple[int, int]], size: tuple[int, int], transform: Sequence[float]
+    tiles: Sequence[_Tile], corners: Sequence[Sequence[int]], size: Sequence[int], transform: Sequence[float]
 ) -> str:
     """The VRT of tiles by their top-left corners.
 
@@ -220,7 +203,9 @@ def _vrt_text(
     metadata = Xml.SubElement(root, "Metadata")
     for key, value in sorted(frozenset.intersection(*(tile.own_tags for tile in tiles))):
         Xml.SubElement(metadata, "MDI", key=key).text = value
-    _add_overviews(root, max(tiles, key=lambda tile: tile.size[0] * tile.size[1]).overviews)
+    factors = max(tiles, key=lambda tile: tile.size[0] * tile.size[1]).overviews
+    if factors:  # those that a smaller tile lacks GDAL computes while reading
+        Xml.SubElement(root, "OverviewList", resampling="average").text = " ".join(map(str, factors))
     for band in range(1, bands + 1):
         element = Xml.SubElement(root, "VRTRasterBand", dataType=DTYPES[dtype], band=str(band))
         Xml.SubElement(element, "ColorInterp").text = ("Red", "Green", "Blue")[band - 1] if bands == 3 else "Gray"
@@ -234,18 +219,12 @@ def _vrt_text(
     return Xml.tostring(root, encoding="unicode")
 
 
-def _add_overviews(root: Xml.Element, factors: Sequence[int]) -> None:
-    """Declare the overviews of the largest tile; GDAL computes those that a smaller one lacks while reading."""
-    if factors:
-        Xml.SubElement(root, "OverviewList", resampling="average").text = " ".join(map(str, factors))
-
-
 def _add_sources(
-    element: Xml.Element, tiles: Sequence[_Tile], corners: Sequence[tuple[int, int]], band: str
+    element: Xml.Element, tiles: Sequence[_Tile], corners: Sequence[Sequence[int]], band: str
 ) -> None:
+    nodata = element.findtext("NoDataValue")
     for tile, (x, y) in zip(tiles, corners, strict=True):
         width, height = (str(n) for n in tile.size)
-        nodata = element.findtext("NoDataValue")
         source = Xml.SubElement(element, "SimpleSource" if nodata is None else "ComplexSource")
         Xml.SubElement(source, "SourceFilename", relativeToVRT="0").text = str(tile.path)
         Xml.SubElement(source, "SourceBand").text = band
@@ -257,40 +236,3 @@ def _add_sources(
         Xml.SubElement(source, "DstRect", xOff=str(x), yOff=str(y), xSize=width, ySize=height)
         if nodata is not None:  # so that one tile's nodata does not hide another's pixels
             Xml.SubElement(source, "NODATA").text = nodata
-
-
-# ------------------------------------------------------------------------------------------------- a user's VRT
-
-
-def _vrt_of_file(file: Path, argument: str) -> str:
-    """The text of a VRT that refers only to local raster files, with their absolute paths.
-
-    Raises:
-        MapError: it does more than join rasters, or refers to files that may not be opened.
-    """
-    import rasterio
-
-    try:
-        root = Xml.fromstring(file.read_bytes())
-    except Xml.ParseError as error:
-        raise MapError(f"{argument}: cannot read {file}: {error}") from None
-    for element in root.iter():
-        if element.tag not in _VRT_TAGS or "subClass" in element.attrib:
-            what = element.attrib.get("subClass", element.tag)
-            raise MapError(f"{argument}: expected a VRT that only joins local files, got {what} in {file}")
-    largest, overviews = 0, ()
-    for element in root.iter("SourceFilename"):
-        name = element.text or ""
-        beside = element.attrib.get("relativeToVRT") == "1" and not os.path.isabs(name)
-        source = local_path(os.path.join(file.parent, name) if beside else name, f"{argument}: {file}")
-        driver = "VRT" if source.is_dir() else driver_of(source, argument)
-        if driver == "VRT":
-            raise MapError(f"{argument}: expected raster files in {file}, got {source}")
-        with rasterio.open(source, driver=driver) as dataset:
-            if dataset.width * dataset.height > largest:
-                largest, overviews = dataset.width * dataset.height, dataset.overviews(1)
-        element.text = str(source)
-        element.attrib["relativeToVRT"] = "0"
-    if root.find("OverviewList") is None:
-        _add_overviews(root, overviews)
-    return Xml.tostring(root, encoding="unicode")

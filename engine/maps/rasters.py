@@ -124,8 +124,8 @@ def open_source(
     """Open a local raster with its georeference.
 
     Args:
-        path: a GeoTIFF, a picture (GDAL reads a world file beside it), MBTiles, a GeoPackage, a VRT, a
-            folder of georeferenced tiles, or one of tiles by their names, z/x/y.png.
+        path: a GeoTIFF, a picture (GDAL reads a world file beside it), MBTiles, a GeoPackage, or a folder
+            of georeferenced tiles.
         argument: name of the file in messages.
         bounds_deg: west, south, east, north of the outer edges of a picture without georeference, whose rows
             and columns run evenly in ``crs`` (EPSG:4326 unless given; EPSG:3857 for a screenshot of a web map).

@@ -15,7 +15,7 @@ from engine.kernels.dense import Samples
 from engine.maps.prepared import FloatImage
 from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
-from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, tile_at, tiles_under
+from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, tiles_under
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -78,7 +78,7 @@ class SampleMap:
         height, width = shape = self._site.level_shape(level)
         if width * height <= WHOLE_LEVEL_PX:
             return [Window(0, 0, width, height)]
-        cells = [tile_at(*place, TILE_PX, shape) for place in tiles_under(window, TILE_PX)]
+        cells = tiles_under(window, TILE_PX, shape)
         # The remainder beyond a level's last whole cell may be narrower than a block: it gives no sample.
         return [cell for cell in cells if min(cell.width_px, cell.height_px) >= BLOCK_PX]
 

@@ -148,10 +148,9 @@ class SurfaceModel:
     @property
     def range_m(self) -> tuple[float, float]:
         """Lowest and highest known height; for a large surface those of its averages."""
-        if not isinstance(self._heights_m, np.ndarray):
-            assert self._decimated is not None  # a surface read in tiles has one
-            return self._decimated.range_m
-        return float(np.nanmin(self._heights_m)), float(np.nanmax(self._heights_m))
+        heights = (self._decimated or self)._heights_m
+        assert isinstance(heights, np.ndarray)  # a surface read in tiles has a decimated one
+        return float(np.nanmin(heights)), float(np.nanmax(heights))
 
 
 def _bilinear(heights_m: Heights, at: Array) -> Array:

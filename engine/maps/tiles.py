@@ -14,17 +14,14 @@ HALO_PX = 64
 """Margin around a tile that is read for description; the descriptor of nearly every keypoint ends within it."""
 
 
-def tiles_under(window: Window, side_px: int) -> list[tuple[int, int]]:
-    """Row and column of the tiles that a window touches, row by row; they begin on multiples of their side."""
-    rows = range(window.y0 // side_px, (window.y1 - 1) // side_px + 1)
-    columns = range(window.x0 // side_px, (window.x1 - 1) // side_px + 1)
-    return [(row, column) for row in rows for column in columns]
+def tiles_under(window: Window, side_px: int, shape: tuple[int, int]) -> list[Window]:
+    """The tiles of a level with this shape that a window touches, row by row.
 
-
-def tile_at(row: int, column: int, side_px: int, shape: tuple[int, int]) -> Window:
-    """One tile of a level with this shape; the last ones are smaller."""
-    x0, y0 = column * side_px, row * side_px
-    return Window(x0, y0, min(side_px, shape[1] - x0), min(side_px, shape[0] - y0))
+    They begin on multiples of their side; the last ones are smaller.
+    """
+    rows = range(window.y0 // side_px * side_px, window.y1, side_px)
+    columns = range(window.x0 // side_px * side_px, window.x1, side_px)
+    return [Window(x, y, min(side_px, shape[1] - x), min(side_px, shape[0] - y)) for y in rows for x in columns]
 
 
 def widened(window: Window, margin_px: int, shape: tuple[int, int]) -> Window:

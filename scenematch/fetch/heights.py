@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
 from engine.geo import Array
-from engine.maps import xyz_tiles
 from engine.maps.rasters import open_source, vertical_datum
 from scenematch.fetch.grid import Bounds, reason_of
 from scenematch.fetch.urls import PLACEHOLDER, check_url, shown, user_agent
@@ -128,10 +127,7 @@ def _opened(file: str) -> Any:
     if "://" not in file:
         if not Path(file).exists():
             return None
-        dataset = open_source(file, "surface").dataset
-        if dataset.driver == xyz_tiles.DRIVER:
-            raise MapError(f"surface: expected heights, got a folder of pictures, {file}")
-        return dataset
+        return open_source(file, "surface").dataset
     try:
         return rasterio.open(f"/vsicurl/{file}", driver="GTiff")
     except RasterioError as error:

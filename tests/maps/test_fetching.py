@@ -363,7 +363,7 @@ def test_surfaces_that_cannot_be(server, files, settings, tmp_path):
         (str(files / "none.tif"), None, MapError, "surface: expected a file of heights, but there is no /"),
         (str(files / "{lat}{lon}.tif"), None, MapError, "surface: expected a file of heights, but there is no "),
         (str(files / "far.tif"), None, MapError, "surface: "),
-        (str(files / "tiles"), None, MapError, "surface: expected heights, got a folder of pictures"),
+        (str(files / "tiles"), None, MapError, "surface: expected georeferenced raster files in the folder"),
         (str(files / "far.tif"), "EPSG:4326", OptionError, "surface_datum: expected a vertical datum in metres"),
     ):
         with pytest.raises(error, match=re.escape(text)):

@@ -127,7 +127,7 @@ def test_memory_is_bounded_and_what_was_given_up_comes_back_the_same(site, marks
             table(small.find(window, 0, upright=True)), table(marks.find(window, 0, upright=True))
         )
         kept = [len(tile["rank"]) for tile in small.tiles.values()]
-        assert sum(kept) <= 700 or len(kept) == len(landmarks._keys(window, 0, True))
+        assert sum(kept) <= 700 or len(kept) == len(small._keys(window, 0, True))
 
 
 @pytest.fixture

@@ -512,20 +512,24 @@ def geographic(tmp_path):
     return write(tmp_path / "map.tif", noise(80, 90), **DEGREES)
 
 
-@pytest.mark.parametrize("bytes_read_anew", [1 << 22, 10], ids=["small file", "large file"])
+@pytest.mark.parametrize(
+    ("bytes_read_anew", "opened"),
+    [(1 << 22, "map.tif"), (10, "map.tif"), (1 << 22, ".")],
+    ids=["small file", "large file", "folder of tiles"],
+)
 def test_resampled_map_is_made_once_and_again_for_other_content(
-    tmp_path, geographic, bytes_read_anew, monkeypatch
+    tmp_path, geographic, bytes_read_anew, opened, monkeypatch
 ):
     monkeypatch.setattr("engine.maps.metric_copy._CACHED_HASH_BYTES", bytes_read_anew)
-    cache = tmp_path / "cache"
-    first = OrthoMap.open(geographic, cache_dir=cache)
+    path, cache = tmp_path / opened, tmp_path / "cache"
+    first = OrthoMap.open(path, cache_dir=cache)
     (made,) = cache.glob("*/*.tif")
     stamp = made.stat().st_mtime_ns
-    second = OrthoMap.open(geographic, cache_dir=cache)
+    second = OrthoMap.open(path, cache_dir=cache)
     assert [p.stat().st_mtime_ns for p in cache.glob("*/*.tif")] == [stamp]
     assert np.array_equal(first.gray(whole(first)), second.gray(whole(second)))
     write(geographic, noise(80, 90, seed=5), **DEGREES)
-    OrthoMap.open(geographic, cache_dir=cache)
+    OrthoMap.open(path, cache_dir=cache)
     assert len(list(cache.glob("*/*.tif"))) == 2
 
 

@@ -1,4 +1,4 @@
-"""Folders of tiles, VRTs, MBTiles and GeoPackages: the picture that they were cut from, or one clear line."""
+"""Folders of tiles, MBTiles and GeoPackages: the picture that they were cut from, or one clear line."""
 
 import re
 import sqlite3
@@ -10,7 +10,6 @@ from affine import Affine
 from rasterio.shutil import copy
 
 from engine.errors import MapError
-from engine.maps.raster_formats import vrt_of_folder
 from engine.maps.rasters import GEOREFERENCE_TAG
 from engine.orthomap import OrthoMap
 from engine.values import Window
@@ -73,18 +72,9 @@ def test_a_folder_of_tiles_is_the_picture_that_it_was_cut_from_and_a_gap_is_noda
     assert cut.info()["driver"] == "VRT"
 
 
-@pytest.mark.parametrize("kind", ["cog", "vrt", "relative vrt"])
-def test_a_cog_and_a_vrt_are_the_picture_byte_by_byte(tmp_path, plain, picture, kind):
-    if kind == "cog":
-        path = tmp_path / "map.tif"
-        copy(plain, path, driver="COG", compress="deflate")
-    else:
-        cut = tiles_of(tmp_path / "tiles", picture, gap=None)
-        text = vrt_of_folder(cut, "map")
-        if kind == "relative vrt":
-            text = text.replace(str(cut), "tiles").replace('relativeToVRT="0"', 'relativeToVRT="1"')
-        path = tmp_path / "map.vrt"
-        path.write_text(text)
+def test_a_cog_is_the_picture_byte_by_byte(tmp_path, plain):
+    path = tmp_path / "map.tif"
+    copy(plain, path, driver="COG", compress="deflate")
     whole, other = OrthoMap.open(plain), OrthoMap.open(path)
     for window in WINDOWS:
         np.testing.assert_array_equal(other.gray(window), whole.gray(window))
@@ -150,26 +140,19 @@ def test_tiles_that_do_not_fit_together_are_refused(tmp_path, picture, changed, 
     assert re.search(words, refusal(OrthoMap.open, cut, error=MapError))
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("<VRTDataset ", '<VRTDataset subClass="VRTWarpedDataset" ', "got VRTWarpedDataset"),
-        ('band="1">', 'band="1" subClass="VRTDerivedRasterBand">', "got VRTDerivedRasterBand"),
-        ("<ColorInterp>Red", "<PixelFunctionType>evil</PixelFunctionType><ColorInterp>Red",
-         "got PixelFunctionType"),
-        ("0-0.tif", "gone.tif", "does not exist"),
-        ("{folder}/0-0.tif", "https://example.org/a.tif", "expected the path of a local file"),
-        ("{folder}/0-0.tif", "/vsicurl/http://example.org/a.tif", "expected the path of a local file"),
-        ("0-0.tif", "self.vrt", r"expected raster files in .*map\.vrt, got .*self\.vrt"),
-        ("</VRTDataset>", "", "cannot read"),
-    ],
-)  # fmt: skip
-def test_a_vrt_that_does_more_than_to_lay_local_files_side_by_side_is_refused(tmp_path, picture, old, new, words):
-    here = tiles_of(tmp_path / "tiles", picture)
-    text = vrt_of_folder(here, "map")
-    (here / "self.vrt").write_text(text)
-    (tmp_path / "map.vrt").write_text(text.replace(old.format(folder=here), new))
-    assert re.search(words, refusal(OrthoMap.open, tmp_path / "map.vrt", error=MapError))
+def test_a_vrt_is_refused_with_what_to_give_instead(tmp_path):
+    path = tmp_path / "map.vrt"
+    path.write_text('<VRTDataset rasterXSize="1" rasterYSize="1"/>')
+    words = r"expected no VRT, got .*map\.vrt; give its folder of tiles, or a GeoTIFF by gdal_translate"
+    assert re.search(words, refusal(OrthoMap.open, path, error=MapError))
+
+
+def test_a_folder_of_web_tiles_is_refused_with_what_to_give_instead(tmp_path):
+    (tmp_path / "18" / "143000").mkdir(parents=True)
+    (tmp_path / "18" / "143000" / "90500.png").write_bytes(b"\x89PNG")
+    (tmp_path / "leaflet.html").write_text("a viewer")
+    words = r"expected georeferenced raster files in the folder .*, found none; .* give MBTiles or a GeoTIFF"
+    assert re.search(words, refusal(OrthoMap.open, tmp_path, error=MapError))
 
 
 # ------------------------------------------------------------------------------------ MBTiles and GeoPackages
