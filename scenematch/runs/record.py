@@ -52,7 +52,6 @@ class RunRecord:
         ground_m: height of the ground on the map.
         ground_amsl_m: the same above the sea, by the telemetry.
         surface_datum: vertical system of the heights, if the file states heights above the sea.
-        attitude: check of the telemetry's attitude against the fixes.
         diagnosis: errors found in the inputs if few frames were fixed, sentences by cause.
         more: other contents of the file, by name.
 
@@ -90,7 +89,6 @@ class RunRecord:
     ground_m: float
     ground_amsl_m: float | None
     surface_datum: str | None = None
-    attitude: Mapping[str, Any] | None = None
     diagnosis: Mapping[str, str] | None = None
     more: Mapping[str, Any] = field(default_factory=dict)
 
@@ -174,7 +172,7 @@ _TABLES: dict[str, tuple[str, Callable[[object], bool]]] = {
     "corrections": ("corrections of the telemetry", _are_corrections),
     "heights": ("counts by source", lambda value: _is_table(value, int)),
     "diagnosis": ("sentences", lambda value: _is_table(value, str)),
-    **dict.fromkeys(("changed", "attitude", "more"), ("a table", lambda value: _is_table(value, object))),
+    **dict.fromkeys(("changed", "more"), ("a table", lambda value: _is_table(value, object))),
 }
 """The same of tables, by name."""
 

@@ -19,7 +19,6 @@ from scenematch.files.notes import frame_note, write_notes
 from scenematch.files.settings import changed
 from scenematch.files.telemetry import ground_amsl_m
 from scenematch.files.track import TrackRow, TrackWriter, read_track, track_row
-from scenematch.report.attitude import AttitudeCheck, AttitudeRow, attitude_row, check_attitude
 from scenematch.runs.arguments import parse_budget, parse_position
 from scenematch.runs.checking import as_rows, diagnose_flight
 from scenematch.runs.inputs import FlightFiles, FlightInputs, open_inputs
@@ -84,10 +83,10 @@ def track(
     description = f"{settings.method}, {settings.profile} profile"
     frames = progress.track(flight, len(flight), description)
     with open_view(matcher, live_view) as view:
-        attitude = _follow(frames, navigator, out, budget, use_priors=start is None, view=view)
+        _follow(frames, navigator, out, budget, use_priors=start is None, view=view)
     # From the rows in the file, so that evaluate gives the same figures.
     rows, shown = read_track(out / TRACK), ReportFrames(flight, matcher)
-    record = _record(files, settings, inputs, str(matcher.device), attitude)
+    record = _record(files, settings, inputs, str(matcher.device))
     share = _fixed_share(rows)
     if diagnosis and settings.profile == "engine" and share < _CHECKED_SHARE:
         record = replace(record, diagnosis=_diagnosis(files, settings, inputs, share, progress))
@@ -114,9 +113,7 @@ def _diagnosis(
     return dict(as_rows(found, corrected=not files.corrections.changes_nothing))
 
 
-def _record(
-    files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, device: str, attitude: AttitudeCheck | None
-) -> RunRecord:
+def _record(files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, device: str) -> RunRecord:
     """The record of a run, for summary.json."""
     given = files.flat() | {"truth": inputs.truth_path}
     for name in PATHS:
@@ -139,7 +136,6 @@ def _record(
         ground_m=inputs.site.ground_m,
         ground_amsl_m=ground_amsl_m(inputs.flight.rows),
         surface_datum=inputs.site.surface_datum,
-        attitude=None if attitude is None else asdict(attitude),
     )
 
 
@@ -151,7 +147,7 @@ def _follow(
     *,
     use_priors: bool,
     view: LiveView | None = None,
-) -> AttitudeCheck | None:
+) -> None:
     """Pass every frame through the navigator, and write each row to disk at once.
 
     Args:
@@ -161,11 +157,7 @@ def _follow(
         budget: of each frame.
         use_priors: whether to use the telemetry's own positions; a given start replaces them.
         view: receives each frame once it is answered.
-
-    Returns:
-        AttitudeCheck | None: check of the telemetry's attitude against the fixes.
     """
-    attitudes: list[AttitudeRow | None] = []
     notes = []
     with TrackWriter(out / TRACK) as writer:
         for index, item in enumerate(frames):
@@ -175,12 +167,10 @@ def _follow(
             latency_ms = (time.perf_counter() - begin) * 1e3
             met = None if budget is None else latency_ms <= budget.total_ms
             writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
-            attitudes.append(attitude_row(item.frame, result))
             notes.append(frame_note(item.name, result, navigator.state.value))
             if view is not None:
                 view.show(index, item.name, item.frame, result, navigator.state, latency_ms)
     write_notes(out / NOTES, notes)
-    return check_attitude([row for row in attitudes if row is not None])
 
 
 def _update(navigator: Navigator, item: FlightFrame, prior: Prior | None) -> Fix | NoFix:
