@@ -12,7 +12,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -51,11 +51,10 @@ GRID = np.array([[0.5, 0.0, 600_000.0], [0.0, -0.5, 4_500_000.0]])
 
 @dataclass(frozen=True)
 class Ground:
-    """A map, what frames over it are drawn from (itself, or another date), and what else the audit is shown."""
+    """A map, and what frames over it are drawn from: itself, or another date."""
 
     site: OrthoMap
     seen: Gray
-    other: OrthoMap | None = None
 
 
 @dataclass(frozen=True)
@@ -185,7 +184,7 @@ def photograph(ground: Ground, nadir_px: Array, height_m: float, rng: np.random.
 def trials(ground: Ground, height_m: float, count: int, rng: np.random.Generator) -> list[Trial]:
     """Frames at random places of a map, matched by the engine, beside what the audit says of each place."""
     site = ground.site
-    found = audit_site(site, CAMERA, height_m, other=ground.other)
+    found = audit_site(site, CAMERA, height_m)
     matcher = SceneMatcher(site, CAMERA, "ncc", "cpu")
     statistics = found.statistics
     at_places = regressors(statistics.texture, statistics.score, statistics.lead)
@@ -269,16 +268,12 @@ def places_row(name: str, found: list[Trial]) -> list[str]:
 
 
 def other_rows(count: int) -> list[list[str]]:
-    """Farmland four years on, by an audit of one year and by one that sees the year between as well."""
+    """Farmland four years on."""
     if not SHARED.is_dir():
         return []
     years = {year: half(farmland(year), east=True) for year in YEARS}
-    grounds, shown = [], []
-    for first, between, last in zip(YEARS, YEARS[1:], YEARS[2:], strict=False):
-        grounds.append(arrays(years[first], years[last]))
-        shown.append(replace(grounds[-1], other=arrays(years[between]).site))
-    alone = places_row("one year alone", all_trials(grounds, count, 1))
-    return [alone, places_row("with `--other` of a year between", all_trials(shown, count, 1))]
+    grounds = [arrays(years[first], years[last]) for first, last in zip(YEARS, YEARS[2:], strict=False)]
+    return [places_row("one year alone", all_trials(grounds, count, 1))]
 
 
 def flight_rows(quick: bool) -> list[list[str]]:

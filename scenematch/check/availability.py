@@ -32,9 +32,8 @@ class Flag(enum.IntEnum):
     REPEATED = 3
     UNSTABLE = 4
     WEAK = 5
-    STALE = 6
-    EDGE = 7
-    OUTSIDE = 8
+    EDGE = 6
+    OUTSIDE = 7
 
 
 # Reasons why a cell is not suitable, in this order; WEAK if none of these applies.
@@ -141,15 +140,11 @@ def gather(plan: AuditPlan, measured: Iterable[SelfMatchStatistics]) -> Audit:
     for name, grid in found.items():
         grid[plan.audited] = [getattr(row, name) for row in rows]
     statistics = SelfMatchStatistics(**found)
-    own = fix_probability(statistics.texture, statistics.score, statistics.lead)
-    effective = own
-    if plan.other is not None:  # a real change instead of the simulated one
-        later = fix_probability(statistics.texture, statistics.other_score, statistics.other_lead)
-        effective = np.where(np.isnan(later), own, np.minimum(own, later))
+    availability = fix_probability(statistics.texture, statistics.score, statistics.lead)
     inside_map = np.zeros(plan.cells, np.bool_)
     inside_map[plan.audited] = [plan.contains(center) for center in plan.centers_px[plan.audited]]
-    flags = np.where(plan.audited, _flags(statistics, own, effective, inside_map), Flag.OUTSIDE).astype(np.uint8)
-    return Audit(plan, statistics, effective, flags)
+    flags = np.where(plan.audited, _flags(statistics, availability, inside_map), Flag.OUTSIDE).astype(np.uint8)
+    return Audit(plan, statistics, availability, flags)
 
 
 def audit_site(
@@ -157,23 +152,21 @@ def audit_site(
     camera: Camera,
     height_agl_m: float,
     options: AuditOptions | None = None,
-    other: OrthoMap | None = None,
     part: MapPart | None = None,
 ) -> Audit:
     """Plan an audit and run it; arguments and errors are those of :func:`scenematch.check.plan.plan_audit`."""
-    plan = plan_audit(site, camera, height_agl_m, options, other, part)
+    plan = plan_audit(site, camera, height_agl_m, options, part)
     return gather(plan, measure_self_match(plan))
 
 
 def _flags(
-    statistics: SelfMatchStatistics, own: Array, effective: Array, inside_map: NDArray[np.bool_]
+    statistics: SelfMatchStatistics, availability: Array, inside_map: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     with np.errstate(invalid="ignore"):
         reasons = [
             (~inside_map, Flag.EDGE),
-            (np.isnan(own), Flag.NODATA),
-            (effective >= SUITABLE, Flag.GOOD),
-            (own >= SUITABLE, Flag.STALE),
+            (np.isnan(availability), Flag.NODATA),
+            (availability >= SUITABLE, Flag.GOOD),
             (statistics.texture < FLAT_TEXTURE, Flag.FLAT),
             (statistics.rival >= REPEATED_RIVAL, Flag.REPEATED),
             (statistics.stability < UNSTABLE_SCORE, Flag.UNSTABLE),

@@ -139,7 +139,6 @@ class AuditPlan(CellGrid):
         view_offset_m: (2,) metres east and north from a level vehicle heading north to the middle of its frame.
         shape: (h, w) of a template.
         audited: (rows, columns) which cells are audited.
-        other: map of the same ground at another date, or None.
     """
 
     site: OrthoMap
@@ -150,7 +149,6 @@ class AuditPlan(CellGrid):
     view_offset_m: Array
     shape: tuple[int, int]
     audited: Mask
-    other: OrthoMap | None
 
     def __len__(self) -> int:
         return int(np.count_nonzero(self.audited))
@@ -190,7 +188,6 @@ def plan_audit(
     camera: Camera,
     height_agl_m: float,
     options: AuditOptions | None = None,
-    other: OrthoMap | None = None,
     part: MapPart | None = None,
 ) -> AuditPlan:
     """Plan the audit of a map, or of a part of it.
@@ -200,7 +197,6 @@ def plan_audit(
         camera: of the flights.
         height_agl_m: of the flights, above 0.
         options: settings.
-        other: map of the same ground at another date, used to find stale cells.
         part: of the map; None is all of it.
 
     Raises:
@@ -222,7 +218,7 @@ def plan_audit(
         grid = CellGrid.over(whole, max(step_px, math.sqrt(whole.area_px / options.max_cells)))
         audited = np.ones(grid.cells, np.bool_)
     return AuditPlan(
-        grid.window, grid.cells, site, height_agl_m, options, level, view, view_offset_m, shape, audited, other
+        grid.window, grid.cells, site, height_agl_m, options, level, view, view_offset_m, shape, audited
     )
 
 

@@ -20,11 +20,10 @@ from engine.maps.prepared import PreparedMap
 from engine.matching.correlation import MIN_VALID_SHARE
 from engine.matching.covariance import score_sigma
 from engine.ncc_fft import surface
-from engine.orthomap import OrthoMap
 from engine.runtime.device import CPU
 from engine.runtime.workers import in_order, safe_count
 from engine.values import Window
-from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
+from engine.window import SPREAD_SIGMAS, place_window, window_size_px
 from scenematch.check.plan import NCC, AuditPlan
 
 Gray = NDArray[np.uint8]
@@ -50,8 +49,6 @@ class SelfMatchStatistics:
         stability: NCC of the patch with itself, blurred, rotated and scaled a little.
         score: NCC of the changed patch at its own position, in sigmas.
         lead: ``score`` minus its best rival, in sigmas.
-        other_score: ``score`` of a patch of another date's map, unchanged; NaN without one.
-        other_lead: ``lead`` of the same.
     """
 
     texture: Array
@@ -59,8 +56,6 @@ class SelfMatchStatistics:
     stability: Array
     score: Array
     lead: Array
-    other_score: Array
-    other_lead: Array
 
 
 # ------------------------------------------------------------------------------------------------- measuring
@@ -77,8 +72,7 @@ def measure_self_match(plan: AuditPlan) -> Iterator[SelfMatchStatistics]:
     def measured(index: int) -> SelfMatchStatistics:
         return _measure(plan, prepared, noise, centers_px[index])
 
-    reads_files = any(site is not None and site.reads_files for site in (plan.site, plan.other))
-    yield from in_order(measured, len(centers_px), 1 if reads_files else safe_count())
+    yield from in_order(measured, len(centers_px), 1 if plan.site.reads_files else safe_count())
 
 
 def _noise(shape: tuple[int, int]) -> Pictures:
@@ -102,23 +96,20 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px:
     if not site.fully_valid and site.valid(extent, level).mean() < MIN_VALID_SHARE:
         return nothing
     gray = site.gray(extent, level)
-    other = None if plan.other is None else _seen_on(plan.other, plan, extent)
     # Nodata is 0 once enhanced: rivals there are weak, as with the masked NCC that a flight uses.
     region = prepared.cut(_window(plan, middle), level)
-    scores = surface(region.search, _templates(gray, noise, other))
+    scores = surface(region.search, _templates(gray, noise))
     x, y = x0 - region.window.x0, y0 - region.window.y0
     exclusion_px = NCC.exclusion_m / (site.gsd_m_per_px * 2.0**level)
     own, rivals = _own_and_rivals(scores, x, y, exclusion_px)
     leads = own - rivals
     sigma = score_sigma(height * width)
-    changed = slice(2, 2 + _DRAWS)
     values = [
         _texture(gray),
         rivals[0],
         own[1],
-        own[changed].mean() / sigma,
-        leads[changed].mean() / sigma,
-        *([np.nan] * 2 if other is None else [own[-1] / sigma, leads[-1] / sigma]),
+        own[2:].mean() / sigma,
+        leads[2:].mean() / sigma,
     ]
     return SelfMatchStatistics(*[np.array(value, np.float64) for value in values])
 
@@ -135,8 +126,8 @@ def _window(plan: AuditPlan, middle_px: Array) -> Window:
     return window
 
 
-def _templates(gray: Gray, noise: Pictures, other: Gray | None) -> Pictures:
-    """(T, h, w) enhanced: the patch unchanged, shaken, changed (draws), and that of another date."""
+def _templates(gray: Gray, noise: Pictures) -> Pictures:
+    """(T, h, w) enhanced: the patch unchanged, shaken, and changed (draws)."""
 
     def enhanced(picture: Gray) -> Pictures:
         return enhance(picture, radius_px=NCC.enhance_radius_px, score=NCC.score)
@@ -148,8 +139,6 @@ def _templates(gray: Gray, noise: Pictures, other: Gray | None) -> Pictures:
         turned = _perturbed(gray, sign * _TURN_DEG, _SCALE**sign, sign * _SHIFT_PX)
         seen = np.clip(turned + sensor, 0.0, 255.0).astype(np.uint8)
         templates.append(enhanced(seen) + _CHANGE * ground)
-    if other is not None:
-        templates.append(enhanced(other))
     return np.stack(templates)
 
 
@@ -173,25 +162,3 @@ def _own_and_rivals(scores: Pictures, x: int, y: int, exclusion_px: float) -> tu
     outside = down * down + across * across > max(exclusion_px, _NEAR_PX) ** 2
     rivals = np.where(outside, scores, -1.0).max(axis=(1, 2))
     return near.max(axis=(1, 2)).astype(np.float64), rivals.astype(np.float64)
-
-
-def _seen_on(other: OrthoMap, plan: AuditPlan, extent: Window) -> Gray | None:
-    """The same ground (h, w) on another map, or None if that does not cover it."""
-    (height, width), scale = plan.shape, 2.0**plan.level
-    corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float64)
-    full = plan.site.full_from_level(corners + np.array([extent.x0, extent.y0]), plan.level)
-    there = other.pixel_from_geodetic(*plan.site.geodetic_from_pixel(full))
-    level = level_for(other.gsd_m_per_px, plan.site.gsd_m_per_px * scale, other.levels)
-    there = other.level_from_full(there, level)
-    low, high = np.floor(there.min(axis=0)).astype(int) - 1, np.ceil(there.max(axis=0)).astype(int) + 2
-    rows, columns = other.level_shape(level)
-    if low.min() < 0 or high[0] > columns or high[1] > rows:
-        return None
-    window = Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
-    if not other.fully_valid and other.valid(window, level).mean() < MIN_VALID_SHARE:
-        return None
-    matrix = cv2.getPerspectiveTransform(corners.astype(np.float32), (there - low).astype(np.float32))
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(
-        cv2.warpPerspective(other.gray(window, level), matrix, (width, height), flags=flags), np.uint8
-    )

@@ -24,7 +24,6 @@ _MARKS = {
     Flag.REPEATED: ("s", "#E69F00", "repeated"),
     Flag.UNSTABLE: ("^", "#009E73", "fine random texture, such as forest"),
     Flag.WEAK: ("v", "#CC79A7", "weak"),
-    Flag.STALE: ("D", "#D55E00", "stale"),
     Flag.NODATA: ("x", "#8c8c8c", "no data"),
     Flag.EDGE: ("+", "#8c8c8c", "too near the edge"),
 }

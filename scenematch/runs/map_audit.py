@@ -36,7 +36,6 @@ class AuditFiles:
         map: the map with its surface.
         camera: calibration; None uses the paper's camera.
         route: GeoJSON LineString, or a QGroundControl .plan.
-        other: the same ground at another date.
         height_agl_m: above the ground; None uses the paper's height.
         around: audit only the circle "LAT,LON,RADIUS_M".
         corridor_m: audit only this distance to either side of the route.
@@ -45,7 +44,6 @@ class AuditFiles:
     map: MapInput
     camera: StrPath | None = None
     route: StrPath | None = None
-    other: StrPath | None = None
     height_agl_m: float | None = None
     around: str | None = None
     corridor_m: float | None = None
@@ -109,7 +107,6 @@ def _plan(
     if files.corridor_m is not None and files.route is None:
         raise OptionError("corridor_m: expected a `route` with it, got none")
     site = files.map.open(progress)
-    other = None if files.other is None else _same_ground(MapInput(files.other).open(progress), site)
     camera = Camera.from_fov(*PAPER_CAMERA) if files.camera is None else Camera.load(files.camera)
     waypoints = None if files.route is None else read_route(files.route)
     if waypoints is not None:
@@ -117,7 +114,7 @@ def _plan(
     height_m = PAPER_HEIGHT_M if files.height_agl_m is None else files.height_agl_m
     with renamed_in_errors(part="route"):
         part = _part(around, waypoints, files.corridor_m, site)
-        plan = plan_audit(site, camera, height_m, options, other, part)
+        plan = plan_audit(site, camera, height_m, options, part)
     _check_size(plan, part)
     return plan, waypoints
 
@@ -158,14 +155,6 @@ def _check_size(plan: AuditPlan, part: MapPart | None) -> None:
         name = "around" if part.around is not None else "corridor_m"
         most, got = (n * plan.site.gsd_m_per_px**2 / 1e6 for n in (SEARCH_LIMIT_PX, plan.area_px))
         raise OptionError(f"{name}: expected at most {most:.0f} km2 of the map to audit, got {got:.0f} km2")
-
-
-def _same_ground(other: OrthoMap, site: OrthoMap) -> OrthoMap:
-    """The other map, if it shows the same ground."""
-    (west, south, east, north), (left, low, right, high) = other.bounds_deg, site.bounds_deg
-    if west > right or east < left or south > high or north < low:
-        raise OptionError(f"other: expected a map of the same ground as {site.name}, got {other.name}, elsewhere")
-    return other
 
 
 def _check_route(waypoints: NDArray[np.float64], site: OrthoMap) -> None:
@@ -210,7 +199,6 @@ def _summary(audit: Audit, route: RouteAvailability | None, files: AuditFiles) -
         "map": str(files.map.map),
         "surface": None if files.map.surface is None else str(files.map.surface),
         "camera": None if files.camera is None else str(files.camera),
-        "other": None if files.other is None else str(files.other),
         "height_agl_m": plan.height_agl_m,
         "prior_sigma_m": plan.options.prior_sigma_m,
         "footprint_m": [n * scale for n in plan.view.footprint_px],

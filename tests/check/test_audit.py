@@ -122,25 +122,6 @@ def test_fine_random_texture_is_less_stable_than_a_town():
 
 
 @pytest.mark.slow
-def test_another_date_finds_what_changed():
-    """Half of the map was built anew: the other date's half is another town."""
-    before, later = town_gray(), town_gray()
-    later[:, HALF:] = before[::-1, ::-1][:, HALF:]
-    sites = [OrthoMap.from_arrays(gray, GRID, UTM) for gray in (before, later)]
-    found = audit_site(sites[0], CAMERA, HEIGHT_M, other=sites[1])
-    alone = audit_site(sites[0], CAMERA, HEIGHT_M)
-    x = found.plan.centers_px[..., 0]
-    known = ~np.isnan(found.availability)
-    reach = found.plan.view.footprint_px[0]
-    same, changed = known & (x < HALF - reach), known & (x > HALF + reach)
-    assert (found.flags[same] == alone.flags[same]).all()
-    was_good = changed & (alone.flags == Flag.GOOD)
-    assert was_good.sum() > 4
-    assert (found.flags[was_good] == Flag.STALE).all()
-    assert (found.availability[changed] <= alone.availability[changed]).all()
-
-
-@pytest.mark.slow
 def test_the_same_map_gives_the_same_audit(site, found):
     again = audit_site(site, CAMERA, HEIGHT_M)
     assert np.array_equal(again.availability, found.availability, equal_nan=True)
@@ -456,7 +437,6 @@ def test_a_folder_that_exists_is_kept_unless_forced(map_file, tmp_path, capsys):
         (["--route=nowhere.plan"], 1, "--route: no such file: nowhere.plan"),
         (["--camera=nowhere.yaml"], 1, "nowhere.yaml"),
         (["--surface=nowhere.tif"], 1, "nowhere.tif"),
-        (["--other=nowhere.tif"], 1, "nowhere.tif"),
     ],
 )
 def test_bad_input_is_one_line_and_no_folder(map_file, tmp_path, capsys, more, code, words):

@@ -49,7 +49,6 @@ def audit(
     route: Annotated[Path | None, option("--route", "FILE")] = None,
     around: Annotated[str | None, option("--around", "LAT,LON,RADIUS_M")] = None,
     corridor_m: Annotated[float | None, option("--corridor-m", "M")] = None,
-    other: Annotated[Path | None, option("--other", "FILE")] = None,
     settings: options.SettingsOption = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
@@ -66,7 +65,6 @@ def audit(
         route: GeoJSON LineString, or a QGroundControl .plan.
         around: Audit only this circle.
         corridor_m: Audit only this distance to either side of the route.
-        other: Map of the same ground at another date, to find stale areas.
     """
     from scenematch.runs.map_audit import AuditFiles, audit_map
     from scenematch.runs.map_input import MapInput
@@ -74,9 +72,8 @@ def audit(
     given = options.read_settings(settings)
     site = MapInput(map_path, surface=surface, **options.table(given, "input").of(MapInput))
     files = AuditFiles(
-        map=site, camera=camera, route=route, other=other, height_agl_m=height_agl_m, around=around,
-        corridor_m=corridor_m,
-    )  # fmt: skip
+        map=site, camera=camera, route=route, height_agl_m=height_agl_m, around=around, corridor_m=corridor_m
+    )
     result = audit_map(files, out, options.table(given, "audit"), force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json(result.summary)
