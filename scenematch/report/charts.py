@@ -77,31 +77,11 @@ class ChartArea:
         label = _text(right, at + (-5 if at > _TOP + 24 else 17), "end", text, kind)
         return _segment(self.left, at, right, at, kind) + label
 
-    def vertical(self, x: float, kind: str, text: str, row: int = 0) -> str:
-        """A labelled vertical line, with its label in a row from the top; empty outside the limits."""
-        if not self.x_limits[0] <= x <= self.x_limits[1]:
-            return ""
-        at = float(self.x(x))
-        gap, anchor = (-6, "end") if at > 0.6 * WIDTH else (6, "start")
-        label = _text(at + gap, _TOP + 14 + 20 * row, anchor, text, kind)
-        return _segment(at, _TOP, at, HEIGHT - _BOTTOM, kind) + label
-
     def overflow(self, x: Array, y: Array, kind: str) -> str:
         """A stroke at the upper edge for each value above it."""
         above = self.x(x[y > self.y_limits[1]])
         marks = "".join(f"M{v:.1f} {_TOP}v9" for v in np.unique(np.round(above, 1)))
         return f'<path class="{kind}" d="{marks}"/>' if marks else ""
-
-    def bars(self, edges: Array, counts: Array, kind: str) -> str:
-        """The bars of a histogram with edges (N + 1,) and counts (N,)."""
-        left, right, top = self.x(edges[:-1]), self.x(edges[1:]), self.y(counts.astype(np.float64))
-        foot = HEIGHT - _BOTTOM
-        marks = "".join(
-            f"M{a + 0.5:.1f} {foot}V{t:.1f}H{b - 0.5:.1f}V{foot}Z"
-            for a, b, t, n in zip(left, right, top, counts, strict=True)
-            if n
-        )
-        return f'<path class="{kind}" d="{marks}"/>'
 
     def strip(self, x: Array, values: Sequence[str]) -> str:
         """A background in the CSS class of each x, up to the next x."""

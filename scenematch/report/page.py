@@ -16,7 +16,7 @@ from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.page_charts import draw_charts
 from scenematch.report.page_map import TrackMap, draw_map, loop_marks, map_of_tracks, track_marks
 from scenematch.report.page_parts import CROSS, charts_with_axis, fill_page, map_with_legend, section
-from scenematch.report.page_tables import draw_inputs, draw_refusals, draw_segments, draw_tiles
+from scenematch.report.page_tables import draw_inputs, draw_refusals, draw_tiles
 from scenematch.report.verdict import loop_sentence, metres, verdict_of
 
 Legend = list[tuple[str, str]]
@@ -34,11 +34,9 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
     track_map = map_of_tracks([track], _view_px(track))
     verdict = verdict_of(track.summary)
     sentences = [verdict.accuracy, *([loop_sentence(track.loop)] if track.loop else []), verdict.latency]
-    segments = draw_segments(track.summary)
     body = [
         section("Where", _where(track, track_map, bool(shown)), "map-section"),
         section("When", _when(track)),
-        *([section("Errors by segment", segments)] if segments else []),
         section("Refusals", draw_refusals(track, shown)),
         section("Frame by frame", _slider(track, shown, why_not), "frames"),
         section("Inputs and versions", f'<div class="inputs">\n{draw_inputs(track.settings)}\n</div>'),

@@ -1,4 +1,4 @@
-"""The charts of the report: error, answers, height, score, latency, attitude, velocity, and a closed loop's."""
+"""The charts of the report: error, answers, height, score, latency, attitude, and a closed loop's."""
 
 from __future__ import annotations
 
@@ -12,11 +12,8 @@ from scenematch.report.metrics import FALSE_SIGMAS, column, truth_per_row
 Chart = tuple[str, str]
 """Caption and SVG."""
 
-_BINS = 48
 _HEADROOM = 1.08  # upper limit relative to the highest value
 _ANGLES = {"roll_deg": "Roll", "pitch_deg": "Pitch", "heading_deg": "Heading"}
-_AXES = ("east", "north")
-_BASE_S, _MAX_GAP_S = 1.0, 5.0  # between fixes whose difference gives a velocity
 
 
 def draw_charts(track: FinishedTrack) -> list[Chart]:
@@ -24,14 +21,14 @@ def draw_charts(track: FinishedTrack) -> list[Chart]:
     if not track.rows:
         return []
     latency_ms, budget_ms = column(track.rows, "latency_ms"), track.settings.get("budget_ms")
-    charts = [_error(track), *_loop(track), *_in_sigmas(track), _answers(track)]
+    charts = [_error(track), *_loop(track), _answers(track)]
     if np.isfinite(track.heights).any():
         charts.append(_height(track))
     if np.isfinite(column(track.rows, "score")).any():
         charts.append(_score(track))
     if np.isfinite(latency_ms).any():
-        charts += [_latency(track, latency_ms, budget_ms), _histogram(latency_ms, budget_ms)]
-    return charts + _motion(track)
+        charts.append(_latency(track, latency_ms, budget_ms))
+    return charts + _attitude(track)
 
 
 def _error(track: FinishedTrack) -> Chart:
@@ -66,24 +63,6 @@ def _error(track: FinishedTrack) -> Chart:
     elif stated.size:
         what += ", with its stated sigma (line)" if any(lines) else f"; stated sigma {np.median(stated):.1f} m"
     return what, area.svg(f"{what} over time", track.time_label, marks, timed=True)
-
-
-def _in_sigmas(track: FinishedTrack) -> list[Chart]:
-    """The error in units of the sigma that the fix states in its direction."""
-    sigmas = np.sqrt(track.errors.normalised_squared_errors)
-    known = sigmas[np.isfinite(sigmas)]
-    if not known.size:
-        return []
-    area = ChartArea(track.time_limits, (0.0, max(1.25 * FALSE_SIGMAS, 1.2 * float(np.percentile(known, 97)))))
-    beyond = track.errors.beyond
-    marks = [
-        area.dots(track.time[~beyond], sigmas[~beyond], "fix"),
-        area.dots(track.time[beyond], sigmas[beyond], "beyond"),
-        area.overflow(track.time, sigmas, "over"),
-    ]
-    fixed = [area.horizontal(FALSE_SIGMAS, "limit", f"{FALSE_SIGMAS:g} sigma")]
-    what = "Horizontal error, in stated sigmas"
-    return [(what, area.svg(f"{what} over time", track.time_label, marks, timed=True, fixed=fixed))]
 
 
 def _answers(track: FinishedTrack) -> Chart:
@@ -132,37 +111,19 @@ def _score(track: FinishedTrack) -> Chart:
 
 
 def _latency(track: FinishedTrack, latency_ms: Array, budget_ms: float | None) -> Chart:
-    area = ChartArea(track.time_limits, (0.0, _top_ms(latency_ms, budget_ms)))
+    known = latency_ms[np.isfinite(latency_ms)]
+    most = min(_HEADROOM * float(known.max()), 1.6 * float(np.percentile(known, 97)))  # without a few outliers
+    area = ChartArea(track.time_limits, (0.0, max(most, _HEADROOM * (budget_ms or 0.0), 0.1)))
     marks = [area.dots(track.time, latency_ms, "fix"), area.overflow(track.time, latency_ms, "over")]
     fixed = [] if budget_ms is None else [area.horizontal(budget_ms, "limit", f"budget {budget_ms:g} ms")]
     return "Latency (ms)", area.svg("Latency over time", track.time_label, marks, timed=True, fixed=fixed)
 
 
-def _histogram(latency_ms: Array, budget_ms: float | None) -> Chart:
-    known = latency_ms[np.isfinite(latency_ms)]
-    top = _top_ms(latency_ms, budget_ms)
-    counts, edges = np.histogram(np.minimum(known, np.nextafter(top, 0.0)), bins=_BINS, range=(0.0, top))
-    area = ChartArea((0.0, top), (0.0, _HEADROOM * float(counts.max())))
-    marks = [
-        area.bars(edges, counts, "bars"),
-        area.vertical(float(np.percentile(known, 95)), "mark", f"95 %: {np.percentile(known, 95):.1f} ms"),
-        "" if budget_ms is None else area.vertical(budget_ms, "limit", f"budget {budget_ms:g} ms", row=1),
-    ]
-    return "Frames by latency", area.svg("Histogram of latency", "latency (ms)", marks, timed=False)
+# -------------------------------------------------------------------------------------------------------- attitude
 
 
-def _top_ms(latency_ms: Array, budget_ms: float | None) -> float:
-    """Upper limit of the latency axis in milliseconds, ignoring a few outliers."""
-    known = latency_ms[np.isfinite(latency_ms)]
-    typical = 1.6 * float(np.percentile(known, 97))
-    return max(min(_HEADROOM * float(known.max()), typical), _HEADROOM * (budget_ms or 0.0), 0.1)
-
-
-# ----------------------------------------------------------------------------------------- attitude and velocity
-
-
-def _motion(track: FinishedTrack) -> list[Chart]:
-    """Charts of roll, pitch, heading and velocity, those without data left out.
+def _attitude(track: FinishedTrack) -> list[Chart]:
+    """Charts of roll, pitch and heading, those without data left out.
 
     The notes have the attitudes of the fixes; the telemetry belongs to the rows by frame name.
     """
@@ -176,24 +137,28 @@ def _motion(track: FinishedTrack) -> list[Chart]:
     for name, words in _ANGLES.items():
         fix = column(track.notes or [None] * len(rows), name)
         charts.append(_angle_chart(words, fix, column(stated, name), column(true, name), track))
-    if track.is_timed:
-        for axis, words in enumerate(_AXES):
-            charts.append(_velocity_chart(axis, column(stated, f"{words}_velocity_mps"), track))
     return [chart for chart in charts if chart is not None]
 
 
 def _angle_chart(words: str, fix: Array, stated: Array, true: Array, track: FinishedTrack) -> Chart | None:
-    """Chart of one angle; omitted if neither the fixes nor the telemetry have it."""
+    """Dots of the fixes on lines of telemetry and truth; omitted if neither fixes nor telemetry have the angle."""
     if not (np.isfinite(fix).any() or np.isfinite(stated).any()):
         return None
-    if words == "Heading":  # kept continuous across north
+    is_heading = words == "Heading"
+    if is_heading:  # kept continuous across north
         reference = _unwrapped(next(a for a in (true, stated, fix) if np.isfinite(a).any()))
         fix, stated, true = (a - 360.0 * np.round((a - reference) / 360.0) for a in (fix, stated, true))
-    caption = f"{words} (degrees)"
-    error = fix - true
+    caption, error = f"{words} (degrees)", fix - true
     if np.isfinite(error).any():
         caption += f", RMS error of the fixes {np.sqrt(np.nanmean(error**2)):.2f}"
-    return _chart(caption, fix, stated, true, track, 360.0 if words == "Heading" else None)
+    area = _area_around(np.concatenate([fix, stated, true]), 0.5, track)
+    marks = [
+        area.line(track.time, stated, "telemetry"),
+        area.dots(track.time, fix, "fix"),
+        area.line(track.time, true, "truth"),
+    ]
+    period = 360.0 if is_heading else None
+    return caption, area.svg(f"{caption} over time", track.time_label, marks, timed=True, period=period)
 
 
 def _unwrapped(heading_deg: Array) -> Array:
@@ -202,56 +167,6 @@ def _unwrapped(heading_deg: Array) -> Array:
     index = np.arange(len(heading_deg), dtype=np.float64)
     unwrapped = np.unwrap(heading_deg[known], period=360.0)
     return np.asarray(np.interp(index, index[known], unwrapped), np.float64)
-
-
-def _velocity_chart(axis: int, stated: Array, track: FinishedTrack) -> Chart | None:
-    fix = velocity_mps(track.time, track.errors.fix_en_m[:, axis])
-    true = velocity_mps(track.time, track.errors.truth_en_m[:, axis])
-    if not (np.isfinite(fix).any() or np.isfinite(stated).any()):
-        return None
-    caption = f"Velocity {_AXES[axis]} (m/s)"
-    if np.isfinite(fix).any():
-        caption += f", of fixes at least {_BASE_S:g} s apart"
-    return _chart(caption, fix, stated, true, track)
-
-
-def velocity_mps(time_s: Array, position_m: Array) -> Array:
-    """Velocity about each known position, from the nearest ones at least half a second before and after it.
-
-    Args:
-        time_s: (N,) not descending.
-        position_m: (N,), NaN where unknown.
-
-    Returns:
-        (N,); NaN at the ends, where the position is unknown, and where the two are more than 5 s apart.
-    """
-    velocity = np.full(len(time_s), np.nan)
-    known = np.flatnonzero(np.isfinite(position_m))
-    if known.size < 3:
-        return velocity
-    time, position = time_s[known], position_m[known]
-    before = np.searchsorted(time, time - _BASE_S / 2.0 + 1e-6, side="right") - 1
-    after = np.searchsorted(time, time + _BASE_S / 2.0 - 1e-6, side="left")
-    inside = (before >= 0) & (after < known.size)
-    a, b = before[inside], after[inside]
-    gap = time[b] - time[a]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rate = (position[b] - position[a]) / gap
-    velocity[known[inside]] = np.where((gap > 0.0) & (gap <= _MAX_GAP_S), rate, np.nan)
-    return velocity
-
-
-def _chart(
-    caption: str, fix: Array, stated: Array, true: Array, track: FinishedTrack, period: float | None = None
-) -> Chart:
-    """Dots of the fixes on lines of telemetry and truth."""
-    area = _area_around(np.concatenate([fix, stated, true]), 0.5, track)
-    marks = [
-        area.line(track.time, stated, "telemetry"),
-        area.dots(track.time, fix, "fix"),
-        area.line(track.time, true, "truth"),
-    ]
-    return caption, area.svg(f"{caption} over time", track.time_label, marks, timed=True, period=period)
 
 
 # --------------------------------------------------------------------------------------------------- closed loop

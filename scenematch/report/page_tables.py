@@ -1,4 +1,4 @@
-"""Tables of the report: key figures, errors by segment, refusals, inputs and versions."""
+"""Tables of the report: key figures, refusals, inputs and versions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import numpy as np
 from engine.values import Reason
 from scenematch.report.explain import SliderFrame
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.page_parts import table
 from scenematch.report.verdict import MEANINGS, metres
 
 _FACTS = {
@@ -58,21 +57,6 @@ def draw_tiles(track: FinishedTrack) -> list[tuple[str, str]]:
         if summary["latency_ms"][key] is not None:
             tiles.append((name, f"{summary['latency_ms'][key]:.1f} ms"))
     return tiles
-
-
-def draw_segments(summary: Mapping[str, Any]) -> str:
-    """The table of errors by segment; empty without any."""
-    rows = []
-    for one in summary.get("segments") or ():
-        length = f"{one['length_m']:g} m" if "length_m" in one else f"{one['duration_s']:g} s"
-        rows.append((length, str(one["segments"]), *(metres(one[key]) for key in ("median_m", "p95_m", "max_m"))))
-    if not rows:
-        return ""
-    words = (
-        "How far the displacement between two fixes is off, by their distance along the true path, or in time: "
-        "evo's relative pose error of the positions, all pairs. An offset that stays the same does not show here."
-    )
-    return f'<p class="sub">{words}</p>\n' + table(("segment", "number", "median", "95 % below", "largest"), rows)
 
 
 def draw_refusals(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:

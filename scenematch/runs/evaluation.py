@@ -14,6 +14,7 @@ from scenematch.files.corrections import Corrections
 from scenematch.files.settings import nested, options_from_mapping
 from scenematch.files.track import TrackRow, read_track
 from scenematch.report.finished_track import FinishedTrack
+from scenematch.report.metrics import summarise
 from scenematch.report.page import shows_frames
 from scenematch.report.runs_page import MAX_RUNS, write_runs_page
 from scenematch.runs.cameras import CameraInput
@@ -21,7 +22,7 @@ from scenematch.runs.inputs import FlightFiles, open_run_truth
 from scenematch.runs.map_input import MapInput
 from scenematch.runs.output import SILENT, Progress, StrPath, check_file
 from scenematch.runs.record import RunRecord, read_record
-from scenematch.runs.results import PAGE, SUMMARY, TRACK, ReportFrames, figures_of, write_results
+from scenematch.runs.results import PAGE, SUMMARY, TRACK, ReportFrames, write_results
 from scenematch.runs.settings import TrackSettings
 
 COMPARISON = "comparison.html"
@@ -171,5 +172,5 @@ def _finished(folder: Path, site: OrthoMap, record: RunRecord) -> FinishedTrack:
     """A finished run on a map, with its figures recomputed."""
     rows = read_track(folder / TRACK)
     truth = open_run_truth(record.truth, rows)
-    summary = figures_of(rows, truth, site, record.ground) | {"settings": record.facts()}
+    summary = summarise(rows, truth, frame=site.frame, ground=record.ground) | {"settings": record.facts()}
     return FinishedTrack(rows, truth, site, record.ground, summary, None)

@@ -18,9 +18,9 @@ from scenematch.files.track import TrackRow
 from scenematch.report.explain import explain_frames
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.loop_record import read_loop_csv
-from scenematch.report.metrics import Ground, errors_en_m, summarise
+from scenematch.report.metrics import summarise
+from scenematch.report.motion import motion_consistency
 from scenematch.report.page import write_page
-from scenematch.report.segments import motion_consistency, segment_errors
 from scenematch.runs.output import SILENT, Progress, write_json
 from scenematch.runs.record import RunRecord
 
@@ -53,8 +53,8 @@ def write_results(
 ) -> dict[str, Any]:
     """Write summary.json and, if requested, the report page, replacing older ones."""
     telemetry = None if frames.flight is None else frames.flight.rows
-    motion = {"motion_consistency": motion_consistency(rows, telemetry, site.frame)}
-    summary = figures_of(rows, truth, site, record.ground) | motion | {"settings": record.facts()}
+    more = {"motion_consistency": motion_consistency(rows, telemetry, site.frame), "settings": record.facts()}
+    summary = summarise(rows, truth, frame=site.frame, ground=record.ground) | more
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
         fixed = [row.timestamp_ns for row in rows if row.fixed and row.timestamp_ns is not None]
         given = [row.timestamp_ns for row in truth or []]
@@ -70,12 +70,6 @@ def write_results(
         track = FinishedTrack(rows, truth, site, record.ground, summary, notes, telemetry, loop)
         _write_page(out / PAGE, track, frames)
     return summary
-
-
-def figures_of(rows: list[TrackRow], truth: list[Truth] | None, site: OrthoMap, ground: Ground) -> dict[str, Any]:
-    """Figures of merit of a track, with truth its errors by segment, too."""
-    segments = {"segments": segment_errors(rows, errors_en_m(rows, truth, site.frame))} if truth else {}
-    return summarise(rows, truth, frame=site.frame, ground=ground) | segments
 
 
 def _span(stamps_ns: list[int]) -> str:
