@@ -100,10 +100,10 @@ def summarise_loop(result: LoopResult) -> dict[str, Any]:
 
     Returns:
         ``seconds``; ``handed_over``, whether the flight ended in a handover; ``plan_rms_m`` and ``plan_max_m``,
-        the true track's horizontal distance from the planned position at each time; ``path_rms_m``, that from the
-        nearest point of the path; ``height_rms_m``; ``estimate_rms_m`` and ``estimate_max_m``, the filter's
-        horizontal error after its first 5 s; ``estimate_nees``, 2 if its covariance is consistent; ``frames``,
-        ``fixes``, ``used`` and ``resets``; ``unhealthy_s`` and ``hold_s``.
+        the true track's horizontal distance from the planned position at each time; ``height_rms_m``;
+        ``estimate_rms_m`` and ``estimate_max_m``, the filter's horizontal error after its first 5 s;
+        ``estimate_nees``, 2 if its covariance is consistent; ``frames``, ``fixes``, ``used`` and ``resets``;
+        ``unhealthy_s`` and ``hold_s``.
     """
     plan, estimate = result.plan_error_m, result.estimate_error_m
     settled = [k for k, row in enumerate(result.record) if row.time_s >= SETTLING_S] or [len(result.record) - 1]
@@ -116,7 +116,6 @@ def summarise_loop(result: LoopResult) -> dict[str, Any]:
         "handed_over": result.record[-1].mode is Mode.HANDED_OVER,
         "plan_rms_m": rms(off),
         "plan_max_m": float(off.max()),
-        "path_rms_m": rms(_off_path(result)),
         "height_rms_m": rms(plan[:, 2]),
         "estimate_rms_m": rms(wrong),
         "estimate_max_m": float(wrong.max()),
@@ -133,16 +132,3 @@ def summarise_loop(result: LoopResult) -> dict[str, Any]:
 def rms(values: Array) -> float:
     """Root mean square."""
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _off_path(result: LoopResult) -> Array:
-    """(N,) horizontal distance in metres of true positions from the nearest point of the path."""
-    path = np.array([row.plan_m[:2] for row in result.record])
-    true = np.array([row.truth.position_m[:2] for row in result.record])
-    steps, start = np.diff(path, axis=0), path[:-1]
-    length2 = np.maximum((steps**2).sum(axis=1), 1e-12)
-    nearest = []
-    for position in true:
-        fraction = np.clip(((position - start) * steps).sum(axis=1) / length2, 0.0, 1.0)
-        nearest.append(np.hypot(*(start + fraction[:, None] * steps - position).T).min() if len(start) else 0.0)
-    return np.array(nearest)
