@@ -155,6 +155,18 @@ class GridPose:
             return None
         return Attitude(self.roll_deg or 0.0, self.pitch_deg or 0.0, wrap_heading_deg(self.grid_heading_deg))
 
+    @property
+    def known_height_m(self) -> float:
+        """The height; only of a pose that has one, or its frame would have been refused."""
+        assert self.height_agl_m is not None
+        return self.height_agl_m
+
+    @property
+    def known_attitude(self) -> Attitude:
+        """The attitude; only of a pose that has a heading, or its frame would have been refused."""
+        assert self.grid_attitude is not None
+        return self.grid_attitude
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prior:

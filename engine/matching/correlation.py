@@ -83,9 +83,7 @@ class Correlator:
             nadir_px: (2,) where to look up its ground; None takes the prior's place, or level ground.
         """
         query, options = self.query, self.options
-        attitude, height = pose.grid_attitude, pose.height_agl_m
-        assert attitude is not None  # a hypothesis has both
-        assert height is not None
+        attitude, height = pose.known_attitude, pose.known_height_m
         jacobian = query.jacobian * 2.0**level
         if is_oblique(query, attitude):
             return self._align_oblique(pose, level, nadir_px)
@@ -111,9 +109,9 @@ class Correlator:
 
         They show no place on Earth, unless the compass is wrong by half a turn or the camera mirrors its picture.
         """
-        query, own, attitude = self.query, aligned.patch.gray, aligned.pose.grid_attitude
+        query, own = self.query, aligned.patch.gray
         turned, patch = np.ascontiguousarray(own[::-1, ::-1]), None
-        if attitude is not None and not is_oblique(query, attitude):
+        if not is_oblique(query, aligned.pose.known_attitude):
             mirrored = np.ascontiguousarray(query.gray[:, ::-1])
             patch = rectify(mirrored, query.camera, aligned.view)
         return [turned, np.ascontiguousarray(own[:, ::-1]) if patch is None else patch.gray]
@@ -121,9 +119,7 @@ class Correlator:
     def _align_oblique(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
         """An oblique frame drawn over the ground's relief; its view is that of the correlated part."""
         query, options = self.query, self.options
-        attitude, height = pose.grid_attitude, pose.height_agl_m
-        assert attitude is not None
-        assert height is not None
+        attitude, height = pose.known_attitude, pose.known_height_m
         place = query.prior_px if nadir_px is None else nadir_px
         patch = oblique_patch(query, attitude, height, level, place)
         if patch is None:
@@ -284,8 +280,7 @@ def _about(stop: EarlyStop, window: Window) -> EarlyStop:
 
 def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:
     """Expected pixels of the window per level above the frame's own; the cost is proportional to them."""
-    site, camera, height_m = query.site, query.camera, query.telemetry.height_agl_m
-    assert height_m is not None  # checked before
+    site, camera, height_m = query.site, query.camera, query.telemetry.known_height_m
     assert query.prior is not None
     own = query.level_of(height_m)
     out = {}

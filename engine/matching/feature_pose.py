@@ -130,8 +130,7 @@ class FeatureMatcher:
             Points (M, 2) in pixels of the undistorted frame, their places (M, 3) on the ground in metres, and the
             pose with its inliers, or None if the matches are too few or determine none.
         """
-        height_m = self.query.telemetry.height_agl_m
-        assert height_m is not None  # without one there is no single view
+        height_m = self.query.telemetry.known_height_m
         hypothesis = TelemetryHypothesis((height_m, height_m), x_axis_deg(self.query))
         views = [view_in(self.query, window, height_m, self.options.scale)]
         found = match_views(self.query, self.landmarks, self.options, views, hypothesis, self.finder)[0]

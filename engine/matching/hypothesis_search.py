@@ -46,8 +46,7 @@ _ROUNDS = 2  # of fitting heading and height, on the middle level and at full re
 
 def reach_of(correlator: Correlator) -> Reach:
     """How far heading and height are searched: as far as the position, in sigmas."""
-    query, height_m = correlator.query, correlator.query.telemetry.height_agl_m
-    assert height_m is not None  # a frame without one was refused
+    query, height_m = correlator.query, correlator.query.telemetry.known_height_m
     errors = query.errors(correlator.options.errors)
     share = SPREAD_SIGMAS * errors.height_sigma_m(height_m) / height_m
     return min(SPREAD_SIGMAS * errors.heading_deg, 180.0), min(share, _MAX_SHARE)
@@ -161,12 +160,12 @@ def _steps(reach: float, step: float) -> list[float]:
 
 def _hypotheses(pose: GridPose, turns: list[float], shares: list[float]) -> list[GridPose]:
     """The pose with its heading turned by each of ``turns`` and its height changed by each of ``shares``."""
-    height, heading = pose.height_agl_m, pose.grid_heading_deg or 0.0
-    assert height is not None  # a frame without one was refused
-    return [
-        replace(pose, grid_heading_deg=(heading + turn) % 360.0, height_agl_m=height * (1.0 + share))
-        for turn, share in itertools.product(turns, shares)
-    ]
+    return [_turned(pose, turn, share) for turn, share in itertools.product(turns, shares)]
+
+
+def _turned(pose: GridPose, turn_deg: float, share: float) -> GridPose:
+    heading_deg, height_m = (pose.grid_heading_deg or 0.0) + turn_deg, pose.known_height_m * (1.0 + share)
+    return replace(pose, grid_heading_deg=heading_deg % 360.0, height_agl_m=height_m)
 
 
 def _coarse(
@@ -259,16 +258,8 @@ def _moved(
 ) -> tuple[Peak, Aligned] | None:
     """The peak near the last one, with the heading turned and the height changed by a share."""
     peak, aligned = best
-    pose = aligned.pose
-    assert pose.grid_heading_deg is not None
-    assert pose.height_agl_m is not None
-    moved = replace(
-        pose,
-        grid_heading_deg=(pose.grid_heading_deg + math.degrees(turn_rad)) % 360.0,
-        height_agl_m=pose.height_agl_m * (1.0 + share),
-    )
     nadir = correlator.nadir_px(peak, aligned)
-    other = correlator.align(moved, aligned.level, nadir)
+    other = correlator.align(_turned(aligned.pose, math.degrees(turn_rad), share), aligned.level, nadir)
     if isinstance(other, NoFix):
         return None
     found = _near(correlator, other, nadir, aligned.level)

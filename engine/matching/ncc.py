@@ -210,8 +210,7 @@ class Ncc(Method):
     def _align(self, correlator: Correlator, coarser: int) -> Aligned | NoFix:
         """The frame with its own height and heading."""
         query, pose = correlator.query, correlator.query.telemetry
-        assert pose.height_agl_m is not None  # or it was refused
-        level = min(query.level_of(pose.height_agl_m) + coarser, query.site.levels - 1)
+        level = min(query.level_of(pose.known_height_m) + coarser, query.site.levels - 1)
         with query.scheduler.stage("align"):
             return correlator.align(pose, level)
 
@@ -322,7 +321,7 @@ class Efforts:
         self, answer: Result | None, found: PeakCandidate | NoFix, first: PeakCandidate | NoFix
     ) -> Result | None:
         """The fix of a peak, or its refusal, which names the match by grey levels and leaves a coarse fix."""
-        query, height_m = self.query, self.query.telemetry.height_agl_m
+        query = self.query
         result = self._ncc.judge(query, found)
         if isinstance(result, NoFix):
             self._refusal = replace(result, match=None if isinstance(first, NoFix) else first.fix)
@@ -330,9 +329,8 @@ class Efforts:
                 self._doubtful = found  # structure's, if it was matched: it sees what grey levels see, and more
             return None if isinstance(answer, Fix) else self._refusal
         assert isinstance(found, PeakCandidate)
-        assert height_m is not None
         self._refused, self._accepted = None, found
-        if found.aligned.level == query.level_of(height_m):
+        if found.aligned.level == query.level_of(query.telemetry.known_height_m):
             return result
         result = replace(result, stage="coarse")
         return with_unconfirmed_tilt(query, result) if is_coarse(answer) else result

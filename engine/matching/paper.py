@@ -123,19 +123,18 @@ def _window(query: Query) -> Window | None:
 
 def _scale(query: Query) -> float:
     """Map pixels per pixel of the frame (eq. 2)."""
-    assert query.telemetry.height_agl_m is not None  # refused before
-    return query.telemetry.height_agl_m / (query.camera.focal_px * query.site.gsd_m_per_px)
+    return query.telemetry.known_height_m / (query.camera.focal_px * query.site.gsd_m_per_px)
 
 
 def template_of(query: Query, window: Window) -> Gray | None:
     """The frame equalised, scaled (eq. 2) and turned (eq. 3), square; None if it does not fit the window."""
-    assert query.telemetry.grid_heading_deg is not None  # refused before
     height, width = query.gray.shape
     scale, jacobian = _scale(query), query.jacobian
     side = int(FRACTION * scale * min(height, width))
     if side < 8 or window.width_px < side or window.height_px < side:
         return None
-    alpha_deg = query.telemetry.grid_heading_deg - float(np.degrees(np.arctan2(-jacobian[0, 1], -jacobian[1, 1])))
+    up_deg = float(np.degrees(np.arctan2(-jacobian[0, 1], -jacobian[1, 1])))
+    alpha_deg = query.telemetry.known_attitude.heading_deg - up_deg
     # getRotationMatrix2D turns anticlockwise; the frame's top points alpha clockwise of the map's top.
     turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), -alpha_deg, scale)
     turn[:, 2] += (side - 1) / 2 - np.array([(width - 1) / 2, (height - 1) / 2])

@@ -141,11 +141,9 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
     """The camera's nadir and its covariance; also the heading if it was searched."""
     query, pose = correlator.query, aligned.pose
     errors = query.errors(correlator.options.errors)
-    height_m = pose.height_agl_m
-    assert height_m is not None  # checked before
     rows, columns = aligned.template.shape
     peak_px2 = peak_covariance_px(peak, rows * columns)
-    peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), height_m, errors)
+    peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), pose.known_height_m, errors)
     covariance = ncc_covariance_m2(peak_px2, pose, query.camera, aligned.jacobian, errors)
     return query.fix(
         METHOD,

@@ -169,16 +169,11 @@ class Query:
 
     def at(self, pose: GridPose) -> Query:
         """The same query with the heading and height that a search found, as accurate as its steps."""
-        known, height_m = self.telemetry, pose.height_agl_m
-        assert self.frame.heading_deg is not None  # a hypothesis has both
-        assert known.grid_heading_deg is not None
-        assert pose.grid_heading_deg is not None
-        assert known.height_agl_m is not None
-        assert height_m is not None
-        turn_deg = pose.grid_heading_deg - known.grid_heading_deg
+        known, height_m = self.telemetry, pose.known_height_m
+        turn_deg = pose.known_attitude.heading_deg - known.known_attitude.heading_deg
         found = replace(
             self.frame,
-            heading_deg=wrap_heading_deg(self.frame.heading_deg + turn_deg),
+            heading_deg=wrap_heading_deg((self.frame.heading_deg or 0.0) + turn_deg),
             heading_sigma_deg=_FOUND_HEADING_DEG,
             height_agl_m=height_m,
             height_sigma_m=_FOUND_HEIGHT_SHARE * height_m,

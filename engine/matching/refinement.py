@@ -110,9 +110,7 @@ class Refinement:
             except OutOfTime:
                 if refined is None:
                     raise
-        attitude = query.telemetry.grid_attitude
-        assert attitude is not None  # a fix by correlation had one
-        if refined or not is_oblique(query, attitude):
+        if refined or not is_oblique(query, query.telemetry.known_attitude):
             evidence = replace(evidence, refined=refined is not None)
         likely = probability(evidence.nats)
         if not evidence.suffices(query.risk):
@@ -211,8 +209,7 @@ class Refinement:
 
         The pose must fit better than the one to begin with.
         """
-        query, site, height_m = self.query, self.query.site, self.query.telemetry.height_agl_m
-        assert height_m is not None  # a fix by correlation had one
+        query, site, height_m = self.query, self.query.site, self.query.telemetry.known_height_m
         own, has_tilt = query.level_of(height_m), self._knows_tilt
         least = _MIN_CORRELATION if has_tilt else CONFIRMING_CORRELATION
         pose, fit = prior.pose, None
@@ -237,10 +234,8 @@ class Refinement:
         """The telemetry's height and attitude; the correlation's position is only a start, without weight."""
         query, known = self.query, self.query.telemetry
         errors = query.errors(self.options.errors)
-        attitude, height_m = known.grid_attitude, known.height_agl_m
-        assert attitude is not None
-        assert height_m is not None
-        attitude_prior = query.attitude_prior(attitude.heading_deg, errors.heading_deg, errors)
+        height_m = known.known_height_m
+        attitude_prior = query.attitude_prior(known.known_attitude.heading_deg, errors.heading_deg, errors)
         precision = np.zeros((8, 8))
         precision[2, 2] = errors.height_sigma_m(height_m) ** -2.0
         precision[3:6, 3:6] = attitude_prior.precision
@@ -296,9 +291,7 @@ def _is_confirmed(refined: Fix | None) -> TypeGuard[Fix]:
 
 def with_unconfirmed_tilt(query: Query, fix: Fix) -> Fix:
     """The fix of a frame whose picture does not confirm its attitude, with a covariance for a wrong tilt."""
-    height_m = query.telemetry.height_agl_m
-    assert height_m is not None  # else there would be no attitude to confirm
-    doubt_m = height_m * math.radians(_UNCONFIRMED_TILT_DEG)
+    doubt_m = query.telemetry.known_height_m * math.radians(_UNCONFIRMED_TILT_DEG)
     return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0]))
 
 
