@@ -1,4 +1,4 @@
-"""The notices list what is installed for whom, under the licences that the packages declare."""
+"""The notices list what is installed for whom, under its licences; an image is built of the whole distribution."""
 
 import re
 import tomllib
@@ -8,7 +8,8 @@ import pytest
 
 from tests.support.paths import ROOT
 
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+FILE = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = FILE["project"]
 NOTICES = (ROOT / "THIRD_PARTY_NOTICES.md").read_text(encoding="utf-8")
 FOR_DEVELOPERS = {"test", "bench", "docs", "dev"}
 NAME = re.compile(r"[A-Za-z0-9._-]+")
@@ -47,3 +48,11 @@ def test_a_licence_is_that_which_its_package_declares(name, licence):
 
 def test_the_notices_are_in_the_distribution():
     assert set(PROJECT["license-files"]) == {"LICENSE", "THIRD_PARTY_NOTICES.md"}
+
+
+def test_an_image_is_built_of_every_package():
+    recipe, sent = ((ROOT / name).read_text(encoding="utf-8") for name in ("Containerfile", ".containerignore"))
+    for pattern in FILE["tool"]["setuptools"]["packages"]["find"]["include"]:
+        package = pattern.rstrip("*")
+        assert f"COPY {package} /src/{package}\n" in recipe
+        assert f"!{package}\n" in sent
