@@ -26,9 +26,8 @@ Array = NDArray[np.float64]
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
 """Names of ROS camera_info, and the valid numbers of coefficients of each."""
 _FISHEYES = ("equidistant", "fisheye")
-_BORDER_RAYS = 16  # along each side of the frame
-
-
+SIDE_STEPS = 16
+"""Into which each side of a frame, or of a picture of the ground, is divided where its projection is computed."""
 NADIR_PITCH_DEG = -90.0
 """Pitch of a camera that looks straight down."""
 MOUNTS = {
@@ -238,7 +237,7 @@ class Camera:
     @cached_property
     def border_rays(self) -> Array:
         """(N, 3) optical rays through the border of the frame; the last goes through its middle."""
-        share = np.linspace(0.0, 1.0, _BORDER_RAYS, endpoint=False)
+        share = np.linspace(0.0, 1.0, SIDE_STEPS, endpoint=False)
         zero, one = np.zeros_like(share), np.ones_like(share)
         sides = [(share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share)]
         xy = np.concatenate([np.stack(side, axis=1) for side in sides] + [np.array([[0.5, 0.5]])])

@@ -6,10 +6,11 @@ import math
 from dataclasses import dataclass, field
 
 from engine.errors import OptionError
+from engine.geo import chi_square_of
 from engine.kernels.scores import check_score
 from engine.learned.pairs import PairMatcher
 from engine.sift import BACKENDS
-from engine.values import MAX_SIGMA_M, GridPose, check, check_choice, check_positive
+from engine.values import MAX_SIGMA_M, RISK, GridPose, check, check_choice, check_positive
 
 PROFILES = ("engine", "paper")
 MAP_FEATURES = ("prepared", "per_frame")
@@ -219,7 +220,7 @@ class MatcherOptions:
     """
 
     profile: str = "engine"
-    risk: float = 1e-4
+    risk: float = RISK
     ncc: NccOptions = field(default_factory=NccOptions)
     sift: SiftOptions = field(default_factory=SiftOptions)
     learned: LearnedOptions = field(default_factory=LearnedOptions)
@@ -259,7 +260,7 @@ class NavigatorOptions:
     acceleration_mps2: float = 3.0
     max_speed_mps: float = 15.0
     default_interval_s: float = 0.2
-    gate: float = 18.4
+    gate: float = round(chi_square_of(RISK, 2), 1)
     min_confidence: float = 0.999
     lost_sigma_m: float = 100.0
     search_every: int = 3

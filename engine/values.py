@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MAX_SIGMA_M = 1e6
 """Upper bound on the standard deviation of a position or of a map's georeference."""
+RISK = 1e-4
+"""Probability of an error that is allowed unless another is chosen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,7 +370,7 @@ class Fix:
         """Horizontal standard deviation, the larger of the two axes of the ellipse."""
         return math.sqrt(larger_variance(self.covariance_m2[:2, :2]))
 
-    def protection_level_m(self, risk: float = 1e-4) -> float:
+    def protection_level_m(self, risk: float = RISK) -> float:
         """Horizontal radius around the fix that the vehicle exceeds with at most this probability.
 
         It allows for a wrong place, by :attr:`confidence`, and for the covariance, as a circle with the ellipse's

@@ -7,9 +7,7 @@ import numpy as np
 from engine.runtime.jit import compiled, inlined
 
 _MAX_SIDE = 2048  # cells along a side of the histogram
-_ROUNDS = 4  # of the mean shift from the fullest cells to the middle of the points
-_FIRST_REACH = 1.25  # of the radius, around the fullest cells, whose middle is off by up to half a cell
-_REACH = 2  # cells to either side counted with each cell
+_REACH = 2  # cells in a radius, counted to either side of each
 
 
 @compiled("(f8[:, ::1], f8)")
@@ -17,7 +15,7 @@ def densest(points, radius):
     """Mark the points within a radius of the place with the most points.
 
     The fullest 5 x 5 cells of a histogram, whose cells are half a radius wide, give the place nearly; from there
-    the mean of the points within the radius is followed.
+    the mean of the points within the radius is followed while their number grows.
 
     Args:
         points: (M, 2) float64, finite.
@@ -32,21 +30,20 @@ def densest(points, radius):
         return best
     x, y = _place_of_fullest_cells(points, radius)
     most, near = 0, np.empty(count, np.bool_)
-    held, x, y = _mark_near(points, x, y, _FIRST_REACH * radius, near)
-    for _ in range(_ROUNDS):
-        if held == 0:
-            break
+    # The middle of the fullest cells is off by up to half a cell.
+    held, x, y = _mark_near(points, x, y, radius + 0.5 * radius / _REACH, near)
+    held, x, y = _mark_near(points, x, y, radius, near)
+    while held > most:
+        most = held
+        for n in range(count):
+            best[n] = near[n]
         held, x, y = _mark_near(points, x, y, radius, near)
-        if held > most:
-            most = held
-            for n in range(count):
-                best[n] = near[n]
     return best
 
 
 @inlined
 def _mark_near(points, x, y, radius, near):
-    """Mark the points within a radius of a place; return their number and mean."""
+    """Mark the points within a radius of a place; return their number and mean, or the place if there is none."""
     held, east, north = 0, 0.0, 0.0
     for n in range(len(points)):
         off_x, off_y = points[n, 0] - x, points[n, 1] - y
@@ -55,7 +52,7 @@ def _mark_near(points, x, y, radius, near):
             held += 1
             east += points[n, 0]
             north += points[n, 1]
-    return held, east / max(held, 1), north / max(held, 1)
+    return held, east / held if held else x, north / held if held else y
 
 
 @inlined
@@ -65,7 +62,7 @@ def _place_of_fullest_cells(points, radius):
     for n in range(1, len(points)):
         left, right = min(left, points[n, 0]), max(right, points[n, 0])
         top, bottom = min(top, points[n, 1]), max(bottom, points[n, 1])
-    cell = max(radius / 2.0, max(right - left, bottom - top) / _MAX_SIDE)
+    cell = max(radius / _REACH, max(right - left, bottom - top) / _MAX_SIDE)
     rows, columns = int((bottom - top) / cell) + 1, int((right - left) / cell) + 1
     margin = 2 * _REACH
     sums = np.zeros((rows + margin, columns + margin), np.int32)

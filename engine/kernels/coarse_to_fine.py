@@ -28,8 +28,7 @@ FloatImage = NDArray[np.float32]
 
 WIDE_PX = 2_000_000
 """Windows of more pixels are wide: every position at full resolution takes a tenth of a second and more."""
-_MIN_HALVED_PX = 128 * 128
-_CANDIDATES, _CANDIDATES_WIDE = 6, 64
+_CANDIDATES, _CANDIDATES_WIDE = 6, 64  # refined before all positions are scored; that takes long in a wide window
 _SEPARATION_PX = 2  # of candidates, on the coarsest level
 _MAX_LOSS = 0.5  # of a perfect match between pixels, on the coarsest level usable for an early stop
 
@@ -155,7 +154,7 @@ def _levels(search: MapRegion, template: FloatImage, min_overlap: float, max_los
     parts, models = [search], [template - template.mean()]
     while (half := parts[-1].half) is not None:
         (H, W), (h, w) = parts[-1].image.shape, models[-1].shape
-        if min(h, w) < 2 * COARSE_TEMPLATE_PX or H * W < _MIN_HALVED_PX or min(H - h, W - w) < 16:
+        if min(h, w) < 2 * COARSE_TEMPLATE_PX or min(H - h, W - w) < 16:
             break
         coarser = halved(models[-1])
         if max_loss < 1.0 and _phase_loss(models[-1], coarser) > max_loss:

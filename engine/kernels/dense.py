@@ -30,12 +30,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
-MIN_SAMPLES = 60
-MAX_STEPS = 12
-"""Gauss-Newton steps at most; four or five are usual."""
-_LAST_STEP = 0.5  # in standard deviations of the pose; the next one would be a tenth of it
-_EXCESS = 1.6  # variance factor at which the errors over six simulated towns at noon match the covariance
-
 
 @dataclass(frozen=True, slots=True)
 class Samples:
@@ -137,7 +131,7 @@ def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> floa
         pose: its slope pivots at the point below its own centre.
 
     Returns:
-        In [-1, 1]; 0 where fewer than :data:`MIN_SAMPLES` are visible.
+        In [-1, 1]; 0 where fewer than :data:`engine.kernels.dense_loops.MIN_SAMPLES` are visible.
     """
     from engine.kernels import dense_loops  # numba takes a while to import
 
@@ -146,7 +140,9 @@ def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> floa
         picture.levels, picture.matrix, np.ascontiguousarray(pose.rotation), pose.center_m, pose.slope,
         offset_m, pose.center_m, samples.gradients, samples.weights,
     )  # fmt: skip
-    return float(dense_loops.compare_levels(levels, samples.values, weights)[2]) if count >= MIN_SAMPLES else 0.0
+    if count < dense_loops.MIN_SAMPLES:
+        return 0.0
+    return float(dense_loops.compare_levels(levels, samples.values, weights)[2])
 
 
 def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: GaussianPrior) -> DenseFit | None:
@@ -165,12 +161,10 @@ def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: Gaussia
 
     offset_m = np.ascontiguousarray((samples.points_m - prior.pose.center_m).T)
     # The loops are compiled for one memory layout of the matrices.
-    rotation, prior_rotation = (np.ascontiguousarray(pose.rotation) for pose in (start, prior.pose))
+    first, mean = ((np.ascontiguousarray(p.rotation), p.center_m, p.slope) for p in (start, prior.pose))
     found, converged, first_correlation, rotation, center_m, slope, *seen = gauss_newton(
-        picture.levels, picture.matrix, rotation, start.center_m, start.slope,
-        prior_rotation, prior.pose.center_m, prior.pose.slope, prior.precision,
+        picture.levels, picture.matrix, first, mean, prior.precision,
         offset_m, samples.values, samples.gradients, samples.weights,
-        MIN_SAMPLES, MAX_STEPS, _EXCESS, _LAST_STEP**2,
     )  # fmt: skip
     if not found:
         return None
@@ -212,7 +206,7 @@ def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
     if scatter <= 0.0:
         return None
     share = min(1.0, in_common**2 / (of_picture * size(of_map)))
-    return _inverse(own * (share / (_EXCESS * scatter)) + prior.precision)
+    return _inverse(own * (share / (gauss_newton.EXCESS * scatter)) + prior.precision)
 
 
 def _inverse(matrix: Array) -> Array | None:

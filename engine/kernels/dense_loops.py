@@ -10,6 +10,8 @@ import numpy as np
 from engine.kernels.small_matrices import pixel_of, rotated
 from engine.runtime.jit import compiled, inlined
 
+MIN_SAMPLES = 60
+"""Fewest visible samples of a pose: some seven per parameter."""
 EDGE_PX = 2.0
 """Border of the picture that is not sampled: differences reach so far."""
 CELLS = 8

@@ -8,56 +8,47 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.dense_loops import CELLS, compare_levels, project
-from engine.kernels.small_matrices import add_equation, mirror, solve, turn, turn_between
+from engine.kernels.dense_loops import CELLS, MIN_SAMPLES, compare_levels, project
+from engine.kernels.small_matrices import MAX_STEPS, add_equation, mirror, solve, turn, turn_between
 from engine.runtime.jit import compiled
 
-_PARAMETERS = 8
+_PARAMETERS = 8  # place, rotation, slope
+_LAST_STEP = 0.5  # in standard deviations of the pose; the next one would be a tenth of it
+EXCESS = 1.6
+"""Variance factor at which the errors over six simulated towns at noon match the covariance."""
 
 
 @compiled(
-    "(f4[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], "
-    "f8[::1], f8[:, ::1], f8[::1], i8, i8, f8, f8)"
+    "(f4[:, ::1], f8[:, ::1], Tuple((f8[:, ::1], f8[::1], f8[::1])), Tuple((f8[:, ::1], f8[::1], f8[::1])), "
+    "f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])"
 )
-def gauss_newton(
-    picture, matrix, rotation, center_m, slope, prior_rotation, prior_center_m, prior_slope, precision,
-    offset_m, values, gradients, known, least, steps, excess, last_step,
-):  # fmt: skip
+def gauss_newton(picture, matrix, start, prior, precision, offset_m, values, gradients, known):
     """Steps until the last one is small.
 
     Args:
         picture: (H, W) float32 levels.
         matrix: (3, 3) pinhole.
-        rotation: (3, 3) of cam_from_map, to begin with.
-        center_m: (3,) of the camera, to begin with.
-        slope: (2,) of the ground, to begin with.
-        prior_rotation: (3, 3) mean of the prior.
-        prior_center_m: (3,) likewise; the slope pivots below it.
-        prior_slope: (2,) likewise.
+        start: rotation (3, 3) of cam_from_map, centre (3,) of the camera and slope (2,) of the ground.
+        prior: the mean of the prior likewise; the slope pivots below its centre.
         precision: (8, 8) of the prior.
         offset_m: (3, N) of the samples from the slope's pivot.
         values: (N,) of the map.
         gradients: (N, 2) of the map, per metre to the east and to the north.
         known: (N,) weights.
-        least: number of visible samples with which to go on.
-        steps: at most.
-        excess: factor on the variance of the differences.
-        last_step: squared length in standard deviations of a step that is the last.
 
     Returns:
         Whether a pose was found, and whether the last step was small; the correlation to begin with; rotation,
         center and slope; of the projection before the last step: rotation, correlation, differences (N,), points
         (3, N), derivatives (3, N) by the picture and by the map, weights (N,) and cells (N,).
     """
-    rotation, center_m, slope = rotation.copy(), center_m.copy(), slope.copy()
-    step, off = np.zeros(_PARAMETERS), np.zeros(_PARAMETERS)
-    found, converged, at_first = True, False, np.nan
-    while True:
+    rotation, center_m, slope = start[0].copy(), start[1].copy(), start[2].copy()
+    step, found, converged, at_first = np.zeros(_PARAMETERS), True, False, np.nan
+    for _ in range(MAX_STEPS):
         seen = rotation.copy()
         levels, points, shown, expected, weights, cell, count = project(
-            picture, matrix, seen, center_m, slope, offset_m, prior_center_m, gradients, known
+            picture, matrix, seen, center_m, slope, offset_m, prior[1], gradients, known
         )
-        if count < least:
+        if count < MIN_SAMPLES:
             found = False
         differences, weights, correlation, gain = compare_levels(levels, values, weights)
         for k in range(3):
@@ -66,16 +57,8 @@ def gauss_newton(
         if np.isnan(at_first):
             at_first = correlation
         if found:
-            normal, score = normal_equations(shown, expected, points, offset_m, seen, weights, differences, excess)
-            turn_between(rotation, prior_rotation, off[3:6])
-            for i in range(3):
-                off[i] = center_m[i] - prior_center_m[i]
-            for i in range(2):
-                off[6 + i] = slope[i] - prior_slope[i]
-            for i in range(_PARAMETERS):
-                for j in range(_PARAMETERS):
-                    normal[i, j] += precision[i, j]
-                    score[i] -= precision[i, j] * off[j]
+            normal, score = normal_equations(shown, expected, points, offset_m, seen, weights, differences)
+            _add_prior(normal, score, (rotation, center_m, slope), prior, precision)
             found = solve(normal, score, step)
         if found:
             turn(seen, step[3:6], rotation)
@@ -86,9 +69,8 @@ def gauss_newton(
                 center_m[i] += step[i]
             for i in range(2):
                 slope[i] += step[6 + i]
-            converged = size < last_step
-        steps -= 1
-        if not found or converged or steps == 0:
+            converged = size < _LAST_STEP**2
+        if not found or converged:
             break
     return (
         found, converged, at_first, rotation, center_m, slope, seen, correlation, differences, points, shown,
@@ -97,13 +79,28 @@ def gauss_newton(
 
 
 @compiled()
-def normal_equations(shown, expected, points, offset_m, rotation, weights, differences, excess):
+def _add_prior(normal, score, pose, prior, precision):
+    """Add what the prior says of the parameters to their normal matrix (8, 8) and right side (8,)."""
+    off = np.zeros(_PARAMETERS)
+    turn_between(pose[0], prior[0], off[3:6])
+    for i in range(3):
+        off[i] = pose[1][i] - prior[1][i]
+    for i in range(2):
+        off[6 + i] = pose[2][i] - prior[2][i]
+    for i in range(_PARAMETERS):
+        for j in range(_PARAMETERS):
+            normal[i, j] += precision[i, j]
+            score[i] -= precision[i, j] * off[j]
+
+
+@compiled()
+def normal_equations(shown, expected, points, offset_m, rotation, weights, differences):
     """Normal matrix (8, 8) and right side (8,); the mean of both gradients converges from farther than one."""
     total = square = 0.0
     for n in range(weights.size):
         total += weights[n]
         square += weights[n] * differences[n] * differences[n]
-    scale = 1.0 / (excess * max(square / max(total, 1e-12), 1e-12))
+    scale = 1.0 / (EXCESS * max(square / max(total, 1e-12), 1e-12))
     normal, score, row = np.zeros((_PARAMETERS, _PARAMETERS)), np.zeros(_PARAMETERS), np.zeros(_PARAMETERS)
     for n in range(weights.size):
         weight = weights[n] * scale

@@ -6,8 +6,6 @@ import numpy as np
 
 from engine.runtime.jit import compiled, inlined
 
-_SEEN = 0.999  # total weight of visible nodes, below which one of them is hidden
-
 
 @compiled("(f4[:, :, ::1], f4, f4, f4[:, ::1], f4[:, ::1], u1[:, ::1])")
 def places_between_nodes(nodes, last_x, last_y, x_px, y_px, inside):
@@ -19,24 +17,26 @@ def places_between_nodes(nodes, last_x, last_y, x_px, y_px, inside):
         last_y: of its rows.
         x_px: (h, w) float32 takes the places.
         y_px: (h, w) float32 likewise.
-        inside: (h, w) uint8 takes 1 where the place is in the frame and can be shown, else 0.
+        inside: (h, w) uint8 takes 1 where the place is in the frame and all nodes around can be shown, else 0.
     """
     height, width = x_px.shape
     across, down = _steps(len(nodes), width), _steps(len(nodes), height)
-    line, zero, seen = np.empty((3, len(nodes)), np.float32), np.float32(0), np.float32(_SEEN)
-    ahead = np.empty(width, np.float32)
+    line, zero = np.empty((2, len(nodes)), np.float32), np.float32(0)
+    ahead = np.empty(len(nodes) - 1, np.bool_)  # between a node and the next
     for row in range(height):
         top, share = down[0][row], down[1][row]
-        for k in range(3):
+        for k in range(2):
             for n in range(len(nodes)):
                 line[k, n] = nodes[top, n, k] + share * (nodes[top + 1, n, k] - nodes[top, n, k])
+        for n in range(len(nodes) - 1):
+            above = min(nodes[top, n, 2], nodes[top, n + 1, 2])
+            ahead[n] = min(above, min(nodes[top + 1, n, 2], nodes[top + 1, n + 1, 2])) > zero
         x, y, shown = x_px[row], y_px[row], inside[row]
         _along(line[0], across, x)
         _along(line[1], across, y)
-        _along(line[2], across, ahead)
         for c in range(width):
             in_frame = (x[c] >= zero) & (x[c] <= last_x) & (y[c] >= zero) & (y[c] <= last_y)
-            shown[c] = in_frame & (ahead[c] > seen)
+            shown[c] = in_frame & ahead[across[0][c]]
 
 
 @inlined

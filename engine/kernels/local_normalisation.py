@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 
+from engine.kernels.sums import MIDDLE_GREY
 from engine.runtime.jit import compiled, inlined
 
-_MIDDLE = 128  # subtracted from levels, so that squares lose fewer digits
-MAX_RADIUS_PX = (math.isqrt(np.iinfo(np.int32).max // _MIDDLE**2) - 1) // 2
+MAX_RADIUS_PX = (math.isqrt(np.iinfo(np.int32).max // MIDDLE_GREY**2) - 1) // 2
 """Radius of the largest neighbourhood whose sum of squares fits into int32."""
 
 
@@ -50,7 +50,7 @@ def normalised(picture, radius_px, noise_variance):
             mean = np.float32(total) * share
             square = np.float32(np.int32(along_squares[x + side] - along_squares[x])) * share
             variance = max(square - mean * mean, np.float32(0.0)) + noise
-            above_mean = np.float32(np.int32((np.int32(row[x]) - _MIDDLE) * area - total)) * share
+            above_mean = np.float32(np.int32((np.int32(row[x]) - MIDDLE_GREY) * area - total)) * share
             target[x] = above_mean / np.sqrt(variance)
         if y + 1 < height:
             below, above = _mirrored(y + 1 + radius_px, height), _mirrored(y - radius_px, height)
@@ -72,7 +72,7 @@ def _mirrored(index, size):
 def _add(down, squares, row):
     """Add a row to the sums over rows."""
     for x in range(row.size):
-        value = np.int32(row[x]) - np.int32(_MIDDLE)
+        value = np.int32(row[x]) - np.int32(MIDDLE_GREY)
         down[x] += value
         squares[x] += value * value
 
@@ -81,7 +81,7 @@ def _add(down, squares, row):
 def _replace(down, squares, new, old):
     """Move the sums over rows down by one row."""
     for x in range(new.size):
-        value, gone = np.int32(new[x]) - np.int32(_MIDDLE), np.int32(old[x]) - np.int32(_MIDDLE)
+        value, gone = np.int32(new[x]) - np.int32(MIDDLE_GREY), np.int32(old[x]) - np.int32(MIDDLE_GREY)
         down[x] += value - gone
         squares[x] += value * value - gone * gone
 

@@ -13,15 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels import surface_loops
-from engine.kernels.blocks import Mask, fast_side, spectrum_of, transform, write_surfaces
+from engine.kernels.blocks import MAX_BLOCKS, Mask, fast_side, spectrum_of, transform, write_surfaces
 from engine.kernels.sums import FLAT_SHARE, box_sum, check_finite, counts, integrals
 
 Array = NDArray[np.float64]
 
 _SMALL_PX = 1 << 17  # windows up to this size are neither split nor scored in two ways
-_DIVISIONS = (1, 2, 3, 4, 6, 8, 12, 16)  # of a surface along each axis
-_SHARED = 0.4  # share of a block's cost: transforms of the template, and memory access
-_MAX_CACHED_PX = 1 << 21  # larger transforms cost 50 % more per pixel
 
 
 class _Model(NamedTuple):
@@ -120,17 +117,22 @@ def _blocks(asked: Mask, h: int, w: int) -> tuple[tuple[int, int], list[tuple[in
     """Rows and columns of the blocks that cost least, and the corners of those with a place to score."""
     height, width = asked.shape
     sums, best = counts(asked), (np.inf, (height, width), [(0, 0)])
-    for n in _DIVISIONS if asked.size > _SMALL_PX else (1,):
+    for n in _divisions(asked.size):
         rows, columns = -(-height // n), -(-width // n)
         y, x = np.arange(0, height, rows), np.arange(0, width, columns)
         below, right = np.minimum(y + rows, height), np.minimum(x + columns, width)
         inside = sums[np.ix_(below, right)] - sums[np.ix_(y, right)] - sums[np.ix_(below, x)] + sums[np.ix_(y, x)]
         j, i = np.nonzero(inside)
-        area_px = fast_side(rows + h - 1) * fast_side(columns + w - 1)
-        cost = (len(j) + _SHARED) * area_px * (1.0 if area_px <= _MAX_CACHED_PX else 1.5)
+        # A block takes two transforms of its pixels and three of products, the template two for all blocks.
+        cost = (5 * len(j) + 2) * fast_side(rows + h - 1) * fast_side(columns + w - 1)
         if cost < best[0]:
             best = cost, (rows, columns), list(zip(y[j].tolist(), x[i].tolist(), strict=True))
     return best[1:]
+
+
+def _divisions(places: int) -> range:
+    """Into how many blocks along each axis a surface may be divided."""
+    return range(1, MAX_BLOCKS + 1 if places > _SMALL_PX else 2)
 
 
 def _model(template: NDArray[Any], size: tuple[int, int]) -> _Model:

@@ -132,8 +132,7 @@ def _derivatives(positions: NDArray[np.int64], powers: list[tuple[int, int]], n:
 
 _WIDE = np.concatenate([NEAR, FAR], axis=1)
 _SUMMITS = {3: (NEAR + 1, _derivatives(NEAR, _QUADRATIC, 3)), 5: (_WIDE + 2, _derivatives(_WIDE, _QUARTIC, 5))}
-_NEWTON_STEPS = 5
-_NEWTON_END_PX = 1e-4
+_NEWTON_STEPS = 5  # which end within 1e-8 px of the summit
 
 
 def fit_peak(patch: NDArray[np.float64]) -> tuple[float, float, NDArray[np.float64]]:
@@ -150,14 +149,11 @@ def fit_peak(patch: NDArray[np.float64]) -> tuple[float, float, NDArray[np.float
     derivatives = (matrix @ patch[positions[0], positions[1]]).reshape(5, n, n)
     orders = np.arange(n)
     x = y = 0.0
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(1 if n == 3 else _NEWTON_STEPS):  # a quadratic needs one step
         gx, gy, xx, xy, yy = (derivatives @ y**orders @ x**orders).tolist()
         determinant = xx * yy - xy * xy
         if xx >= 0 or determinant <= 0:  # no maximum: a ridge, a saddle
             break
-        last_x, last_y = x, y
         x = min(0.5, max(-0.5, x - (yy * gx - xy * gy) / determinant))
         y = min(0.5, max(-0.5, y - (xx * gy - xy * gx) / determinant))
-        if n == 3 or abs(x - last_x) + abs(y - last_y) < _NEWTON_END_PX:  # a quadratic needs one step
-            break
     return x, y, np.array([[xx, xy], [xy, yy]])

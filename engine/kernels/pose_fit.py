@@ -9,10 +9,22 @@ import math
 
 import numpy as np
 
-from engine.kernels.small_matrices import add_equation, mirror, pixel_of, rotated, solve, turn, turn_between
+from engine.kernels.small_matrices import (
+    MAX_STEPS,
+    add_equation,
+    mirror,
+    pixel_of,
+    rotated,
+    solve,
+    turn,
+    turn_between,
+)
 from engine.runtime.jit import compiled, inlined
 
-_FAR_PX = 1e9  # assigned coordinates of points behind the camera
+_FAR_PX = 1e9  # assigned coordinates of points behind the camera: they stay finite
+_NOISE_FLOOR_PX = 0.05  # least standard deviation assumed for an image point's x and y
+_REACH_SIGMAS = 4.0  # of a pixel, beyond which a match has no weight if its tolerance is less
+_LAST_STEP = 2e-2  # in standard deviations of the pose
 
 
 @compiled("(f8[::1, :], f8[::1, :], f8[:, ::1], f8[:, ::1], f8[::1])")
@@ -47,14 +59,8 @@ def reproject(points, pixels, matrix, rotation, center):
     return tangents, projected, squared
 
 
-@compiled(
-    "(f8[::1, :], f8[::1, :], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, i8, f8[:, ::1], f8[::1], i8, "
-    "f8, f8, f8)"
-)
-def fit_pose(
-    points, pixels, matrix, weights, attitude, precision, tolerance_px, noise_floor_px, least,
-    rotation, center, steps, slack, reach_sigmas, step_sigmas,
-):  # fmt: skip
+@compiled("(f8[::1, :], f8[::1, :], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8, i8, f8[:, ::1], f8[::1], f8)")
+def fit_pose(points, pixels, matrix, weights, attitude, precision, tolerance_px, least, rotation, center, slack):
     """Gauss-Newton with Tukey's biweight; each step updates the inliers and their variance.
 
     Args:
@@ -65,14 +71,10 @@ def fit_pose(
         attitude: (3, 3) known rotation.
         precision: (3, 3) inverse covariance of its angles, 0 if unknown.
         tolerance_px: of an inlier.
-        noise_floor_px: least standard deviation of a pixel.
         least: number of inliers with which to go on.
         rotation: (3, 3) to begin with.
         center: (3,) to begin with.
-        steps: at most, 1 or more.
         slack: factor on the tolerance in the first step.
-        reach_sigmas: standard deviations at which a match has no weight any more.
-        step_sigmas: a step this small, in standard deviations of the pose, is the last.
 
     Returns:
         Whether there is a pose; rotation, center; what :func:`reproject` returns; inliers (N,) bool; information
@@ -86,7 +88,7 @@ def fit_pose(
     inliers, information = np.empty(weights.size, np.bool_), np.zeros((6, 6))
     tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
     count = _mark_within(squared, reach, inliers)
-    while True:
+    for _ in range(MAX_STEPS):
         found = count >= least
         if not found:
             break
@@ -118,11 +120,10 @@ def fit_pose(
         for n in range(weights.size):
             if inliers[n]:
                 mean += weights[n] * squared[n]
-        variance = variance_px2(mean / freedom, tolerance_px, noise_floor_px)
+        variance = variance_px2(mean / freedom, tolerance_px)
         count = _mark_within(squared, square, inliers)
-        reach = max(square, reach_sigmas**2 * variance)
-        steps -= 1
-        if size < step_sigmas**2 or steps == 0:
+        reach = max(square, _REACH_SIGMAS**2 * variance)
+        if size < _LAST_STEP**2:
             break
     return found, rotation, center, tangents, projected, squared, inliers, information, variance
 
@@ -199,13 +200,13 @@ def biweight_factors(u):
     return sensitivity / weight, noise / sensitivity
 
 
-@compiled("(f8, f8, f8)")
-def variance_px2(mean, tolerance_px, noise_floor_px):
+@compiled("(f8, f8)")
+def variance_px2(mean, tolerance_px):
     """The variance s^2 at which distances r, truncated at T, have this mean square per axis.
 
     E[r^2 | r < T] = 2 s^2 (1 - u / (e^u - 1)),  u = T^2 / (2 s^2).
     """
-    mean = max(mean, noise_floor_px * noise_floor_px)
+    mean = max(mean, _NOISE_FLOOR_PX * _NOISE_FLOOR_PX)
     half = 0.5 * tolerance_px * tolerance_px
     variance = min(mean, half)
     for _ in range(5):

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.kernels.sums import MIDDLE_GREY
 
 FloatImage = NDArray[np.float32]
 
 SCORES = ("grey", "local", "gradient", "mixed")
-_MIDDLE_GREY = 127.5
 # Added to the local variance, in squared grey levels, so that sensor noise on flat ground is not amplified.
 _NOISE_VARIANCE = 4.0
 
@@ -57,7 +57,7 @@ def enhance(
     weight = None if valid is None else valid.astype(np.float32)
     smooth = _smoothed(gray, weight)
     if score == "grey":
-        return _masked(smooth.astype(np.float32) - _MIDDLE_GREY, weight)
+        return _masked(smooth.astype(np.float32) - MIDDLE_GREY, weight)
     if score == "local":
         return _normalised(smooth, radius_px, weight)
     # No gradient is taken across the border of the valid area.

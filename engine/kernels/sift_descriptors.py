@@ -14,7 +14,7 @@ import numpy as np
 from engine.runtime.jit import compiled, inlined
 
 _BOUND = 0.2  # of an entry before the last normalisation
-_LEAST = 1e-24  # keeps an empty descriptor zero
+_TINY = np.finfo(np.float32).tiny  # keeps an empty descriptor zero
 
 
 @inlined
@@ -184,11 +184,11 @@ def descriptors(buffer, table, keypoints, angle, step, tent):
 @inlined
 def _normalise(values):
     """The roots of shares (RootSIFT), with entries bounded before (Lowe)."""
-    bound, total = np.float32(_BOUND), np.float32(_LEAST)
+    bound, total = np.float32(_BOUND), _TINY
     for k in range(values.size):
         total += values[k] * values[k]
     gain = np.float32(1) / np.float32(math.sqrt(total))
-    total = np.float32(_LEAST)
+    total = _TINY
     for k in range(values.size):
         value = min(values[k] * gain, bound)
         values[k] = value

@@ -13,7 +13,7 @@ from engine.runtime.jit import compiled, inlined
 
 TAPS = 4
 """Taps of a filter that one pass over a strip applies; filters are padded with zeros to a multiple of it."""
-_STRIP = 8  # rows of the octave written at a time; a multiple of a word of flags and of both phases
+_STRIP = np.dtype(np.uint64).itemsize  # rows of the octave written at a time: as many as a word has flags
 
 
 @compiled(
@@ -234,10 +234,10 @@ def _extrema_of_strip(sizes, width, strip, searched, border, threshold, work, fo
         size, flag, left, centre, right = sizes[s, width + 1 :], flags[1:], top, top[1:], top[2:]
         for x in range(n - 2):
             flag[x] = size[x] >= max(max(left[x], centre[x]), max(right[x], threshold))
-        for w in range((n + 7) // 8):
+        for w in range((n + _STRIP - 1) // _STRIP):
             if words[w] == 0:
                 continue
-            for at in range(8 * w, min(8 * w + 8, n - 1)):
+            for at in range(_STRIP * w, min(_STRIP * (w + 1), n - 1)):
                 y, x = strip[0] - 1 + at // width, at % width
                 if flags[at] and searched[0] <= y < searched[1] and border <= x < width - border:
                     if count == len(found):

@@ -9,6 +9,9 @@ import numpy as np
 
 from engine.runtime.jit import compiled, inlined
 
+MAX_STEPS = 12
+"""Gauss-Newton steps of a pose fit at most; four or five are usual."""
+
 
 @inlined
 def rotated(rotation, a, b, c):

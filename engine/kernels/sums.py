@@ -13,6 +13,8 @@ from engine.runtime.device import Picture
 
 # Sums of squares about a mean below this share of the whole picture's are rounding: there a patch is flat.
 FLAT_SHARE = 1e-12
+MIDDLE_GREY = 128
+"""Of uint8; levels are counted from it, so that sums of squares lose fewer digits."""
 
 
 def integrals(image: NDArray[Any]) -> NDArray[np.float64]:

@@ -13,8 +13,6 @@ import cv2
 from engine.kernels.sums import FLAT_SHARE, box_sum, check_finite
 from engine.runtime.tensors import Tensor, torch
 
-# Lower bound on a template's norm; a template of zeros scores 0.
-_TINY = 1e-12
 # Upper bound on the numbers in the product spectra of a group of templates, which bounds the memory.
 _CHUNK_NUMBERS = 1 << 24
 
@@ -57,7 +55,7 @@ def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor
     energy = box_energy(sums, h, w) if zero_mean else box_sum(sums[1], h, w)
     energy.masked_fill_(energy <= FLAT_SHARE * sums[1, :, -1:, -1:], torch.inf)
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True, dtype=torch.float64)
-    normal = templates.double() / norm.clamp_min(_TINY)  # a flat template is all zeros, and scores 0 everywhere
+    normal = templates.double() / norm.clamp_min(_tiny(norm))  # a flat template is all zeros, and scores 0
     scores = correlate(search.double(), normal).mul_(energy.rsqrt_()[:, None]).clamp_(-1.0, 1.0)
     check_all_finite(**given)  # last: the host waits for it
     return scores.to(search.dtype)
@@ -74,8 +72,14 @@ def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) ->
     Returns:
         (T, H-h+1, W-w+1) float32 in [-1, 1].
     """
-    norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True).clamp_min_(_TINY)
-    return correlate(image[None], (templates / norm)[None])[0].mul_(inverse_norms).clamp_(-1.0, 1.0)
+    norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True)
+    normal = templates / norm.clamp_min_(_tiny(norm))
+    return correlate(image[None], normal[None])[0].mul_(inverse_norms).clamp_(-1.0, 1.0)
+
+
+def _tiny(values: Tensor) -> float:
+    """The least normal number of their type, which keeps a quotient of zeros zero."""
+    return torch.finfo(values.dtype).tiny
 
 
 def peak_numbers(scores: Tensor, exclusion_px: float) -> list[float]:

@@ -13,7 +13,7 @@ CELL_PX = 8
 """Side of the cell of pixels that shares one descriptor, and in which the detector chooses at most one place."""
 _CLEAR_PX = 4
 """A keypoint nearer to the edge is only partly visible; of several nearer to each other the strongest stays."""
-_MIN_SCORE = 0.0005
+_MIN_SCORE = 0.0005  # LightGlue's
 
 
 class SuperPoint(nn.Module):

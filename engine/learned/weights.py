@@ -25,7 +25,6 @@ _WRAPPERS = ("state_dict", "extractor", "model")  # keys under which checkpoints
 _DERIVED = ("num_batches_tracked", "confidence_thresholds", "dkd.hw_grid")
 # Training leftovers in published files, not used for inference.
 _UNUSED = re.compile(r"log_assignment\.\d+\.r|.*num_batches_tracked|confidence_thresholds")
-_LISTED = 3  # names in a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,5 +115,4 @@ def _read(path: str | Path) -> Mapping[str, Tensor]:
 
 
 def _listed(names: list[str]) -> str:
-    more = len(names) - _LISTED
-    return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "")
+    return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.camera import Camera
+from engine.camera import SIDE_STEPS, Camera
 from engine.geo import inverse_2x2
 from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.values import Attitude, Frame
@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 # Beyond this angle off the vertical a footprint is stretched more than 4 times and relief occludes the ground.
 MAX_RAY_DEG = 75.0
 MIN_DOWN = math.cos(math.radians(MAX_RAY_DEG))
+MIN_SIDE_PX = 8
+"""Least side of a patch, and of a picture that was averaged down."""
 # A frame finer than the map by more than this factor is averaged down first, to prevent aliasing.
 _MAX_SHRINK = 0.75
 _ASPECTS = np.array([1.0, 4 / 3, 3 / 4, 16 / 9, 9 / 16])
@@ -174,12 +176,12 @@ def shrink(gray: NDArray[np.uint8], scale: float) -> tuple[NDArray[np.uint8], Ar
     """
     if scale >= _MAX_SHRINK:
         return gray, np.eye(3)
-    height, width = (max(8, round(n * scale)) for n in gray.shape)
+    height, width = (max(MIN_SIDE_PX, round(n * scale)) for n in gray.shape)
     sx, sy = width / gray.shape[1], height / gray.shape[0]
     homography = np.array([[sx, 0, sx / 2 - 0.5], [0, sy, sy / 2 - 0.5], [0, 0, 1.0]])
     picture, left = gray, scale
     while left <= _MAX_SHRINK / 2.0:  # as far as halving goes, which OpenCV does fast, edges on edges
-        half = (max(8, picture.shape[1] // 2), max(8, picture.shape[0] // 2))
+        half = (max(MIN_SIDE_PX, picture.shape[1] // 2), max(MIN_SIDE_PX, picture.shape[0] // 2))
         picture, left = np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.uint8), 2.0 * left
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8), homography
 
@@ -200,20 +202,17 @@ def _inscribed_size(view: GroundView, shape: tuple[int, ...]) -> tuple[int, int]
             break
     else:
         return None
-    return (width, height) if min(width, height) >= 8 else None
+    return (width, height) if min(width, height) >= MIN_SIDE_PX else None
 
 
 # ----------------------------------------------------------------------------------------- the whole frame
 
 MAX_FIELD_DEG = 70.0
 """Ground farther off the vertical than this angle is ignored: it is far away and foreshortened."""
-MIN_PICTURE_PX = 32
-"""Least extent of an orthorectified frame."""
 SIDE_STEP_PX = 16
-"""Its sides are multiples of this, so that a flight uses few sizes and plans none in the air."""
+"""Least side of an orthorectified frame, and its step: a flight uses few sizes, and plans none in the air."""
 MAX_PICTURE_PX = WHOLE_LEVEL_PX
 """Most pixels of one; if it would need more, the height is out of proportion to the map."""
-_NODES = 17  # per side of the grid on which the projection is computed; bilinear in between
 RIM_PX = 5
 """Margin left out inside an orthorectified frame's edge, whose gradients are not the ground's."""
 _RIM = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
@@ -301,14 +300,15 @@ def orthorectify(
         :data:`MAX_FIELD_DEG`.
     """
     bounds = ground_bounds_px(camera, attitude, height_m, enu_jacobian)
-    if bounds is None or (bounds[1] - bounds[0]).min() < MIN_PICTURE_PX:
+    if bounds is None or (bounds[1] - bounds[0]).min() < SIDE_STEP_PX:
         return None
     sides = np.ceil((bounds[1] - bounds[0] + 1.0) / SIDE_STEP_PX) * SIDE_STEP_PX
     if sides.prod() > MAX_PICTURE_PX:
         return None
     corner = np.floor(bounds.mean(axis=0) - (sides - 1.0) / 2.0)
     enu_from_camera = camera.enu_from_camera(attitude)
-    nodes = np.stack(np.meshgrid(*np.linspace(corner, corner + sides - 1.0, _NODES).T), axis=-1)
+    sides_px = np.linspace(corner, corner + sides - 1.0, SIDE_STEPS + 1)
+    nodes = np.stack(np.meshgrid(*sides_px.T), axis=-1)  # bilinear in between
     up_m = np.full(nodes.shape[:2], -height_m) if relief is None else relief(nodes) - height_m
     ground_m = np.concatenate([nodes @ enu_jacobian.T, up_m[..., None]], axis=-1)
     size = (int(sides[1]), int(sides[0]))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.matching.align import Patch, orthorectify
+from engine.matching.align import MIN_SIDE_PX, Patch, orthorectify
 from engine.matching.query import Query
 from engine.matching.relief import ground_relief
 from engine.orthomap import OrthoMap
@@ -20,7 +20,6 @@ OBLIQUE_DEG = 25.0
 """Angle of the optical axis off the vertical beyond which the ground no longer looks like a plane."""
 FIELD_DEG = 60.0
 """Ground farther off the vertical is left out: walls hide it, and an error of height or tilt moves it most."""
-_MIN_SIDE_PX = 8
 _CELLS = 96  # of the grid that finds the rectangle, along the longer side
 
 
@@ -53,7 +52,7 @@ def oblique_patch(
     if nadir_px is not None:
         valid &= _on_map(site, valid.shape, photo.offset_px + site.level_from_full(nadir_px, level), level)
     box = largest_rectangle(valid)
-    if min(box.width_px, box.height_px) < _MIN_SIDE_PX:
+    if min(box.width_px, box.height_px) < MIN_SIDE_PX:
         return None
     part = photo.gray[box.y0 : box.y0 + box.height_px, box.x0 : box.x0 + box.width_px]
     return Patch(np.ascontiguousarray(part), photo.offset_px + np.array([box.x0, box.y0]))

@@ -12,13 +12,13 @@ References:
     https://doi.org/10.1214/aoms/1177703732 (the variance of such an estimate).
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels.dense import MAX_STEPS
 from engine.matching.acceptance import CHANCE
 
 Array = NDArray[np.float64]
@@ -26,13 +26,11 @@ Mask = NDArray[np.bool_]
 Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
 
 _MAX_SAMPLES = 1000  # that RANSAC draws
-_NOISE_FLOOR_PX = 0.05  # least standard deviation assumed for an image point's x and y
-_STEP_SIGMAS = 2e-2  # stop after a step this small, in standard deviations of the pose
 _PAIRS = 24  # pairs of matches that give candidate centres if the attitude is known
 SLACK = 2.0
 """Factor on the tolerance at the start, for the error of a known attitude or of a pose that fits roughly."""
-_REACH_SIGMAS = 4.0
-_MIN_EIGENVALUE = 1e-7  # of the correlation matrix; below it some direction is not determined
+# Of the correlation matrix; below it half of the digits are lost, and some direction is not determined.
+_MIN_EIGENVALUE = math.sqrt(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,8 +192,7 @@ def gauss_newton(problem: Problem, R: Array, center: Array, *, slack: float = 1.
     attitude = rotation if problem.attitude is None else np.ascontiguousarray(problem.attitude)
     found, rotation, center, tangents, projected, squared, inliers, information, variance = fit_pose(
         problem.points, problem.pixels, problem.K, problem.weights, attitude, problem.precision,
-        problem.tolerance_px, _NOISE_FLOOR_PX, problem.min_inliers,
-        rotation, center, MAX_STEPS, slack, _REACH_SIGMAS, _STEP_SIGMAS,
+        problem.tolerance_px, problem.min_inliers, rotation, center, slack,
     )  # fmt: skip
     if not found:
         return None

@@ -21,14 +21,12 @@ from engine.kernels.dense import Pose
 
 Array = NDArray[np.float64]
 
-_WIDE = 2.0  # standard deviation of the slope in the refinement, in units of the assumed one
-# Widths of the mixture in the same units, all equally probable: fitted to no flight, but to draws of both errors.
-# With slopes of any one width from 0 to 4 degrees the mean normalised squared error is 1.1 to 2.2.
+# Widths of the mixture in units of the assumed slope, all equally probable: fitted to no flight, but to draws of
+# both errors. With slopes of any one width from 0 to 4 degrees the mean normalised squared error is 1.1 to 2.2.
 _WIDTHS = (0.175, 0.35, 0.7, 1.4)
 # The refinement without its prior of the slope and the peak rest on the same attitude: over level simulated towns
 # 98 % of poses agreed to this share of the height (the peak is as inexact), over hills of 8 to 30 m 19 to 33 %.
 _MAX_APART_SHARE = 0.0067
-_MAX_DEG = 20.0  # of the assumed slope: twice as steep is a wall
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +42,14 @@ class SlopeFit:
     covariance: Array
 
 
+def _wide(unknown_slope_deg: float) -> float:
+    """Standard deviation of the slope for the first refinement: twice the variance of the mixture's widest."""
+    return math.sqrt(2.0) * _WIDTHS[-1] * math.radians(unknown_slope_deg)
+
+
 def wide_slope_deg(unknown_slope_deg: float) -> float:
-    """Standard deviation of the slope for the first refinement, in degrees."""
-    return _WIDE * min(unknown_slope_deg, _MAX_DEG)
+    """Standard deviation of the slope for the first refinement, as the angle of that slope in degrees."""
+    return math.degrees(math.atan(_wide(unknown_slope_deg)))
 
 
 def over_unknown_slope(
@@ -65,7 +68,7 @@ def over_unknown_slope(
         The pose, or None if the ground is not a plane: the refined position without a slope prior then differs
         from the peak's.
     """
-    wide = math.tan(math.radians(wide_slope_deg(unknown_slope_deg)))
+    wide = _wide(unknown_slope_deg)
     unbounded = covariance[6:, 6:] - wide**2 * np.eye(2)  # with the wide prior removed
     free = -covariance[:2, 6:] @ np.linalg.solve(unbounded, pose.slope)
     apart_m = pose.center_m[:2] + free - peak_en_m
@@ -73,7 +76,7 @@ def over_unknown_slope(
         return None
     steps, covariances, log_weights = [], [], []
     for width in _WIDTHS:
-        sigma = math.tan(math.radians(width * min(unknown_slope_deg, _MAX_DEG)))
+        sigma = width * math.radians(unknown_slope_deg)
         variance = 1.0 / (sigma**-2 - wide**-2)  # of the measurement that turns the wide prior into this one
         total = covariance[6:, 6:] + variance * np.eye(2)
         gain = np.linalg.solve(total, covariance[6:]).T

@@ -20,7 +20,6 @@ TURNS_DEG = (0.0, -6.0, 6.0)
 SCALES = (1.0, 0.93, 1.075)
 """Scales to try, since a height may be wrong."""
 _RIVAL_RADII = 3.0  # from the best translation; closer votes may be its own, scattered by an unknown tilt
-_PAIRED = 300  # points compared with all others for the probability that one agrees by chance
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,12 +103,10 @@ def chance_of_agreeing(
     from engine.kernels import clusters  # numba takes a while to import
 
     total = seen_px.shape[1]
-    some = slice(None, None, -(-total // _PAIRED))
-    own = predicted_px[:, some]
-    near = int(clusters.count_near_pairs(*map(np.ascontiguousarray, (*own, *seen_px)), radius_px))
-    wrong = near - int(np.count_nonzero(agree[some]))
+    near = int(clusters.count_near_pairs(*map(np.ascontiguousarray, (*predicted_px, *seen_px)), radius_px))
+    wrong = near - int(np.count_nonzero(agree))
     uniform = math.pi * radius_px * radius_px / area_px2
-    share: float = wrong / (own.shape[1] * max(total - 1, 1))
+    share: float = wrong / (total * max(total - 1, 1))
     return min(max(share, uniform), 1.0)
 
 

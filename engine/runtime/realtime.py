@@ -23,10 +23,9 @@ from engine.errors import BackendError, OptionError
 _log = logging.getLogger("scenematch")
 
 _MLOCK = 1 | 2 | 4  # of mlockall(2): current and future pages, but only those that are used
-_CAP_IPC_LOCK = 14
+_CAP_IPC_LOCK = 14  # of capabilities(7)
 _KERNEL = Path("/proc/sys/kernel")
-_MAX_LOAD = 0.9  # load of a core above which the kernel's limit for real-time threads is near
-_LOAD_OVER_S = 2.0
+_LOAD_OVER_S = 2.0  # two periods of the kernel's limit
 _FIFO_CURE = "CAP_SYS_NICE, `ulimit -r 20`, or in a unit of systemd LimitRTPRIO=20"
 _NICE_CURE = "CAP_SYS_NICE, `ulimit -e 40`, or in a unit of systemd LimitNICE=40"
 _MEMORY_CURE = "CAP_IPC_LOCK, `ulimit -l unlimited`, or in a unit of systemd LimitMEMLOCK=infinity"
@@ -135,7 +134,7 @@ def start_thread(
 
 
 class LoadWatch:
-    """Warns once that a thread computes so much that the kernel's limit is near.
+    """Warns once that a thread computes so much that it reaches the kernel's limit.
 
     Args:
         realtime: of the thread; None and a nice value have no limit.
@@ -156,7 +155,7 @@ class LoadWatch:
         over_s = end_s - self._begin_s
         if over_s < _LOAD_OVER_S:
             return
-        if self._busy_s > _MAX_LOAD * over_s:
+        if self._busy_s > limited_share() * over_s:
             self._watches = False
             _log.warning(
                 "real time: frames are matched for %.0f %% of the time; the kernel stops real-time threads that "

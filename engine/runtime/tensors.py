@@ -21,7 +21,7 @@ from engine.runtime import threads
 __all__ = ["Tensor", "download", "functional", "nn", "torch", "upload"]
 
 AnyArray = NDArray[Any]
-_ALIGNMENT = 16  # bytes; no element is larger
+_ALIGNMENT = torch.complex128.itemsize  # no element is larger
 
 threads.limit_torch(torch)
 

@@ -24,7 +24,6 @@ from engine.errors import BackendError
 
 T = TypeVar("T")
 
-_ALONE_S = 0.05  # of work in this process first
 _WORTH_S = 0.5  # of remaining work; less is done before workers would start
 _work: list[Callable[[int], Any]] = []  # in a worker, the task, which came by the fork: it need not be pickled
 
@@ -47,7 +46,7 @@ def safe_count() -> int:
 def in_order(work: Callable[[int], T], count: int, workers: int) -> Iterator[T]:
     """Yield ``work(0)`` to ``work(count - 1)``, computed by workers if that is faster.
 
-    This process does the first tasks: all workers share what they cache.
+    This process does the first task: all workers share what it caches.
 
     Args:
         work: the task; its results and exceptions pass through a pipe.
@@ -61,7 +60,7 @@ def in_order(work: Callable[[int], T], count: int, workers: int) -> Iterator[T]:
     while done < count:
         spent_s = time.perf_counter() - start_s
         left_s = spent_s / done * (count - done) if done else 0.0
-        if workers > 1 and spent_s > _ALONE_S and left_s > _WORTH_S:
+        if workers > 1 and left_s > _WORTH_S:
             break
         yield work(done)
         done += 1

@@ -17,20 +17,17 @@ from engine.kernels.sift_extrema import TAPS, find_extrema
 from engine.kernels.sift_refinement import refine_extrema, spread_out
 from engine.runtime import threads
 from engine.sift.descriptors import ORIENT_STEP, orientation_weights, tents
-from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, Octave, octaves_of
+from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, TRUNCATE, Octave, octaves_of
 from engine.sift.values import Features, SiftChoice
 
 AnyArray = NDArray[Any]
 Floats = NDArray[np.float32]
 Filters = tuple[Floats, NDArray[np.int64], Floats]
 
-_TRUNCATE = 3.0  # a Gaussian's reach in sigmas
 _BORDER = 4  # octave pixels along the edge without keypoints
 _EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
 _MOVES = 2  # times that a keypoint may move to a neighbouring voxel
 _MAX_SHIFT = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
-_PART_PX = 60_000  # pixels of an octave per thread, below which another thread does not pay
-_POINTS_PER_THREAD = 150
 _X, _Y, _GROWTH, _CONTRAST, _, _OCTAVE = range(6)
 
 
@@ -98,7 +95,7 @@ def filters(inputs: int, sigmas: tuple[float, ...], up: int) -> Filters:
 @lru_cache(maxsize=16)
 def _weights(sigmas: tuple[float, ...], up: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.float64]]:
     """Weights (levels, up, taps), reach (levels,), and the sums (levels, up, taps + 1) of those before a tap."""
-    reach = np.ceil(_TRUNCATE * np.array(sigmas)).astype(np.int64)
+    reach = np.ceil(TRUNCATE * np.array(sigmas)).astype(np.int64)
     taps = -(-(2 * reach.max() + up) // TAPS) * TAPS
     offsets = np.arange(taps) - reach[:, None, None]  # (levels, 1, taps)
     phase = np.arange(up).reshape(1, -1, 1) / up
@@ -166,9 +163,10 @@ def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Fl
     for number, (octave, across, down) in enumerate(plan.octaves):
         layout = octave.layout
         early = np.float32(_EARLY * threshold)
+        # Each part filters again what its neighbours' filters reach, and has at least as many rows of its own.
         voxels = _in_parts(
             lambda part: find_extrema(source, across, down, buffer, layout, part, _BORDER, early),  # noqa: B023
-            threads.parts(octave.height, octave.height * octave.width // _PART_PX),
+            threads.parts(octave.height, octave.height // (2 * octave.up * int(down[1].max()))),
         )
         found.append(refine_extrema(buffer, layout, voxels, limits, number))
         start = octave.offset + SCALES * octave.per_level
@@ -226,7 +224,7 @@ def dominant_angle(gaussians: Floats, keypoints: Floats, plan: LoopPlan) -> Floa
     step = np.float32(ORIENT_STEP) * plan.first_sigma
     return _in_parts(
         lambda part: sift_descriptors.angles(gaussians, plan.table, keypoints[slice(*part)], step, window, smooth),
-        threads.parts(len(keypoints), len(keypoints) // _POINTS_PER_THREAD),
+        threads.parts(len(keypoints), len(keypoints)),
     )
 
 
@@ -246,7 +244,7 @@ def describe(gaussians: Floats, keypoints: Floats, angle_rad: Floats, plan: Loop
         lambda part: sift_descriptors.descriptors(
             gaussians, plan.table, keypoints[slice(*part)], angle_rad[slice(*part)], plan.first_sigma, tents()
         ),
-        threads.parts(len(keypoints), len(keypoints) // _POINTS_PER_THREAD),
+        threads.parts(len(keypoints), len(keypoints)),
     )
 
 

@@ -7,8 +7,6 @@ import math
 from engine.runtime.tensors import Tensor, torch
 from engine.sift.values import FORBIDDEN, ROUNDING, TRAIN_CHUNK, Features, Limits, Matches, fields_of
 
-_FAR = 1e30
-
 
 def match_tensors(query: Features, train: Features, limits: Limits, ratio: float) -> Matches:
     """The matches of features on a GPU; see :func:`engine.sift.matching.match`."""
@@ -38,13 +36,13 @@ def _distance(cosine: Tensor) -> Tensor:
 
 def _forbid(cosine: Tensor, query: Features, train: Features, limits: Limits) -> None:
     """Lower the cosine (B, N, M) of excluded pairs by a large number, in place; faster than masks."""
-    scale, max_scale_factor = limits
+    (scale, max_scale_factor), far = limits, torch.finfo(cosine.dtype).max
     for valid, dim in ((query.valid, 2), (train.valid, 1)):
-        cosine.sub_((~valid).to(cosine.dtype).unsqueeze(dim), alpha=_FAR)
+        cosine.sub_((~valid).to(cosine.dtype).unsqueeze(dim), alpha=far)
     if max_scale_factor is not None:
         own, other = (query.scale_px * scale).clamp_min(1e-9).log(), train.scale_px.clamp_min(1e-9).log()
         excess = (other[:, None, :] - own[:, :, None]).abs_().sub_(math.log(max_scale_factor))
-        cosine.sub_(excess.clamp_min_(0), alpha=_FAR)
+        cosine.sub_(excess.clamp_min_(0), alpha=far)
 
 
 def _two_nearest(query: Features, train: Features, limits: Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:

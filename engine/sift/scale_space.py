@@ -4,11 +4,11 @@ import math
 from dataclasses import dataclass
 
 SCALES = 3  # DoG levels searched per octave, Lowe's s
-LEVELS = SCALES + 3  # Gaussian levels per octave
 FIRST_SIGMA_PX = 0.8  # sigma of the first Gaussian level, in pixels of the image
+TRUNCATE = 3.0  # a Gaussian's reach in sigmas
 EDGE_RATIO = 10.0  # ratio of a keypoint's curvatures at which it lies on an edge
 _CAMERA_SIGMA_PX = 0.5  # assumed blur of an image
-_MIN_OCTAVE = 12
+_MIN_OCTAVE = 12  # least side of an octave
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Octave:
     @property
     def end(self) -> int:
         """Where its part of the buffer ends."""
-        return self.offset + LEVELS * self.per_level
+        return self.offset + len(self.sigmas) * self.per_level
 
 
 def octaves_of(height: int, width: int, upsample: int) -> tuple[Octave, ...]:
@@ -46,7 +46,8 @@ def octaves_of(height: int, width: int, upsample: int) -> tuple[Octave, ...]:
         width: of the picture.
         upsample: samples per pixel of the first octave.
     """
-    growth = [2.0 ** (level / SCALES) for level in range(LEVELS)]
+    # Extrema are searched in differences of levels with one on either side.
+    growth = [2.0 ** (level / SCALES) for level in range(SCALES + 3)]
     sigmas = tuple(math.sqrt((FIRST_SIGMA_PX * g) ** 2 - _CAMERA_SIGMA_PX**2) for g in growth)
     octaves: list[Octave] = []
     offset, source, up = 0, (height, width), upsample

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+import numpy as np
 
 from engine.runtime.device import Picture
 
@@ -10,7 +13,7 @@ Limits = tuple[float, float | None]
 """Ratio of the scales of matched keypoints, and the factor that it may be off by; None allows all."""
 TRAIN_CHUNK = 4096  # train slots compared at a time, to bound memory for a whole map
 FORBIDDEN = -2.0  # below every cosine
-ROUNDING = 2e-3  # distance between a descriptor and itself by float32 rounding
+ROUNDING = math.sqrt(128 * np.finfo(np.float32).eps)  # most between a descriptor and itself, by rounding
 
 
 @dataclass(frozen=True, slots=True)

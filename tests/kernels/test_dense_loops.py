@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from engine.kernels import dense_loops
 from engine.kernels.dense_loops import CELLS, EDGE_PX, median
-from engine.kernels.gauss_newton import information, normal_equations
+from engine.kernels.gauss_newton import EXCESS, information, normal_equations
 from engine.kernels.lower_plane import lower_plane
 from engine.kernels.small_matrices import solve, turn, turn_between
 
@@ -158,8 +158,8 @@ def samples():
 def test_normal_equations_are_those_of_the_weighted_least_squares(samples):
     shown, expected, points, offset_m, rotation, weights, differences, _ = samples
     jacobian = rows(0.5 * (shown + expected), points, offset_m, rotation)
-    scale = 1.0 / (1.6 * np.average(differences**2, weights=weights))
-    normal, score = normal_equations(shown, expected, points, offset_m, rotation, weights, differences, 1.6)
+    scale = 1.0 / (EXCESS * np.average(differences**2, weights=weights))
+    normal, score = normal_equations(shown, expected, points, offset_m, rotation, weights, differences)
     np.testing.assert_allclose(normal, scale * (jacobian.T * weights) @ jacobian, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(score, -scale * jacobian.T @ (weights * differences), rtol=1e-10, atol=1e-10)
 

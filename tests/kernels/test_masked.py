@@ -158,7 +158,7 @@ def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, mod
     """Windows that count as small are neither divided nor scored in two ways."""
     if divisions is not None:
         monkeypatch.setattr(masked_blocks, "_SMALL_PX", 0)
-        monkeypatch.setattr(masked_blocks, "_DIVISIONS", divisions)
+        monkeypatch.setattr(masked_blocks, "_divisions", lambda places: divisions)
     window, valid, templates = drawn(kind, size, model)
     window, templates = (values.astype(np.float32).astype(np.float64) for values in (window, templates))
     expected = by_whole_windows(window, valid, templates, min_overlap)

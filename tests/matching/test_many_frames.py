@@ -39,7 +39,6 @@ PLACES = [np.array([300.0 + 6.0 * k, 290.0 + 4.0 * (k % 3)]) for k in range(6)]
 @pytest.fixture(autouse=True)
 def _started_at_once(monkeypatch):
     """Workers are started after the first task, however little work it is."""
-    monkeypatch.setattr(processes, "_ALONE_S", 0.0)
     monkeypatch.setattr(processes, "_WORTH_S", 0.0)
 
 

@@ -40,7 +40,7 @@ def binomial(gray):
 
 def test_grey_is_the_smoothed_picture_about_middle_grey():
     gray = noise()
-    np.testing.assert_allclose(enhance(gray, score="grey"), binomial(gray) - 127.5, atol=0.51)
+    np.testing.assert_allclose(enhance(gray, score="grey"), binomial(gray) - 128, atol=0.51)
 
 
 def test_local_without_a_neighbourhood_only_smooths():

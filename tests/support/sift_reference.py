@@ -10,7 +10,7 @@ import math
 import numpy as np
 from scipy.ndimage import map_coordinates, maximum_filter
 
-from engine.sift.scale_space import FIRST_SIGMA_PX, LEVELS, SCALES, Octave
+from engine.sift.scale_space import FIRST_SIGMA_PX, SCALES, Octave
 
 Array = np.ndarray
 BORDER, EARLY, MOVES, MAX_SHIFT, EDGE_RATIO = 4, 0.8, 2, 0.7, 10.0
@@ -30,7 +30,7 @@ def levels_of(image: Array, octaves: tuple[Octave, ...]) -> list[Array]:
     found, source = [], image.astype(np.float64)
     for octave in octaves:
         down, across = ([gaussian_matrix(n, sigma, octave.up) for sigma in octave.sigmas] for n in source.shape)
-        found.append(np.stack([down[level] @ source @ across[level].T for level in range(LEVELS)]))
+        found.append(np.stack([down[level] @ source @ across[level].T for level in range(SCALES + 3)]))
         source = found[-1][SCALES, ::2, ::2]
     return found
 
