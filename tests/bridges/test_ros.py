@@ -16,10 +16,8 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from bench.inputs.bags import BagMessages
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.navigation.live import LiveOptions
@@ -48,13 +46,7 @@ from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
 from tests.support.fixes import a_fix
 from tests.support.ground import body_axes
 from tests.support.odometries import odometry_message, twist_message
-
-STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
-NOW_NS = 1_700_000_000_123_456_789
-
-
-def maker_of(name):
-    return BagMessages(STORES[name].types.__getitem__, name == "ros1")
+from tests.support.ros import NOW_NS, STORES, StandInNode, maker_of
 
 
 def wired(name, message):
@@ -471,35 +463,9 @@ def test_diagnostics_are_pairs_of_text(ros, maker):
 # ----------------------------------------------------------------------------------------------- the bridge
 
 
-class StandIn:
-    """A node that keeps what is published."""
-
-    def __init__(self, maker):
-        self.messages, self.wanted, self.published, self.changed = maker, True, [], threading.Condition()
-        self.time_ns = NOW_NS
-
-    def now_ns(self):
-        return self.time_ns
-
-    def publish(self, output, message):
-        with self.changed:
-            self.published.append((output, message))
-            self.changed.notify_all()
-
-    def has_subscribers(self, output):
-        return self.wanted
-
-    def of(self, output):
-        return [message for kind, message in list(self.published) if kind == output]
-
-    def wait_for(self, output, count):
-        with self.changed:
-            assert self.changed.wait_for(lambda: len(self.of(output)) >= count, 60.0), self.published
-
-
 @pytest.fixture
 def node(maker):
-    return StandIn(maker)
+    return StandInNode(maker)
 
 
 class Answers:

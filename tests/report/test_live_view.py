@@ -18,7 +18,6 @@ from engine.navigation.navigator import NavigatorState
 from scenematch.bridges.ros import RosBridge
 from scenematch.bridges.ros_out import RosOptions
 from scenematch.cli.app import run
-from scenematch.files.ros.messages import MessageFactory
 from scenematch.files.track import read_track
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget
 from scenematch.runs.settings import TrackSettings
@@ -28,13 +27,13 @@ from tests.support.runs import bare_runs
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 from pyarrow import duration, timestamp
 from rerun.chunk import RrdReader
-from rosbags.typesys import Stores, get_typestore
 
 from scenematch.report import live_view
 from scenematch.report.live_view import FIX_RGB, SIGMAS, ellipsoid
 from tests.support import browser
 from tests.support.commands import refusal
 from tests.support.dark_flight import DARK, FRAMES, dark_flight
+from tests.support.ros import StandInNode, maker_of
 
 
 def rows_of(recording):
@@ -245,11 +244,7 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
             Connection("udpin", "127.0.0.1", 0), quiet, MavlinkOptions(), watch=stated.append
         )
     else:
-        messages = MessageFactory(get_typestore(Stores.ROS2_HUMBLE).types.__getitem__, False)
-        node = SimpleNamespace(
-            messages=messages, now_ns=lambda: 1, has_subscribers=lambda output: False, publish=lambda *_: None
-        )
-        made = RosBridge(node, sim_site, quiet, RosOptions(), watch=stated.append)
+        made = RosBridge(StandInNode(maker_of("ros2")), sim_site, quiet, RosOptions(), watch=stated.append)
     made.deliver(answer)
     made.close()
     assert stated == [answer]
