@@ -425,8 +425,15 @@ def test_the_raster_lies_where_the_map_does(map_file, found, tmp_path):
 
 
 @pytest.mark.slow
-def test_people_get_a_table_and_a_pipe_no_escapes(map_file, route_file, tmp_path, capsys):
-    assert run(audit(map_file, tmp_path / "out", f"--route={route_file}")) == 0
+def test_people_get_a_table_and_a_pipe_no_escapes_and_a_folder_is_kept_unless_forced(
+    map_file, route_file, tmp_path, capsys
+):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").touch()
+    command = audit(map_file, tmp_path / "out", f"--route={route_file}")
+    assert "--force" in refusal(capsys, command)
+    assert run([*command, "--force"]) == 0
+    assert (tmp_path / "out" / "mine.txt").exists()
     printed = capsys.readouterr()
     assert re.search(r"^good +\d+\.\d%$", printed.out, re.MULTILINE)
     assert "poor: flat" in printed.out
@@ -435,17 +442,6 @@ def test_people_get_a_table_and_a_pipe_no_escapes(map_file, route_file, tmp_path
     assert len(stated) == 2
     assert stated[1].startswith("next: scenematch track --map ")
     assert "\x1b" not in printed.out
-
-
-@pytest.mark.slow
-def test_a_folder_that_exists_is_kept_unless_forced(map_file, tmp_path, capsys):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "mine.txt").write_text("mine", encoding="utf-8")
-    assert "--force" in refusal(capsys, audit(map_file, out))
-    assert [path.name for path in out.iterdir()] == ["mine.txt"]
-    assert run(audit(map_file, out, "--force")) == 0
-    assert (out / "mine.txt").read_text(encoding="utf-8") == "mine"
 
 
 @pytest.mark.parametrize(

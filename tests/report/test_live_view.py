@@ -3,7 +3,6 @@
 import socket
 import sys
 import threading
-import time
 from collections import defaultdict
 from functools import cache
 from types import SimpleNamespace
@@ -34,6 +33,7 @@ from tests.support import browser
 from tests.support.commands import refusal
 from tests.support.dark_flight import DARK, FRAMES, dark_flight
 from tests.support.ros import StandInNode, maker_of
+from tests.support.waiting import wait_until
 
 
 def rows_of(recording):
@@ -213,7 +213,7 @@ def test_a_bridge_never_waits_for_the_view_and_the_newest_is_shown(matcher, capl
     assert watcher.follow(navigator) is navigator
     answer = Answer(Frame(np.zeros((300, 300), np.uint8), 1), None, 1.0)
     watcher(answer)
-    wait_for(lambda: view.shown)
+    wait_until(lambda: view.shown)
     for _ in range(5):  # nobody takes them
         watcher(answer)
     view.go.set()
@@ -221,13 +221,6 @@ def test_a_bridge_never_waits_for_the_view_and_the_newest_is_shown(matcher, capl
     assert view.shown == [(0, NavigatorState.SEARCHING), (5, NavigatorState.SEARCHING)]
     assert view.closed
     assert "the live view failed at frame 0" in caplog.text
-
-
-def wait_for(happened):
-    end = time.monotonic() + 60.0
-    while not happened() and time.monotonic() < end:
-        time.sleep(0.01)
-    assert happened()
 
 
 @pytest.mark.parametrize("bridge", ["mavlink", "ros"])

@@ -161,7 +161,8 @@ def test_notes_come_back_as_they_were(tmp_path):
 
 def test_settings_are_read_back_from_the_record():
     options = {"ncc": NccOptions(refine=False), "sift": SiftOptions(max_height_m=90.0)}
-    settings = TrackSettings(method="sift", budget_ms=40.0, risk=1e-3, **options)
+    columns = {"timestamp_us": "time_us", "height_agl_m": "altitude_agl [m]"}
+    settings = TrackSettings(method="sift", budget_ms=40.0, risk=1e-3, telemetry_columns=columns, **options)
     record = json.loads(json.dumps(changed(settings)))
     assert options_from_mapping(TrackSettings, nested(record)) == settings
 

@@ -17,6 +17,7 @@ from scenematch.runs import last_fix
 from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.supervisor import check_supervision
 from tests.support.paths import ROOT
+from tests.support.waiting import wait_until
 
 SCRIPT = """
 import os, sys, time
@@ -97,10 +98,7 @@ def test_a_worker_does_not_outlive_its_supervisor(supervisor):
     pid = int(supervisor.stdout.readline().split()[0])
     assert is_running(pid)
     supervisor.kill()
-    until = time.monotonic() + 60.0
-    while is_running(pid) and time.monotonic() < until:
-        time.sleep(0.02)
-    assert not is_running(pid)
+    wait_until(lambda: not is_running(pid))
 
 
 def test_a_gpu_cannot_be_supervised():
