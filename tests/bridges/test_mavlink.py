@@ -1,7 +1,5 @@
 """The MAVLink bridge: bytes as pymavlink makes them, the firmwares' traps, a stand-in autopilot on loopback."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math

@@ -1,7 +1,5 @@
 """The ROS nodes: messages of both ROS in and out by rosbags' types, REP-103 by hand, and nodes on stand-ins."""
 
-from __future__ import annotations
-
 import array
 import contextlib
 import math

@@ -278,6 +278,8 @@ def test_version(capsys):
         (["track", "--bogus"], ["--bogus", "scenematch track --help"]),
         (["map"], ["scenematch map --help"]),
         (["demo", "--seed=-1"], ["--seed"]),
+        (["simulate", "--out=o", "--frames=0"], ["--frames"]),
+        (["simulate", "--out=o", "--surface=dsm.tif"], ["--surface: expected with --map only"]),
     ],
 )
 def test_wrong_usage_is_told_with_the_help_that_there_is(arguments, words, capsys):

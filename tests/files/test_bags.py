@@ -1,7 +1,5 @@
 """Bags of ROS 1 and ROS 2: the same pictures and numbers in every format, in and out; damage in one line."""
 
-from __future__ import annotations
-
 import io
 from functools import cache, partial
 

@@ -1,7 +1,5 @@
 """Corrections of telemetry: units, signs, swapped columns, offsets and a clock, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, replace

@@ -1,7 +1,5 @@
 """The supervisor replaces a worker that is killed; the last fix is found by who takes over, and by no other."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

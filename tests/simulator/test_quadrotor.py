@@ -1,7 +1,5 @@
 """The quadrotor: physics against closed forms, the pilot along a route, and the statistics of the sensors."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What cannot be simulated is refused by the name of the argument."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """The simulated world: conditions against their definitions, relief and water against geometry, maps as worlds."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 
