@@ -21,11 +21,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.quaternion import Quaternion
 
+from engine import Attitude, NavigatorOptions, NoFix, OptionError, Prior, Reason, TelemetryError
 from engine.camera import mount_rotation
-from engine.errors import OptionError, TelemetryError
 from engine.geo import LocalFrame
-from engine.options import NavigatorOptions
-from engine.values import Attitude, NoFix, Prior, Reason
 from scenematch.bridges import mavlink_requests
 from scenematch.bridges.fix_velocity import GroundVelocity, VelocityFromFixes
 from scenematch.bridges.links import Connection, parse_connection

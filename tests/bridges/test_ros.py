@@ -20,6 +20,7 @@ from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.navigation.live import LiveOptions
 from engine.values import Attitude, NoFix, Reason, Window
+from scenematch import CameraInput, MapInput, RosSettings, run_ros_bridge
 from scenematch.bridges.ros import OUTPUTS, RosBridge
 from scenematch.bridges.ros_in import RosTelemetry, RosTopics
 from scenematch.bridges.ros_out import RosOptions, diagnostics, pose, window_picture
@@ -38,9 +39,6 @@ from scenematch.files.ros.messages import (
     range_from_message,
     stamp_ns,
 )
-from scenematch.runs.cameras import CameraInput
-from scenematch.runs.map_input import MapInput
-from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
 from tests.support.fixes import a_fix
 from tests.support.ground import body_axes
 from tests.support.odometries import odometry_message, twist_message

@@ -13,8 +13,7 @@ from pyproj import Transformer
 from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterWindow
 
-from engine import Camera, OrthoMap
-from engine.errors import OptionError, TelemetryError
+from engine import Camera, OptionError, OrthoMap, TelemetryError
 from scenematch.check.availability import Flag, audit_site, fix_probability, predict_route
 from scenematch.check.plan import AuditOptions, MapPart, plan_audit
 from scenematch.check.self_match import measure_self_match

@@ -13,8 +13,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.serde import utils as serde_utils
 
 from bench.inputs.bags import BAG_KINDS, write_bag
-from engine.camera import Camera
-from engine.errors import TelemetryError
+from engine import Camera, TelemetryError
 from engine.values import Frame, Prior, Truth
 from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import open_truth

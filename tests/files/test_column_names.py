@@ -3,10 +3,9 @@
 import pytest
 
 from engine.errors import OptionError
+from scenematch import MapInput, TrackSettings
 from scenematch.files.telemetry import open_telemetry
 from scenematch.runs.inputs import FlightFiles, open_inputs
-from scenematch.runs.map_input import MapInput
-from scenematch.runs.settings import TrackSettings
 from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
 

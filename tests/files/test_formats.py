@@ -8,14 +8,7 @@ import pytest
 import rasterio
 from PIL import Image
 
-from engine.camera import Camera
-from engine.errors import (
-    CalibrationError,
-    DtypeError,
-    MapError,
-    OptionError,
-    ShapeError,
-)
+from engine import CalibrationError, Camera, DtypeError, MapError, OptionError, ShapeError
 from engine.values import Frame, NoFix, Prior, Reason, Truth, Window
 from scenematch.files.flight import open_flight, write_flight_folder
 from scenematch.files.frames import open_frames, read_image

@@ -4,8 +4,7 @@ import re
 
 import pytest
 
-from engine import OptionError
-from engine.options import NavigatorOptions, SiftOptions
+from engine import NavigatorOptions, OptionError, SiftOptions
 from scenematch.files.settings import changed, field_descriptions, options_from_mapping, settings_text
 from scenematch.runs.settings import TrackSettings, load_settings
 from tests.support.refusals import refusal

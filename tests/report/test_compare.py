@@ -7,13 +7,11 @@ from dataclasses import replace
 import pytest
 
 from engine import OptionError
+from scenematch import FlightFiles, TrackSettings, track
 from scenematch.cli.app import run
 from scenematch.files.logs.readers import LogClock
 from scenematch.files.track import read_track
 from scenematch.runs.comparison import DEFAULT_RUNS, parse_runs
-from scenematch.runs.inputs import FlightFiles
-from scenematch.runs.settings import TrackSettings
-from scenematch.runs.tracking import track
 from tests.support.commands import file_options, refusal
 
 

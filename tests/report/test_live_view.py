@@ -11,16 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from engine import Frame, Navigator, NoFix, Prior, Reason, SceneMatcher
-from engine.navigation.live import Answer
-from engine.navigation.navigator import NavigatorState
+from engine import Answer, Frame, Navigator, NavigatorState, NoFix, Prior, Reason, SceneMatcher
+from scenematch import TrackSettings, track
 from scenematch.bridges.ros import RosBridge
 from scenematch.bridges.ros_out import RosOptions
 from scenematch.cli.app import run
 from scenematch.files.track import read_track
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget
-from scenematch.runs.settings import TrackSettings
-from scenematch.runs.tracking import track
 from tests.support.runs import bare_runs
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")

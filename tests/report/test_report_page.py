@@ -11,6 +11,7 @@ import pytest
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
 from engine.options import MatcherOptions, NccOptions, SiftOptions
 from engine.values import Reason, Window
+from scenematch import TrackSettings, evaluate
 from scenematch.cli.app import run
 from scenematch.files.notes import FrameNote, frame_note, read_notes, write_notes
 from scenematch.files.settings import changed, nested, options_from_mapping
@@ -21,8 +22,6 @@ from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.metrics import Ground, TrackErrors, summarise
 from scenematch.report.page import write_page
 from scenematch.report.verdict import MEANINGS, verdict_of
-from scenematch.runs.evaluation import evaluate
-from scenematch.runs.settings import TrackSettings
 from tests.support.commands import refusal
 from tests.support.dark_flight import DARK, FRAMES, data_of
 

@@ -8,8 +8,7 @@ import pytest
 
 import scenematch
 from bench.inputs.log_files import ulog_flight
-from engine import OptionError, TelemetryError
-from engine.errors import BackendError, MissingExtraError
+from engine import BackendError, MissingExtraError, OptionError, TelemetryError
 from scenematch import FlightFiles, Progress, TrackSettings, track
 from scenematch.bridges.links import parse_connection
 from scenematch.check import Diagnosis, Finding

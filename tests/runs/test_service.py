@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from engine import SceneMatcher
-from engine.errors import OptionError
+from engine import OptionError, SceneMatcher
 from engine.navigation.live import Counts
 from engine.runtime.realtime import _FIFO_CURE, _MEMORY_CURE
 from scenematch.bridges.camera_stream import _IDLE_S, _REOPEN_S, _TIMEOUTS

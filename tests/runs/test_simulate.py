@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.camera import Camera
-from engine.orthomap import OrthoMap
+from engine import Camera, OrthoMap
 from scenematch.cli.app import run
 from scenematch.files.flight import open_flight
 from scenematch.files.track import read_track

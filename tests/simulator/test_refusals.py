@@ -7,9 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from engine.camera import Camera
-from engine.errors import OptionError, ShapeError
-from engine.values import Attitude
+from engine import Attitude, Camera, OptionError, ShapeError
 from scenematch.runs.simulation import WorldSettings
 from scenematch.simulator import Condition, FlightStyle, Optics, SensorNoise, World, build_town, plan_flight
 from scenematch.simulator.faults import Fault
