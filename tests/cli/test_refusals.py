@@ -8,7 +8,6 @@ from tests.support.commands import refusal
 BRIDGE = ["bridge", "mavlink", "--map=m.tif", "--camera=c.yaml", "--connect=udpout:127.0.0.1:14999"]
 PLAYED, LIVE = [*BRIDGE, "--frames=f"], [*BRIDGE, "--camera-source=0"]
 ROS = ["bridge", "ros", "--map=m.tif"]
-GRAB = "input.exposure_to_grab_ms"
 IN_REAL_TIME = [[*command, "--settings=bridge.realtime=true"] for command in (PLAYED, ROS)]
 NO_ORIGIN = ["--settings=mavlink.set_origin=false", "--settings=mavlink.origin_alt_m=3"]
 SIMULATE = ["simulate", "--out=o"]

@@ -270,7 +270,7 @@ def test_a_bag_without_telemetry_or_calibration_says_so(tmp_path, maker):
         read_bag_camera(path)
 
 
-def test_what_counts_as_a_bag(tmp_path):
+def test_what_counts_as_a_bag_and_one_that_is_missing_is_named(tmp_path):
     path, _, _ = a_bag(tmp_path, "ros2-mcap")
     assert is_bag(path)
     assert is_bag(next(path.glob("*.mcap")))
@@ -278,9 +278,6 @@ def test_what_counts_as_a_bag(tmp_path):
     assert not is_bag(tmp_path)
     assert not is_bag("flight.mp4")
     assert len(BagFrames(next(path.glob("*.mcap"))).names) == 5
-
-
-def test_a_bag_that_is_missing_is_named(tmp_path):
     with pytest.raises(TelemetryError, match="no such bag"):
         BagFrames(tmp_path / "missing.bag")
 
