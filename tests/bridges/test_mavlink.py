@@ -799,10 +799,7 @@ def test_a_flight_that_is_played_begins_when_it_is_told(tmp_path):
     played = list(replay(tmp_path, None, rate_hz=50.0, every=2))  # one in two, each at its own time
     assert [picture.max() for picture, _ in played] == [0, 2]
     assert played[1][1] - played[0][1] == 40_000_000
-
-
-def test_a_flight_that_is_played_is_read_before_its_first_picture_is_asked_for(tmp_path):
-    with pytest.raises(TelemetryError, match="no such"):
+    with pytest.raises(TelemetryError, match="no such"):  # before its first picture is asked for
         replay(tmp_path / "none", None, rate_hz=50.0)
 
 
@@ -1048,25 +1045,26 @@ def test_the_autopilots_velocity_is_used_if_the_bridge_is_told_so(loop, use_velo
     assert (frames[-1].east_velocity_mps, frames[-1].north_velocity_mps) == (expected, expected)
 
 
-def test_the_first_fixes_are_held_against_the_receiver(loop):
-    site = SimpleNamespace(frame=LocalFrame(33.64, 72.99))
-    made, pilot = loop(site=site, pilot={"origin": ORIGIN_1E7, "receiver": (3, 336400000, 729900000)})
-    made.navigator.result = fix(east_m=40.0)
-    fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
-    made.navigator.result = fix(east_m=1.0)
-    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
+AT_THE_ORIGIN = Prior(lat_deg=33.64, lon_deg=72.99, sigma_m=20.0)
 
 
-@pytest.mark.parametrize("resumed", [False, True])
-def test_only_a_first_fix_waits_for_the_autopilots_word_on_its_receiver(loop, resumed, monkeypatch):
-    """The stand-in says nothing of a receiver; a bridge that goes on from its last fix asks for none."""
+@pytest.mark.parametrize(
+    ("given", "off_m", "is_sent"),
+    [
+        ({"pilot": {"origin": ORIGIN_1E7, "receiver": (3, *ORIGIN_1E7[:2])}}, 40.0, True),
+        ({"start": AT_THE_ORIGIN, "resumed": True}, 400.0, True),
+        ({"start": AT_THE_ORIGIN, "resumed": False}, 400.0, False),
+    ],
+    ids=["heard", "resumed", "not heard"],
+)
+def test_the_first_fixes_are_held_against_the_receiver(loop, given, off_m, is_sent, monkeypatch):
+    """Or wait for the autopilot's word on it; a bridge that goes on from its last fix asks for none."""
     monkeypatch.setattr("scenematch.bridges.mavlink._GNSS_STALE_NS", 10**15)
-    start = Prior(lat_deg=33.64, lon_deg=72.99, sigma_m=20.0)
-    made, pilot = loop(site=SimpleNamespace(frame=LocalFrame(33.64, 72.99)), start=start, resumed=resumed)
-    made.navigator.result = fix(east_m=400.0)
+    made, pilot = loop(site=SimpleNamespace(frame=LocalFrame(33.64, 72.99)), **given)
+    made.navigator.result = fix(east_m=off_m)
     fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
     made.navigator.result = fix(east_m=1.0)
-    if resumed:
+    if is_sent:
         fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
     else:
         fly(made.bridge, lambda: made.bridge.status.withheld.get("receiver not heard yet", 0) > 5)
