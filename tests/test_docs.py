@@ -9,8 +9,7 @@ import pytest
 from docs.draw_architecture import drawn, members, picture
 from docs.site_commands import with_options
 from docs.site_roles import on_page_content
-from engine.options import AssumedErrors, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, SiftOptions
-from engine.values import Reason
+from engine import AssumedErrors, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, Reason, SiftOptions
 from scenematch.files.track import COLUMNS
 from tests.support.commands import LEAVES
 from tests.support.paths import ROOT

@@ -63,16 +63,12 @@ def test_a_shifted_keypoint_counts_up_to_the_tolerances(places, off_px, repeated
     assert (figures.repeatability, figures.inlier_ratio) == (repeated, right)
 
 
+@pytest.mark.parametrize("zoom", [1.0, 2.0])
 @pytest.mark.parametrize(("factor", "repeated"), [(1.4, 1.0), (1.6, 0.0), (1 / 1.4, 1.0), (1 / 1.6, 0.0)])
-def test_a_keypoint_of_another_scale_is_not_repeated(places, factor, repeated):
-    figures = judge(keypoints(places), keypoints(places, scale_px=2.0 * factor), pair_by(np.eye(3)))
-    assert figures.repeatability == repeated
-
-
-def test_scales_are_compared_on_the_ground(places):
-    pair = pair_by(np.diag([2.0, 2.0, 1.0]))  # the first shows the ground twice as large
-    first, second = keypoints(places, scale_px=4.0), keypoints(places / 2.0, scale_px=2.0)
-    assert judge(first, second, pair).repeatability == 1.0
+def test_a_keypoint_of_another_scale_on_the_ground_is_not_repeated(places, factor, repeated, zoom):
+    """Where the first picture shows the ground larger, keypoints of the same ground are larger in it."""
+    first, second = keypoints(places, scale_px=2.0 * zoom), keypoints(places / zoom, scale_px=2.0 * factor)
+    assert judge(first, second, pair_by(np.diag([zoom, zoom, 1.0]))).repeatability == repeated
 
 
 def test_keypoints_outside_the_common_ground_do_not_count_against_repeatability(places):

@@ -11,11 +11,9 @@ from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
 from bench import datasets
+from scenematch import FlightFiles, TrackSettings, track
 from scenematch.files.telemetry import read_telemetry
 from scenematch.files.truth import read_truth
-from scenematch.runs.inputs import FlightFiles
-from scenematch.runs.settings import TrackSettings
-from scenematch.runs.tracking import track
 from scenematch.simulator import plan_flight
 from tests.support.towns import drawn_town
 

@@ -223,15 +223,12 @@ def moved(forward_m: float, right_m: float) -> State:
     return replace(TAKEN, east_m=TAKEN.east_m + east_m, north_m=TAKEN.north_m + north_m)
 
 
-def test_where_the_frame_was_taken_its_middle_is_shown():
-    warp = recorded_from_shown(TAKEN, FRAME, TAKEN, FOCAL_PX)
-    assert np.allclose(warp, np.column_stack([np.eye(2), MARGIN]), atol=1e-9)
-
-
-def test_forward_is_up_and_right_is_right():
+@pytest.mark.parametrize(("forward_m", "right_m"), [(0.0, 0.0), (5.0, 3.0)])
+def test_the_middle_of_the_frame_is_shown_forward_is_up_and_right_is_right(forward_m, right_m):
     metre_px = FOCAL_PX / TAKEN.height_m
-    warp = recorded_from_shown(TAKEN, FRAME, moved(5.0, 3.0), FOCAL_PX)
-    assert np.allclose(warp[:, 2] - MARGIN, [3.0 * metre_px, -5.0 * metre_px], atol=1e-9)
+    warp = recorded_from_shown(TAKEN, FRAME, moved(forward_m, right_m), FOCAL_PX)
+    expected = MARGIN + metre_px * np.array([right_m, -forward_m])
+    assert np.allclose(warp, np.column_stack([np.eye(2), expected]), atol=1e-9)
 
 
 def test_a_pixel_is_on_the_same_ground_in_both_pictures():

@@ -1,7 +1,5 @@
 """The benchmark of GPUs on a machine without one: its table and its counting."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """A live camera: it is opened again where it ends or stalls, and a picture that repeats is none."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 import time

@@ -1,7 +1,5 @@
 """The MAVLink bridge: bytes as pymavlink makes them, the firmwares' traps, a stand-in autopilot on loopback."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math
@@ -23,11 +21,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.quaternion import Quaternion
 
+from engine import Attitude, NavigatorOptions, NoFix, OptionError, Prior, Reason, TelemetryError
 from engine.camera import mount_rotation
-from engine.errors import OptionError, TelemetryError
 from engine.geo import LocalFrame
-from engine.options import NavigatorOptions
-from engine.values import Attitude, NoFix, Prior, Reason
 from scenematch.bridges import mavlink_requests
 from scenematch.bridges.fix_velocity import GroundVelocity, VelocityFromFixes
 from scenematch.bridges.links import Connection, parse_connection
@@ -61,6 +57,7 @@ from scenematch.cli.app import run as main
 from scenematch.runs.last_fix import remember_delay
 from tests.support.fixes import a_fix
 from tests.support.paths import ROOT
+from tests.support.waiting import wait_until
 
 GOLDEN = ROOT / "tests" / "golden" / "mavlink"
 ORIGIN = NedOrigin(33.6400000, 72.9900000, 510.0)
@@ -395,18 +392,13 @@ def test_height_is_by_the_rangefinder_then_the_clearance_then_above_home():
     clear = mavlink.MAVLink_altitude_message(5_000_000, 0, 0, 0, 0, -1001.0, 95.0)
     beam = mavlink.MAVLink_distance_sensor_message(5000, 20, 20000, 10_000, 0, 0, 25, 0)
     ahead = mavlink.MAVLink_distance_sensor_message(5000, 20, 20000, 10_000, 0, 0, 0, 0)
-    tilted = mavlink.MAVLink_attitude_message(5000, math.radians(60.0), 0, 0, 0, 0, 0)
+    level, tilted = (mavlink.MAVLink_attitude_message(5000, roll, 0, 0, 0, 0, 0) for roll in (0, math.pi / 3))
     assert heard(home).height_agl_m == pytest.approx(90.0)
     assert heard(home, clear).height_agl_m == pytest.approx(95.0)
     assert heard(home, clear, ahead).height_agl_m == pytest.approx(95.0)
     assert heard(home, clear, beam, tilted).height_agl_m == pytest.approx(50.0)
-
-
-def test_a_rangefinder_without_a_stamp_counts_from_its_arrival():
-    beam = mavlink.MAVLink_rangefinder_message(80.0, 1.0)
-    level = mavlink.MAVLink_attitude_message(5000, 0, 0, 0, 0, 0, 0)
-    assert heard(level, beam).height_agl_m == pytest.approx(80.0)
-    assert heard(level, mavlink.MAVLink_rangefinder_message(0.0, 0.0)).height_agl_m is None
+    unstamped = (mavlink.MAVLink_rangefinder_message(range_m, 1.0) for range_m in (80.0, 0.0))
+    assert [heard(level, beam).height_agl_m for beam in unstamped] == [pytest.approx(80.0), None]
 
 
 def test_the_date_is_the_autopilots_or_where_it_has_none_this_machines():
@@ -541,12 +533,6 @@ def test_a_datagram_of_noise_is_given_up_soon():
     assert not datagrams.feed(noise)
     assert datagrams.dropped < 100  # not the 20,000 packets that may begin in it
     assert len(datagrams.feed(noise[:30] + beat(autopilot()))) == 1
-
-
-def test_strangers_are_not_heard():
-    assert len(decoder().feed(beat(autopilot()))) == 1
-    assert not decoder().feed(beat(autopilot(system=2)))
-    assert not decoder().feed(beat(autopilot(component=190)))
 
 
 def test_with_a_key_only_what_is_rightly_signed_and_new_is_heard():
@@ -813,10 +799,7 @@ def test_a_flight_that_is_played_begins_when_it_is_told(tmp_path):
     played = list(replay(tmp_path, None, rate_hz=50.0, every=2))  # one in two, each at its own time
     assert [picture.max() for picture, _ in played] == [0, 2]
     assert played[1][1] - played[0][1] == 40_000_000
-
-
-def test_a_flight_that_is_played_is_read_before_its_first_picture_is_asked_for(tmp_path):
-    with pytest.raises(TelemetryError, match="no such"):
+    with pytest.raises(TelemetryError, match="no such"):  # before its first picture is asked for
         replay(tmp_path / "none", None, rate_hz=50.0)
 
 
@@ -897,15 +880,6 @@ def test_a_packet_that_cannot_be_read_does_not_end_the_reading(loop, monkeypatch
     fly(made.bridge, lambda: pilot.of("VISION_POSITION_ESTIMATE"))
     assert len(faults) == 3
     assert [record.exc_info[0] for record in caplog.records if record.exc_info] == [ValueError]
-
-
-@pytest.mark.slow
-def test_fixes_come_at_4_hz_or_more(loop):
-    made, pilot = loop()
-    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 20, every_s=0.1)
-    got = pilot.of("VISION_POSITION_ESTIMATE")
-    hz = (len(got) - 1) / ((got[-1][1] - got[0][1]) * 1e-9)
-    assert hz >= MIN_RATE_HZ
 
 
 def test_an_origin_is_set_where_there_is_none_and_nothing_is_sent_before(loop, monkeypatch):
@@ -1071,25 +1045,26 @@ def test_the_autopilots_velocity_is_used_if_the_bridge_is_told_so(loop, use_velo
     assert (frames[-1].east_velocity_mps, frames[-1].north_velocity_mps) == (expected, expected)
 
 
-def test_the_first_fixes_are_held_against_the_receiver(loop):
-    site = SimpleNamespace(frame=LocalFrame(33.64, 72.99))
-    made, pilot = loop(site=site, pilot={"origin": ORIGIN_1E7, "receiver": (3, 336400000, 729900000)})
-    made.navigator.result = fix(east_m=40.0)
-    fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
-    made.navigator.result = fix(east_m=1.0)
-    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
+AT_THE_ORIGIN = Prior(lat_deg=33.64, lon_deg=72.99, sigma_m=20.0)
 
 
-@pytest.mark.parametrize("resumed", [False, True])
-def test_only_a_first_fix_waits_for_the_autopilots_word_on_its_receiver(loop, resumed, monkeypatch):
-    """The stand-in says nothing of a receiver; a bridge that goes on from its last fix asks for none."""
+@pytest.mark.parametrize(
+    ("given", "off_m", "is_sent"),
+    [
+        ({"pilot": {"origin": ORIGIN_1E7, "receiver": (3, *ORIGIN_1E7[:2])}}, 40.0, True),
+        ({"start": AT_THE_ORIGIN, "resumed": True}, 400.0, True),
+        ({"start": AT_THE_ORIGIN, "resumed": False}, 400.0, False),
+    ],
+    ids=["heard", "resumed", "not heard"],
+)
+def test_the_first_fixes_are_held_against_the_receiver(loop, given, off_m, is_sent, monkeypatch):
+    """Or wait for the autopilot's word on it; a bridge that goes on from its last fix asks for none."""
     monkeypatch.setattr("scenematch.bridges.mavlink._GNSS_STALE_NS", 10**15)
-    start = Prior(lat_deg=33.64, lon_deg=72.99, sigma_m=20.0)
-    made, pilot = loop(site=SimpleNamespace(frame=LocalFrame(33.64, 72.99)), start=start, resumed=resumed)
-    made.navigator.result = fix(east_m=400.0)
+    made, pilot = loop(site=SimpleNamespace(frame=LocalFrame(33.64, 72.99)), **given)
+    made.navigator.result = fix(east_m=off_m)
     fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 5)
     made.navigator.result = fix(east_m=1.0)
-    if resumed:
+    if is_sent:
         fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > 2)
     else:
         fly(made.bridge, lambda: made.bridge.status.withheld.get("receiver not heard yet", 0) > 5)
@@ -1225,13 +1200,6 @@ def test_a_serial_port_takes_halves_and_its_loss_is_survived(monkeypatch):
         os.close(vehicle)
         wait_until(lambda: not bridge.connected)
     os.close(port)
-
-
-def wait_until(holds, timeout_s=60.0):
-    end = time.monotonic() + timeout_s
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 # ---------------------------------------------------------------------------------------------- the page

@@ -1,7 +1,5 @@
 """The ROS nodes: messages of both ROS in and out by rosbags' types, REP-103 by hand, and nodes on stand-ins."""
 
-from __future__ import annotations
-
 import array
 import contextlib
 import math
@@ -16,17 +14,16 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from bench.inputs.bags import BagMessages
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
 from engine.navigation.live import LiveOptions
 from engine.values import Attitude, NoFix, Reason, Window
+from scenematch import CameraInput, MapInput, RosSettings, run_ros_bridge
 from scenematch.bridges.ros import OUTPUTS, RosBridge
 from scenematch.bridges.ros_in import RosTelemetry, RosTopics
-from scenematch.bridges.ros_out import RosOptions, diagnostics, pose, window_picture
+from scenematch.bridges.ros_out import RosOptions, pose, window_picture
 from scenematch.bridges.vehicle import NedOrigin, VehicleState, north_east_m
 from scenematch.cli.app import run as main
 from scenematch.cli.argument_names import ros_arguments_last
@@ -42,19 +39,10 @@ from scenematch.files.ros.messages import (
     range_from_message,
     stamp_ns,
 )
-from scenematch.runs.cameras import CameraInput
-from scenematch.runs.map_input import MapInput
-from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
 from tests.support.fixes import a_fix
 from tests.support.ground import body_axes
 from tests.support.odometries import odometry_message, twist_message
-
-STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
-NOW_NS = 1_700_000_000_123_456_789
-
-
-def maker_of(name):
-    return BagMessages(STORES[name].types.__getitem__, name == "ros1")
+from tests.support.ros import NOW_NS, STORES, StandInNode, maker_of
 
 
 def wired(name, message):
@@ -211,13 +199,10 @@ def a_range(maker, range_m):
 
 @pytest.mark.parametrize(("range_m", "stated"), [(12.0, 12.0), (0.1, None), (60.0, None), (math.inf, None),
                                                (math.nan, None), (-math.inf, None)])  # fmt: skip
-def test_ranges_beyond_reach_are_unknown(maker, range_m, stated):
-    assert range_from_message(a_range(maker, range_m)) == stated
-
-
-def test_a_range_of_any_sensor_says_nothing(maker):
+def test_ranges_beyond_reach_and_of_any_sensor_are_unknown(maker, range_m, stated):
     """MAVROS' rangefinder states 0 to 1000 m of every sensor, and one of 50 m reports 50 m from 150."""
-    message = a_range(maker, 50.0)
+    message = a_range(maker, range_m)
+    assert range_from_message(message) == stated
     message.min_range, message.max_range = 0.0, 1000.0
     assert range_from_message(message) is None
 
@@ -278,7 +263,6 @@ def test_a_time_that_goes_back_begins_again(maker):
     assert heard.vehicle(NOW_NS).height_agl_m is None
 
 
-@pytest.mark.parametrize(("variances", "sigma_mps"), [(None, None), ((0.04, 0.09, 0.01), 0.3)])
 @pytest.mark.parametrize(
     ("make", "frame"),
     [
@@ -287,20 +271,17 @@ def test_a_time_that_goes_back_begins_again(maker):
     ],
     ids=lambda value: None if callable(value) else str(value),
 )
-def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, make, frame, variances, sigma_mps):
+def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, make, frame):
     """Wherever the odometry has its own north, and along whichever of the two frames its twist is."""
     rng = np.random.default_rng(5)
     for angles in random_angles(10):
         enu_mps, heard = rng.normal(0.0, 8.0, 3), RosTelemetry()
-        message = make(maker, NOW_NS, angles, enu_mps, variances=variances, **frame)
+        message = make(maker, NOW_NS, angles, enu_mps, **frame)
         heard.add("odometry", wired(ros, message), 0)
         assert heard.vehicle(NOW_NS).east_velocity_mps is None  # towards nobody knows where
         heard.add("imu", maker.imu(NOW_NS, "", *angles), 0)
         now = heard.vehicle(NOW_NS)
         assert (now.east_velocity_mps, now.north_velocity_mps) == pytest.approx(enu_mps[:2], abs=1e-9)
-        turned_mps = math.radians(1.0) * np.linalg.norm(enu_mps)  # the heading is off by a degree
-        stated = None if sigma_mps is None else pytest.approx(math.hypot(sigma_mps, turned_mps))
-        assert now.velocity_sigma_mps == stated
 
 
 @pytest.mark.parametrize(
@@ -461,45 +442,12 @@ def test_the_window_is_shown_with_the_fix_in_it(sim_site):
     assert np.abs(red - np.array([y, x]) * share).max() < 1.5
 
 
-def test_diagnostics_are_pairs_of_text(ros, maker):
-    message = wired(ros, diagnostics(maker, NOW_NS, 1, "no fix: ambiguous", {"reason": "ambiguous"}))
-    (status,) = message.status
-    assert (status.level, status.name, status.message) == (1, "scenematch: position", "no fix: ambiguous")
-    assert [(pair.key, pair.value) for pair in status.values] == [("reason", "ambiguous")]
-
-
 # ----------------------------------------------------------------------------------------------- the bridge
-
-
-class StandIn:
-    """A node that keeps what is published."""
-
-    def __init__(self, maker):
-        self.messages, self.wanted, self.published, self.changed = maker, True, [], threading.Condition()
-        self.time_ns = NOW_NS
-
-    def now_ns(self):
-        return self.time_ns
-
-    def publish(self, output, message):
-        with self.changed:
-            self.published.append((output, message))
-            self.changed.notify_all()
-
-    def has_subscribers(self, output):
-        return self.wanted
-
-    def of(self, output):
-        return [message for kind, message in list(self.published) if kind == output]
-
-    def wait_for(self, output, count):
-        with self.changed:
-            assert self.changed.wait_for(lambda: len(self.of(output)) >= count, 60.0), self.published
 
 
 @pytest.fixture
 def node(maker):
-    return StandIn(maker)
+    return StandInNode(maker)
 
 
 class Answers:
@@ -559,8 +507,10 @@ def test_a_refusal_is_told_and_never_a_pose(maker, node, sim_site):
     assert not node.of("fix")
     stated = [message.status[0] for message in node.of("diagnostics")]
     assert [status.level for status in stated] == [1] * len(stated)
+    first = next(iter(Reason)).value
+    assert (stated[0].name, stated[0].message) == ("scenematch: position", f"no fix: {first}")
     assert status.refused == {**{reason.value: 1 for reason in Reason}, "not finite": 2}
-    assert {pair.key: pair.value for pair in stated[0].values}["reason"] == next(iter(Reason)).value
+    assert {pair.key: pair.value for pair in stated[0].values}["reason"] == first
 
 
 def test_nobody_looks_at_the_window(maker, node, sim_site):
@@ -836,15 +786,8 @@ def test_what_ros2_does_not_take_is_one_line(rclpy_with):
         ros2.Node("scenematch", ["wrong"])
 
 
-@pytest.mark.parametrize(
-    ("given", "becomes"),
-    [
-        ({}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}),
-        ({"ROS_LOCALHOST_ONLY": "0"}, {"ROS_LOCALHOST_ONLY": "0"}),
-    ],
-)
-def test_discovery_stays_here_unless_it_is_set(rclpy_with, monkeypatch, given, becomes):
+@pytest.mark.parametrize("given", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, {"ROS_LOCALHOST_ONLY": "0"}])
+def test_discovery_stays_here_unless_it_is_set(rclpy_with, monkeypatch, given):
     rclpy_with()
     from scenematch.bridges import ros2
 
@@ -852,7 +795,8 @@ def test_discovery_stays_here_unless_it_is_set(rclpy_with, monkeypatch, given, b
         monkeypatch.setenv(name, value)
     ros2.Node("scenematch")
     names = ("ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE")
-    assert {name: ros2.os.environ[name] for name in names if name in ros2.os.environ} == becomes
+    stated = {name: ros2.os.environ[name] for name in names if name in ros2.os.environ}
+    assert stated == (given or {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
 
 
 @pytest.mark.parametrize("ends", [ShutdownError, KeyboardInterrupt])

@@ -1,7 +1,5 @@
 """The diagnosis: which single change makes telemetry, camera and clock fit what the pictures show."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -54,15 +54,6 @@ def test_a_vehicle_needs_no_extra_of_a_desk(flight, tmp_path):
     assert (out / "report.html").is_file()
 
 
-def test_a_flight_is_tracked_without_an_extra_of_a_desk(flight, tmp_path, monkeypatch):
-    for name in OF_DESKS:
-        monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.setattr("engine.matching.matcher.SceneMatcher.warmup", lambda *_: None)
-    out = tmp_path / "out"
-    assert run(["track", *file_options(flight), f"--out={out}", "--method=ncc"]) == 0
-    assert (out / "report.html").is_file()
-
-
 def test_what_draws_names_its_extra_before_it_begins(flight, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     out = tmp_path / "out"

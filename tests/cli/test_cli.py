@@ -207,21 +207,16 @@ def test_locate_finds_a_picture_without_a_prior(flight, capsys):
     assert printed.err == f"next: scenematch map info {flight / 'map.tif'}\n"
 
 
-def test_a_map_that_lies_badly_makes_a_fix_doubtful(flight, capsys):
+def test_a_map_that_lies_badly_makes_a_fix_doubtful_and_a_start_off_it_is_refused(flight, capsys):
     """The built-in map says that it is exact; input.map_sigma_m counts more, and adds up with the rest."""
     image, truth = flight / "frames" / "000000.jpg", cells(flight / "truth.csv")[0]
-    place = [f"--start={truth['lat_deg']},{truth['lon_deg']}", f"--camera={flight / 'camera.yaml'}"]
-    base = ["locate", str(image), f"--map={flight / 'map.tif'}", *place, "--json"]
-    variances = []
+    base = ["locate", str(image), f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
+    place, variances = f"--start={truth['lat_deg']},{truth['lon_deg']}", []
+    assert "--start" in refusal(capsys, [*base, "--start=10,10"])
     for option in ([], ["--settings=input.map_sigma_m=3"]):
-        assert run([*base, *option]) == 0
+        assert run([*base, place, "--json", *option]) == 0
         variances.append(np.diag(json.loads(capsys.readouterr().out)["covariance_m2"]))
     np.testing.assert_allclose(variances[1] - variances[0], 9.0, rtol=1e-4)
-
-
-def test_a_start_off_the_map_is_refused(flight, capsys):
-    files = [f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
-    assert "--start" in refusal(capsys, ["locate", flight / "frames/000000.jpg", *files, "--start=10,10"], 2)
 
 
 def test_map_info(flight, capsys):
@@ -278,6 +273,8 @@ def test_version(capsys):
         (["track", "--bogus"], ["--bogus", "scenematch track --help"]),
         (["map"], ["scenematch map --help"]),
         (["demo", "--seed=-1"], ["--seed"]),
+        (["simulate", "--out=o", "--frames=0"], ["--frames"]),
+        (["simulate", "--out=o", "--surface=dsm.tif"], ["--surface: expected with --map only"]),
     ],
 )
 def test_wrong_usage_is_told_with_the_help_that_there_is(arguments, words, capsys):

@@ -8,10 +8,10 @@ from tests.support.commands import refusal
 BRIDGE = ["bridge", "mavlink", "--map=m.tif", "--camera=c.yaml", "--connect=udpout:127.0.0.1:14999"]
 PLAYED, LIVE = [*BRIDGE, "--frames=f"], [*BRIDGE, "--camera-source=0"]
 ROS = ["bridge", "ros", "--map=m.tif"]
-GRAB = "input.exposure_to_grab_ms"
 IN_REAL_TIME = [[*command, "--settings=bridge.realtime=true"] for command in (PLAYED, ROS)]
 NO_ORIGIN = ["--settings=mavlink.set_origin=false", "--settings=mavlink.origin_alt_m=3"]
 SIMULATE = ["simulate", "--out=o"]
+LOOP = [*SIMULATE, "--closed-loop"]
 TRACK = ["track", "--map=m.tif", "--camera=c.yaml", "--frames=f", "--out=o"]
 CHECK = ["check", "--map=m.tif", "--camera=c.yaml", "--frames=f"]
 LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
@@ -39,6 +39,18 @@ LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
         ([*TRACK, "--profile=paper"], "--method", "auto"),
         *((SIMULATE, "--relief-m", value) for value in ("nan", "-5", "81")),
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
+        ([*SIMULATE, "--map=m.tif"], "--relief-m", "5"),
+        (SIMULATE, "--condition", "eclipse"),
+        *(
+            (LOOP, f"--{name}", value)
+            for name, value in (
+                ("fault", "lost"),
+                ("method", "orb"),
+                ("minutes", "0"),
+                ("frames", "3"),
+                ("camera-pitch-deg", "-45"),
+            )
+        ),
         *((command, "--device", "gpu") for command in (PLAYED, ROS, TRACK, LOCATE)),
         (PLAYED, "--firmware", "x"),
         *((PLAYED, "--connect", value) for value in ("nonsense", "udpin:0.0.0.0:14550")),
@@ -69,8 +81,8 @@ def test_a_value_out_of_range_is_refused_by_its_option(command, option, value, t
         ([*PLAYED, "--settings=bridge.nice=-5"], "--settings bridge.nice", "--settings bridge.realtime"),
         ([*ROS, "--settings=bridge.cores=0"], "--settings bridge.cores", "--settings bridge.realtime"),
         ([*PLAYED, *NO_ORIGIN], "--settings mavlink.origin_alt_m", "--settings mavlink.set_origin"),
-        ([*SIMULATE, "--minutes=1"], "--minutes", "--closed-loop"),
-        ([*SIMULATE, "--rerun=a.rrd"], "--rerun", "--closed-loop"),
+        *(([*SIMULATE, f"--{name}={value}"], f"--{name}", "--closed-loop") for name, value in
+          (("minutes", 1), ("rerun", "a.rrd"), ("fault", "killed"), ("method", "ncc"))),
     ],
 )  # fmt: skip
 def test_an_option_that_would_say_nothing_is_refused(command, option, wanted, capsys):

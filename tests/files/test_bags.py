@@ -1,7 +1,5 @@
 """Bags of ROS 1 and ROS 2: the same pictures and numbers in every format, in and out; damage in one line."""
 
-from __future__ import annotations
-
 import io
 from functools import cache, partial
 
@@ -13,11 +11,9 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.serde import utils as serde_utils
-from rosbags.typesys import Stores, get_typestore
 
-from bench.inputs.bags import BAG_KINDS, BagMessages, write_bag
-from engine.camera import Camera
-from engine.errors import TelemetryError
+from bench.inputs.bags import BAG_KINDS, write_bag
+from engine import Camera, TelemetryError
 from engine.values import Frame, Prior, Truth
 from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import open_truth
@@ -25,6 +21,7 @@ from scenematch.files.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, rea
 from scenematch.runs.inputs import FlightFiles
 from tests.support.odometries import odometry_message, twist_message
 from tests.support.refusals import refusal
+from tests.support.ros import STORES, maker_of
 
 STEP_NS = 100_000_000
 compiled = cache(partial(compile, filename="<message>", mode="exec"))
@@ -103,14 +100,7 @@ def test_a_flight_comes_back(bag):
     assert len(flight) == len(frames)
     for k, (item, frame) in enumerate(zip(flight, frames, strict=True)):
         assert item.frame.timestamp_ns == frame.timestamp_ns
-        for name in (
-            "height_agl_m",
-            "roll_deg",
-            "pitch_deg",
-            "heading_deg",
-            "east_velocity_mps",
-            "north_velocity_mps",
-        ):
+        for name in COMPARED:
             assert getattr(item.frame, name) == pytest.approx(getattr(frame, name), abs=1e-9)
         assert (item.prior is not None) == (k <= 1)  # a position holds for a tenth of a second
     prior = next(iter(flight)).prior
@@ -138,13 +128,10 @@ def test_others_read_what_is_written(bag):
     assert compass == [frame.heading_deg for frame in frames]
 
 
-STORES = {True: Stores.ROS1_NOETIC, False: Stores.ROS2_HUMBLE}
-
-
 def written(path, topics, set_up=lambda writer: None):
     """A bag with messages by topic, (time_ns, message): of ROS 1 where its name is one, else a folder of ROS 2."""
     ros1 = path.suffix == ".bag"
-    types = get_typestore(STORES[ros1])
+    types = STORES["ros1" if ros1 else "ros2"]
     serialize = types.serialize_ros1 if ros1 else types.serialize_cdr
     writer = Writer1(path) if ros1 else Writer2(path, version=9)
     set_up(writer)
@@ -157,13 +144,9 @@ def written(path, topics, set_up=lambda writer: None):
     return path
 
 
-def maker_of(ros1):
-    return BagMessages(get_typestore(STORES[ros1]).types.__getitem__, ros1)
-
-
 @pytest.fixture
 def maker():
-    return maker_of(True)
+    return maker_of("ros1")
 
 
 def test_without_a_compass_the_imu_has_the_heading(tmp_path, maker):
@@ -244,10 +227,10 @@ def a_bag_with_odometry(path, maker, *, variances=None, by=BY_ODOMETRY, without=
 
 
 @pytest.mark.parametrize("variances", [(0.16, 0.04, 0.04), None])
-@pytest.mark.parametrize("ros1", [True, False])
+@pytest.mark.parametrize(("ros", "name"), [("ros1", "x.bag"), ("ros2", "x")])
 @pytest.mark.parametrize("by", [BY_ODOMETRY, twist_message], ids=["odometry", "twist"])
-def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, ros1, by, variances):
-    path = a_bag_with_odometry(tmp_path / ("x.bag" if ros1 else "x"), maker_of(ros1), variances=variances, by=by)
+def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, ros, name, by, variances):
+    path = a_bag_with_odometry(tmp_path / name, maker_of(ros), variances=variances, by=by)
     for item in open_flight(path):
         assert (item.frame.east_velocity_mps, item.frame.velocity_sigma_mps) == (50.0, None)
     flight = open_flight(path, odometry_topic="/vio/odometry")
@@ -287,7 +270,7 @@ def test_a_bag_without_telemetry_or_calibration_says_so(tmp_path, maker):
         read_bag_camera(path)
 
 
-def test_what_counts_as_a_bag(tmp_path):
+def test_what_counts_as_a_bag_and_one_that_is_missing_is_named(tmp_path):
     path, _, _ = a_bag(tmp_path, "ros2-mcap")
     assert is_bag(path)
     assert is_bag(next(path.glob("*.mcap")))
@@ -295,9 +278,6 @@ def test_what_counts_as_a_bag(tmp_path):
     assert not is_bag(tmp_path)
     assert not is_bag("flight.mp4")
     assert len(BagFrames(next(path.glob("*.mcap"))).names) == 5
-
-
-def test_a_bag_that_is_missing_is_named(tmp_path):
     with pytest.raises(TelemetryError, match="no such bag"):
         BagFrames(tmp_path / "missing.bag")
 
@@ -335,6 +315,6 @@ def test_topics_of_the_calibration(tmp_path, maker):
 )
 def test_compressed_bags_are_read(tmp_path, name, compression):
     image = np.random.default_rng(1).integers(0, 256, (9, 7, 3), dtype=np.uint8)
-    messages = [(10**9, maker_of(name == "x.bag").image(10**9, "", image))]
+    messages = [(10**9, maker_of("ros1" if name == "x.bag" else "ros2").image(10**9, "", image))]
     path = written(tmp_path / name, {IMAGE: messages}, lambda writer: writer.set_compression(*compression))
     assert np.array_equal(BagFrames(path).read("0"), image)

@@ -1,15 +1,11 @@
 """Telemetry with the columns of other programs: named in the settings, or told as not read."""
 
-import json
-
 import pytest
 
 from engine.errors import OptionError
-from scenematch.files.settings import changed, nested, options_from_mapping
+from scenematch import MapInput, TrackSettings
 from scenematch.files.telemetry import open_telemetry
 from scenematch.runs.inputs import FlightFiles, open_inputs
-from scenematch.runs.map_input import MapInput
-from scenematch.runs.settings import TrackSettings, load_settings
 from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
 
@@ -43,16 +39,6 @@ def test_a_missing_required_column_is_told_with_those_that_are_there(save):
 def test_a_name_that_the_file_lacks_is_refused(save):
     message = refusal(open_telemetry, save(OTHERS), names=NAMES | {"height_agl_m": "alt"})
     assert "line 1: lacks the column alt, which the settings name as height_agl_m" in message
-
-
-def test_the_settings_name_them(tmp_path):
-    path = tmp_path / "settings.toml"
-    lines = "".join(f'{ours} = "{theirs}"\n' for ours, theirs in NAMES.items())
-    path.write_text(f'method = "sift"\n[telemetry_columns]\n{lines}', encoding="utf-8")
-    settings = load_settings(path)
-    assert settings.telemetry_columns == NAMES
-    recorded = json.loads(json.dumps(changed(settings)))  # as the record of a run keeps them
-    assert options_from_mapping(TrackSettings, nested(recorded)) == settings
 
 
 def test_a_run_reads_them_by_its_settings(tmp_path, save):

@@ -1,7 +1,5 @@
 """Corrections of telemetry: units, signs, swapped columns, offsets and a clock, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, replace
@@ -41,9 +39,10 @@ def test_columns_are_made_of_the_row_as_it_was():
     assert corrected(columns=("timestamp_ns=1000000*timestamp_ns",)).timestamp_ns == 10**15
 
 
-def test_offsets_are_added_and_a_heading_wraps():
+def test_offsets_are_added_a_heading_wraps_and_a_height_below_the_ground_becomes_unknown():
     assert corrected(heading_offset_deg=20.0).heading_deg == pytest.approx(10.0)
     assert corrected(height_offset_m=-30.0).height_agl_m == 70.0
+    assert corrected(height_offset_m=-120.0).height_agl_m is None  # of one above the sea, before take-off
 
 
 def test_a_late_telemetry_is_moved_to_its_pictures():
@@ -79,11 +78,6 @@ def test_what_a_correction_makes_impossible_is_refused_by_frame():
         corrected(columns=("timestamp_ns=1e200*timestamp_ns",))
     with pytest.raises(OptionError, match="columns: expected timestamp_ns of itself only"):
         corrected(columns=("timestamp_ns=roll_deg",))
-
-
-def test_a_height_that_is_none_above_the_ground_becomes_unknown():
-    """Of a height above the sea, the rows before take-off."""
-    assert corrected(height_offset_m=-120.0).height_agl_m is None
 
 
 @pytest.mark.parametrize("yaw_rad", [-math.pi / 2, -0.1, 0.5, 3.0, 6.2])

@@ -4,8 +4,7 @@ import re
 
 import pytest
 
-from engine import OptionError
-from engine.options import NavigatorOptions, SiftOptions
+from engine import NavigatorOptions, OptionError, SiftOptions
 from scenematch.files.settings import changed, field_descriptions, options_from_mapping, settings_text
 from scenematch.runs.settings import TrackSettings, load_settings
 from tests.support.refusals import refusal
@@ -39,14 +38,17 @@ def test_every_field_that_a_file_can_hold_is_explained():
 
 def test_values_arrive(path):
     text = 'method = "sift"\n[ncc]\nexclusion_m = 2\n[ncc.errors]\nmap_m = 6.5\n[navigator]\nodometry = true\n'
+    text += '[telemetry_columns]\nheight_agl_m = "altitude_agl [m]"\n'
     found = loaded(path, text)
     assert (found.method, found.ncc.exclusion_m, found.ncc.errors.map_m) == ("sift", 2.0, 6.5)
     assert found.navigator.odometry is True
+    assert found.telemetry_columns == {"height_agl_m": "altitude_agl [m]"}
     assert changed(found) == {
         "method": "sift",
         "ncc.exclusion_m": 2.0,
         "ncc.errors.map_m": 6.5,
         "navigator.odometry": True,
+        "telemetry_columns": {"height_agl_m": "altitude_agl [m]"},
     }
     assert changed(TrackSettings()) == {}
 

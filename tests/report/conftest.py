@@ -2,8 +2,7 @@
 
 import pytest
 
-from scenematch.runs.settings import TrackSettings
-from scenematch.runs.tracking import track
+from scenematch import TrackSettings, track
 from tests.support.browser import missing, open_browser
 from tests.support.dark_flight import dark_flight
 from tests.support.runs import bare_runs

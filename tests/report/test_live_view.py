@@ -3,7 +3,6 @@
 import socket
 import sys
 import threading
-import time
 from collections import defaultdict
 from functools import cache
 from types import SimpleNamespace
@@ -12,29 +11,26 @@ import cv2
 import numpy as np
 import pytest
 
-from engine import Frame, Navigator, NoFix, Prior, Reason, SceneMatcher
-from engine.navigation.live import Answer
-from engine.navigation.navigator import NavigatorState
+from engine import Answer, Frame, Navigator, NavigatorState, NoFix, Prior, Reason, SceneMatcher
+from scenematch import TrackSettings, track
 from scenematch.bridges.ros import RosBridge
 from scenematch.bridges.ros_out import RosOptions
 from scenematch.cli.app import run
-from scenematch.files.ros.messages import MessageFactory
 from scenematch.files.track import read_track
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget
-from scenematch.runs.settings import TrackSettings
-from scenematch.runs.tracking import track
 from tests.support.runs import bare_runs
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 from pyarrow import duration, timestamp
 from rerun.chunk import RrdReader
-from rosbags.typesys import Stores, get_typestore
 
 from scenematch.report import live_view
 from scenematch.report.live_view import FIX_RGB, SIGMAS, ellipsoid
 from tests.support import browser
 from tests.support.commands import refusal
 from tests.support.dark_flight import DARK, FRAMES, dark_flight
+from tests.support.ros import StandInNode, maker_of
+from tests.support.waiting import wait_until
 
 
 def rows_of(recording):
@@ -214,7 +210,7 @@ def test_a_bridge_never_waits_for_the_view_and_the_newest_is_shown(matcher, capl
     assert watcher.follow(navigator) is navigator
     answer = Answer(Frame(np.zeros((300, 300), np.uint8), 1), None, 1.0)
     watcher(answer)
-    wait_for(lambda: view.shown)
+    wait_until(lambda: view.shown)
     for _ in range(5):  # nobody takes them
         watcher(answer)
     view.go.set()
@@ -222,13 +218,6 @@ def test_a_bridge_never_waits_for_the_view_and_the_newest_is_shown(matcher, capl
     assert view.shown == [(0, NavigatorState.SEARCHING), (5, NavigatorState.SEARCHING)]
     assert view.closed
     assert "the live view failed at frame 0" in caplog.text
-
-
-def wait_for(happened):
-    end = time.monotonic() + 60.0
-    while not happened() and time.monotonic() < end:
-        time.sleep(0.01)
-    assert happened()
 
 
 @pytest.mark.parametrize("bridge", ["mavlink", "ros"])
@@ -245,11 +234,7 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
             Connection("udpin", "127.0.0.1", 0), quiet, MavlinkOptions(), watch=stated.append
         )
     else:
-        messages = MessageFactory(get_typestore(Stores.ROS2_HUMBLE).types.__getitem__, False)
-        node = SimpleNamespace(
-            messages=messages, now_ns=lambda: 1, has_subscribers=lambda output: False, publish=lambda *_: None
-        )
-        made = RosBridge(node, sim_site, quiet, RosOptions(), watch=stated.append)
+        made = RosBridge(StandInNode(maker_of("ros2")), sim_site, quiet, RosOptions(), watch=stated.append)
     made.deliver(answer)
     made.close()
     assert stated == [answer]

@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 
 from engine.geo import LocalFrame
+from scenematch import ClosedLoopSettings, FlightFiles, TrackSettings, fly_closed_loop, track
 from scenematch.files.track import read_track
 from scenematch.files.truth import read_truth
 from scenematch.report.metrics import summarise
 from scenematch.report.verdict import metres
-from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
 from scenematch.runs.evaluation import report
-from scenematch.runs.inputs import FlightFiles
-from scenematch.runs.settings import TrackSettings
-from scenematch.runs.tracking import track
 from tests.support.contrast import SCRIPT
 from tests.support.dark_flight import DARK, FRAMES, data_of
 from tests.support.runs import bare_runs

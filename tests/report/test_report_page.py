@@ -11,6 +11,7 @@ import pytest
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
 from engine.options import MatcherOptions, NccOptions, SiftOptions
 from engine.values import Reason, Window
+from scenematch import TrackSettings, evaluate
 from scenematch.cli.app import run
 from scenematch.files.notes import FrameNote, frame_note, read_notes, write_notes
 from scenematch.files.settings import changed, nested, options_from_mapping
@@ -21,8 +22,6 @@ from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.metrics import Ground, TrackErrors, summarise
 from scenematch.report.page import write_page
 from scenematch.report.verdict import MEANINGS, verdict_of
-from scenematch.runs.evaluation import evaluate
-from scenematch.runs.settings import TrackSettings
 from tests.support.commands import refusal
 from tests.support.dark_flight import DARK, FRAMES, data_of
 
@@ -161,7 +160,8 @@ def test_notes_come_back_as_they_were(tmp_path):
 
 def test_settings_are_read_back_from_the_record():
     options = {"ncc": NccOptions(refine=False), "sift": SiftOptions(max_height_m=90.0)}
-    settings = TrackSettings(method="sift", budget_ms=40.0, risk=1e-3, **options)
+    columns = {"timestamp_us": "time_us", "height_agl_m": "altitude_agl [m]"}
+    settings = TrackSettings(method="sift", budget_ms=40.0, risk=1e-3, telemetry_columns=columns, **options)
     record = json.loads(json.dumps(changed(settings)))
     assert options_from_mapping(TrackSettings, nested(record)) == settings
 

@@ -10,15 +10,12 @@ from PIL import Image
 
 from engine.camera import Camera, mount_rotation
 from engine.errors import CalibrationError, MapError, OptionError, TelemetryError
-from scenematch import BridgeFiles, FlightFiles
+from scenematch import BridgeFiles, CameraInput, Corrections, FlightFiles, MapInput
 from scenematch.cli.app import run
-from scenematch.files.corrections import Corrections
 from scenematch.files.flight import camera_info
 from scenematch.files.geotiff import write_geotiff
-from scenematch.runs.cameras import CameraInput
 from scenematch.runs.evaluation import recorded_files
 from scenematch.runs.inputs import check_pictures
-from scenematch.runs.map_input import MapInput
 from scenematch.runs.record import RunRecord
 from tests.support.commands import refusal
 from tests.support.photos import gimbal, photograph

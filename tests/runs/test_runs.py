@@ -2,18 +2,18 @@
 
 import subprocess
 import sys
-import tempfile
 from functools import partial
-from pathlib import Path
 
 import pytest
 
 import scenematch
-from engine import OptionError, TelemetryError
-from engine.errors import BackendError, MissingExtraError
+from bench.inputs.log_files import ulog_flight
+from engine import BackendError, MissingExtraError, OptionError, TelemetryError
 from scenematch import FlightFiles, Progress, TrackSettings, track
+from scenematch.bridges.links import parse_connection
 from scenematch.check import Diagnosis, Finding
 from scenematch.check.findings import Contradiction
+from scenematch.files.logs.ulog import read_ulog
 from scenematch.files.ros.bags import import_rosbags
 from scenematch.files.track import read_track
 from scenematch.files.truth import read_truth
@@ -146,42 +146,28 @@ def test_the_library_imports_nothing_optional_and_no_command_line():
 # ------------------------------------------------------------------------------------- extras that are missing
 
 
-def serial_link():
-    from scenematch.bridges.links import parse_connection
-
-    parse_connection("serial:/dev/null:57600").open()
-
-
-def bridge():
+def bridge(_):
     from scenematch import BridgeFiles, BridgeSettings, CameraInput, MapInput, MavlinkSettings, run_mavlink_bridge
 
     files = BridgeFiles(map=MapInput("m.tif"), camera=CameraInput("c.yaml"), frames="f")
     run_mavlink_bridge(files, MavlinkSettings(connect="udpout:127.0.0.1:1"), BridgeSettings())
 
 
-def ulog():
-    from scenematch.files.logs.ulog import read_ulog
-
-    with tempfile.NamedTemporaryFile(suffix=".ulg") as file:
-        Path(file.name).write_bytes(b"ULog\x01\x12\x35\x01" + bytes(64))
-        read_ulog(Path(file.name))
-
-
 @pytest.mark.parametrize(
     ("module", "package", "extra", "use"),
     [
         ("pymavlink", "pymavlink", "mavlink", bridge),
-        ("pymavlink", "pymavlink", "mavlink", lambda: scenematch.write_parameter_file("px4", "", "out.params")),
-        ("serial", "pyserial", "mavlink", serial_link),
-        ("rosbags", "rosbags", "bags", import_rosbags),
-        ("rosbags.highlevel", "rosbags", "bags", import_rosbags),
-        ("pyulog", "pyulog", "logs", ulog),
+        ("pymavlink", "pymavlink", "mavlink", lambda _: scenematch.write_parameter_file("px4", "", "out.params")),
+        ("serial", "pyserial", "mavlink", lambda _: parse_connection("serial:/dev/null:57600").open()),
+        ("rosbags", "rosbags", "bags", lambda _: import_rosbags()),
+        ("rosbags.highlevel", "rosbags", "bags", lambda _: import_rosbags()),
+        ("pyulog", "pyulog", "logs", lambda path: read_ulog(ulog_flight(path / "a.ulg"))),
     ],
 )
-def test_a_missing_extra_is_always_the_same_error(module, package, extra, use, monkeypatch):
+def test_a_missing_extra_is_always_the_same_error(module, package, extra, use, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingExtraError) as caught:
-        use()
+        use(tmp_path)
     assert isinstance(caught.value, BackendError)
     assert str(caught.value) == (
         f"expected {package} to be installed, got none: pip install 'scenematch-engine[{extra}]'"

@@ -15,15 +15,12 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
-from engine import SceneMatcher
-from engine.errors import OptionError
+from engine import OptionError, SceneMatcher
 from engine.navigation.live import Counts
 from engine.runtime.realtime import _FIFO_CURE, _MEMORY_CURE
 from scenematch.bridges.camera_stream import _IDLE_S, _REOPEN_S, _TIMEOUTS
 from scenematch.bridges.ros import RosStatus, RosTopics
-from scenematch.files.ros.messages import MessageFactory
 from scenematch.runs import mavlink_bridge, service
 from scenematch.runs.bridge_files import BridgeFiles
 from scenematch.runs.inputs import FlightFiles
@@ -33,6 +30,7 @@ from scenematch.runs.output import Progress
 from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
 from scenematch.runs.service import _BEATS, running_service, status_reporter
 from tests.support.paths import ROOT
+from tests.support.ros import StandInNode, maker_of
 
 UNIT = ROOT / "deploy" / "scenematch-bridge.service"
 
@@ -183,22 +181,16 @@ def test_a_ros_bridge_reports_as_the_other_does(manager, flight, progress, monke
     monkeypatch.setenv("WATCHDOG_USEC", "1000")
     monkeypatch.setattr(SceneMatcher, "warmup", lambda *_, **__: None)
     monkeypatch.setattr(service, "_STATUS_PERIOD_S", 0.0)
-    types = get_typestore(Stores.ROS1_NOETIC).types
-    maker, published = MessageFactory(types.__getitem__, True), []
-    flown, black = FlightFiles.in_folder(flight), np.zeros((300, 300), np.uint8)
+    maker = maker_of("ros1")
+    node, flown, black = StandInNode(maker), FlightFiles.in_folder(flight), np.zeros((300, 300), np.uint8)
 
     def spin(handlers, every_second, seconds):
         handlers["/down"][1](maker.image(10**9, "", black))
         handlers["/down"][1](maker.image(9 * 10**8, "", black))  # out of order
-        until_s = time.monotonic() + 60.0
-        while not published and time.monotonic() < until_s:
-            time.sleep(0.01)
+        node.wait_for("diagnostics", 1)
         every_second()
 
-    node = SimpleNamespace(
-        messages=maker, now_ns=lambda: 10**9, spin=spin, has_subscribers=lambda output: False,
-        publish=lambda output, message: published.append(output),
-    )  # fmt: skip
+    node.spin, node.time_ns = spin, 10**9
     ros = RosSettings(map=flown.map, camera=flown.camera, topics=RosTopics(image="/down"))
     run_ros_bridge(ros, BridgeSettings(method="ncc"), node=node, progress=progress)
     line = "1 pictures; published 0; not published: no_height 1, unusable 1"

@@ -1,7 +1,5 @@
 """The command `simulate`: folders that are read back as flights, a loop that is closed, and what is refused."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil
@@ -10,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.camera import Camera
-from engine.orthomap import OrthoMap
+from engine import Camera, OrthoMap
 from scenematch.cli.app import run
 from scenematch.files.flight import open_flight
 from scenematch.files.track import read_track
@@ -143,25 +140,3 @@ def test_an_older_run_is_kept_without_force_and_leaves_nothing_with_it(folder, l
     assert run(["simulate", "--out", str(loop), "--frames", "1", *own_map(folder), "--force"]) == 0
     assert {path.name for path in loop.iterdir()} == FOLDER | {"mine.txt"}
     assert len(list((loop / "frames").iterdir())) == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["--fault", "killed"], "--fault"),
-        (["--method", "ncc"], "--method"),
-        (["--closed-loop", "--frames", "3"], "--frames"),
-        (["--closed-loop", "--fault", "lost"], "--fault"),
-        (["--closed-loop", "--method", "orb"], "--method"),
-        (["--closed-loop", "--minutes", "0"], "--minutes"),
-        (["--condition", "eclipse"], "--condition"),
-        (["--surface", "dsm.tif"], "--surface"),
-        (["--map", "map.tif", "--relief-m", "5"], "--relief-m"),
-        (["--frames", "0"], "--frames"),
-        (["--closed-loop", "--camera-pitch-deg", "-45"], "--camera-pitch-deg"),
-    ],
-)
-def test_wrong_usage_is_one_line_and_leaves_no_folder(arguments, named, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert named in refusal(capsys, ["simulate", "--out", out, *arguments])
-    assert not out.exists()

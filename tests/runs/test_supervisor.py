@@ -1,7 +1,5 @@
 """The supervisor replaces a worker that is killed; the last fix is found by who takes over, and by no other."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -17,6 +15,7 @@ from scenematch.runs import last_fix
 from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.supervisor import check_supervision
 from tests.support.paths import ROOT
+from tests.support.waiting import wait_until
 
 SCRIPT = """
 import os, sys, time
@@ -97,10 +96,7 @@ def test_a_worker_does_not_outlive_its_supervisor(supervisor):
     pid = int(supervisor.stdout.readline().split()[0])
     assert is_running(pid)
     supervisor.kill()
-    until = time.monotonic() + 60.0
-    while is_running(pid) and time.monotonic() < until:
-        time.sleep(0.02)
-    assert not is_running(pid)
+    wait_until(lambda: not is_running(pid))
 
 
 def test_a_gpu_cannot_be_supervised():

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from engine.errors import BackendError, OptionError
-from engine.navigation.live import Live, LiveOptions
+from engine import BackendError, Live, LiveOptions, OptionError
 from engine.runtime import realtime as module
 from engine.runtime.realtime import LoadWatch, Realtime, check_realtime, limited_share, set_realtime, start_thread
 from scenematch.runs.mavlink_bridge import BridgeSettings

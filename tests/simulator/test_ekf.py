@@ -9,9 +9,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from engine.errors import StateError
+from engine import Attitude, StateError
 from engine.geo import enu_from_body
-from engine.values import Attitude
 from scenematch.simulator import ekf
 from scenematch.simulator.ekf import STATES, FilterState, History, fuse_fix, fuse_heading, fuse_height
 from scenematch.simulator.quadrotor import STEP_S, Airframe, IdealImu, Wind, WindField, advance, hovering, shaken

@@ -7,10 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from engine.errors import OptionError
-from engine.navigation.navigator import NavigatorState
-from engine.orthomap import OrthoMap
-from engine.values import Frame, NoFix, Prior, Reason, Window
+from engine import Frame, NavigatorState, NoFix, OptionError, OrthoMap, Prior, Reason, Window
 from scenematch.simulator.faults import Fault, ShiftedMap
 from scenematch.simulator.loop import LoopOptions, Mode, fly_closed_loop
 from scenematch.simulator.pilot import plan_rounds

@@ -1,7 +1,5 @@
 """The quadrotor: physics against closed forms, the pilot along a route, and the statistics of the sensors."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -21,7 +19,7 @@ from scenematch.simulator.quadrotor import (
     shaken,
 )
 from scenematch.simulator.rotations import rotation, rotation_vector
-from scenematch.simulator.sensors import Barometer, Compass, Imu, Instruments, SensorSuite, steps_between
+from scenematch.simulator.sensors import Barometer, Compass, Imu, Instruments, SensorSuite
 from scenematch.simulator.vehicle import GRAVITY_MPS2, FlightStyle
 
 FRAME = Airframe()
@@ -244,8 +242,3 @@ def test_one_seed_gives_one_flight_and_each_sensor_its_own_stream():
     a, b, c = (s.imu(NOTHING).force_mps2 for s in (first, second, other))
     np.testing.assert_array_equal(a, b)
     assert not np.array_equal(a, c)
-
-
-def test_rates_are_those_of_the_steps():
-    assert steps_between(5.0) == 20
-    assert steps_between(100.0) == 1

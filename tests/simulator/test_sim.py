@@ -1,7 +1,5 @@
 """The simulated flight: geometry against engine.geo and engine.camera, the town, the vehicle, the sensors."""
 
-from __future__ import annotations
-
 import itertools
 
 import cv2

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from engine.camera import Camera
-from engine.values import Attitude
+from engine import Attitude, Camera
 from scenematch.runs.simulation import WorldSettings
 from scenematch.simulator import ExposureMotion, FlightStyle, Optics, Town, World, plan_flight, render_frame
 from scenematch.simulator.flight import DRONE_SENSOR, paper_camera

@@ -1,7 +1,5 @@
 """The simulated world: conditions against their definitions, relief and water against geometry, maps as worlds."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 
@@ -9,10 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from engine import OrthoMap
-from engine.errors import OptionError
+from engine import Attitude, OptionError, OrthoMap
 from engine.geo import enu_from_body
-from engine.values import Attitude
 from scenematch.files.geotiff import write_geotiff
 from scenematch.simulator import FlightStyle, SensorNoise, World, build_town, plan_flight, world_from_map
 from scenematch.simulator.canvas import ASPHALT, CANOPY, GRASS
