@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
+from engine import Camera, Fix, MatcherOptions, NoFix, Prior, SceneMatcher
 from engine.geo import enu_from_body
 from engine.kernels.dense import EnhancedFrame, GaussianPrior, Pose, Samples, correlation_at, covariance_of, refine
 from engine.maps.prepared import PreparedMap
@@ -23,6 +23,12 @@ from tests.support.towns import site_of
 NADIR = np.array([315.0, 296.0])
 HEIGHT_M = 150.0
 SIZE_PX = 300
+
+
+@pytest.fixture(scope="module")
+def camera():
+    """Whose pixels are not square, and whose axis is not in the middle."""
+    return Camera(SIZE_PX, SIZE_PX, np.array([[259.8, 0.0, 149.5], [0.0, 264.0, 152.0], [0.0, 0.0, 1.0]]))
 
 
 def waves(u, v):
@@ -132,6 +138,15 @@ def test_what_neighbours_share_widens_the_covariance(scene, camera):
         assert off @ np.linalg.solve(covariance[:2, :2], off) < 13.8  # once in a thousand
         sigmas[name] = np.sqrt(np.diag(covariance)[:2])
     assert (sigmas["patches"] > 1.5 * sigmas["grain"]).all()
+
+
+def test_samples_share_a_cell_within_an_eighth_of_the_picture(scene, camera):
+    fit = fitted(camera, scene, believed(scene[0]))
+    seen = fit.weights > 0
+    places, cells = (camera.matrix @ (fit.points / fit.points[2]))[:2, seen], fit.cells[seen]
+    assert len(np.unique(cells)) > 40
+    for cell in np.unique(cells):
+        assert np.ptp(places[:, cells == cell], axis=1).max() <= SIZE_PX / 8
 
 
 def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground):
