@@ -6,11 +6,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from scipy.stats import chi2, norm
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.kernels.pose_fit import biweight_factors
 from engine.matching.pose import AttitudePrior, PoseStart, PoseStats, solve_pose
 from engine.options import PoseOptions
 from tests.support.poses import CAMERA, GROUNDS, SIZE_PX, WRONG, Scene, any_scene, attitude, measured, scene
@@ -99,8 +97,9 @@ def test_unusable_matches_are_ignored():
     s.points_px[5, 0] = np.inf
     weights = np.ones(40)
     weights[8] = 0
+    s.points_m[11] = 2.0 * s.center_m - s.points_m[11]  # behind the camera, on the same line of sight
     pose = solved(s, weights=weights)
-    assert np.flatnonzero(~pose.inliers).tolist() == [3, 5, 8]
+    assert np.flatnonzero(~pose.inliers).tolist() == [3, 5, 8, 11]
     np.testing.assert_allclose(pose.center_m, s.center_m, atol=1e-5)
 
 
@@ -147,15 +146,6 @@ def test_errors_lie_within_three_sigma_whatever_the_ground(ground, with_prior, c
         assert 2.4 < np.mean(nees_turn) < 3.6
 
 
-@pytest.mark.parametrize("u", [1.0, 4.5, 8.0, 60.0])
-def test_biweight_factors_are_their_integrals(u):
-    def mean(f):
-        return quad(lambda q: f(q, (1 - q / u) ** 2) * math.exp(-q), 0, u)[0]
-
-    weight, pull, noise = mean(lambda q, w: w), mean(lambda q, w: w * q), mean(lambda q, w: w * w * q)
-    np.testing.assert_allclose(biweight_factors(u), (pull / weight, noise / pull), rtol=1e-6)
-
-
 def test_where_the_search_began_does_not_show():
     """The attitude of the telemetry and three random matches lead to one pose."""
     rng = np.random.default_rng(22)
@@ -197,14 +187,6 @@ def test_a_prior_on_attitude_separates_tilt_from_displacement():
         for squared, pose in ((plain, solved(s)), (helped, solved(s, prior=prior))):
             squared.append(np.sum((pose.center_m - s.center_m)[:2] ** 2))
     assert np.mean(helped) < 0.5 * np.mean(plain)
-
-
-def test_the_precision_of_a_prior_is_its_covariance_inverted():
-    mount = cv2.Rodrigues(np.deg2rad([3.0, 30.0, -20.0]))[0]
-    prior = AttitudePrior(np.eye(3), (0.3, 0.6, 2.0), axes=mount)
-    about_body = np.diag(np.deg2rad([0.3, 0.6, 2.0]) ** 2)
-    np.testing.assert_allclose(np.linalg.inv(prior.precision), mount.T @ about_body @ mount, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(AttitudePrior(np.eye(3), 0.3).precision, np.eye(3) / np.deg2rad(0.3) ** 2)
 
 
 # Refused.
