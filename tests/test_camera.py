@@ -117,15 +117,6 @@ def test_a_scaled_camera_sees_the_same_through_the_same_place_of_its_frame(size)
     assert np.allclose(lens.scaled_to(*size).scaled_to(640, 480).matrix, lens.matrix)
 
 
-@pytest.mark.parametrize("model", ["plumb_bob", "fisheye"])
-def test_undistortion_of_a_smaller_picture_is_the_smaller_undistorted_picture(model):
-    lens = camera(model, LENSES[model])
-    image = cv2.GaussianBlur(texture((480, 640)), (0, 0), 4.0)
-    smaller = lens.scaled_to(320, 240).undistort(cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA))
-    wanted = cv2.resize(lens.undistort(image), (320, 240), interpolation=cv2.INTER_AREA)
-    assert np.abs(smaller[40:-40, 40:-40].astype(int) - wanted[40:-40, 40:-40]).mean() < 1.0
-
-
 @pytest.mark.parametrize("size", [(640, 360), (320, 320), (480, 640)])
 def test_a_frame_of_another_shape_is_not_scaled_to(size):
     with pytest.raises(CalibrationError, match="calibrated for 640 x 480, expected that aspect ratio"):

@@ -224,6 +224,27 @@ def test_the_sigma_of_a_fix_is_the_longer_axis_of_its_ellipse():
     assert fix.window.area_px == 20
 
 
+@pytest.mark.parametrize("risk", [1e-1, 1e-2, 1e-4])
+def test_the_protection_level_holds_all_but_the_risk(risk):
+    """Of 200,000 positions drawn by a fix's own statement; a circle of the larger axis is at least as wide."""
+    fix = a_fix(covariance_m2=np.diag([1.0, 0.25, 4.0]), confidence=1.0 - risk / 10)
+    level_m = fix.protection_level_m(risk)
+    assert math.isfinite(level_m)
+    off_m = np.random.default_rng(0).multivariate_normal(np.zeros(2), fix.covariance_m2[:2, :2], 200_000)
+    assert (np.hypot(*off_m.T) > level_m).mean() + risk / 10 <= risk
+
+
+@pytest.mark.parametrize("confidence", [None, 0.99])
+def test_no_circle_protects_where_the_place_may_be_a_wrong_one(confidence):
+    assert a_fix(confidence=confidence).protection_level_m(1e-3) == math.inf
+
+
+@pytest.mark.parametrize("risk", [0.0, 1.0, math.nan])
+def test_a_risk_is_a_probability(risk):
+    with pytest.raises(OptionError, match="risk: expected a probability above 0 and below 1"):
+        a_fix(confidence=0.99999).protection_level_m(risk)
+
+
 def test_reasons_are_an_enum_of_their_own_names():
     assert issubclass(Reason, enum.Enum)
     assert all(reason.value == reason.name.lower() for reason in Reason)

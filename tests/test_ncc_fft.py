@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, shift
 
@@ -150,24 +150,6 @@ def test_scores_stay_within_minus_one_and_one(seed, bright, flat, zero_mean):
 )  # fmt: skip
 def test_errors_name_the_argument_what_was_expected_and_what_came(search, templates, error, names):
     assert re.match(rf"{names}: expected .+, got .+", refusal(ncc, search, templates, error=error))
-
-
-def paraboloid(x0, y0, size=(15, 19), bend=((-0.05, 0.01), (0.01, -0.03)), top=0.8):
-    y, x = np.mgrid[: size[0], : size[1]]
-    d = np.stack([x - x0, y - y0], axis=-1)
-    return torch.from_numpy(top + 0.5 * np.einsum("...i,ij,...j", d, np.array(bend), d))
-
-
-@given(x0=st.floats(2.0, 16.0), y0=st.floats(2.0, 12.0))
-def test_the_peak_of_a_paraboloid_is_found_exactly(x0, y0):
-    surface = paraboloid(x0, y0)
-    y, x = divmod(int(surface.argmax()), surface.shape[1])
-    assume(abs(x0 - x) <= 0.5)  # on a slanting ridge the best whole pixel need not be the nearest
-    assume(abs(y0 - y) <= 0.5)
-    peak = find_peak(surface, exclusion_px=3.0)
-    assert (peak.x, peak.y) == (pytest.approx(x0, abs=1e-6), pytest.approx(y0, abs=1e-6))
-    assert peak.score == float(surface.max())
-    np.testing.assert_allclose(peak.curvature, [[-0.05, 0.01], [0.01, -0.03]], atol=1e-9)
 
 
 @pytest.mark.parametrize(("dx", "dy"), [(0.0, 0.0), (0.3, -0.2), (-0.45, 0.4), (0.5, 0.1)])

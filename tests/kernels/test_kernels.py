@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -11,9 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from engine.kernels import blocks, reference, tensors
+from engine.kernels.local import LocalScores
 from engine.ncc_fft import MapRegion, ncc, prepare, surface
 from engine.runtime import threads as chosen
-from engine.window import place_window, window_size_px
 from tests.support.tensors import assert_close
 
 KERNELS = {"dispatch": ncc, "tensors": tensors.ncc_surface}
@@ -146,6 +144,29 @@ def test_a_prepared_crop_scores_as_the_reference(seed, model):
             np.testing.assert_allclose(scores.numpy(), expected[:count], rtol=0, atol=1e-5)
 
 
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    model=st.tuples(st.integers(1, 21), st.integers(2, 16)),
+    more=st.tuples(st.integers(0, 20), st.integers(0, 30)),
+    flat=st.sampled_from([(0.5, 0.0), (0.0, 0.5)]),
+)
+@settings(max_examples=40)
+def test_scores_at_a_few_places_are_the_references(seed, model, more, flat):
+    """About the middle and both ends of a picture of which the right half, or all, is flat."""
+    rng = np.random.default_rng(seed)
+    image = rng.normal(size=[n + m for n, m in zip(model, more, strict=True)]).astype(np.float32)
+    image[:, round(flat[0] * image.shape[1]) :] = flat[1]
+    template = rng.normal(size=model).astype(np.float32)
+    template -= template.mean()
+    expected = reference.ncc_surface(image, template, zero_mean=True)
+    last = np.array(expected.shape) - 1
+    for middle in (0 * last, last // 2, last):
+        scorer = LocalScores(image, template, tuple(middle.tolist()))
+        places = np.argwhere(np.ones(expected.shape))
+        y, x = places[np.abs(places - middle).max(axis=1) <= scorer.REACH].T
+        np.testing.assert_allclose(scorer.at(y, x), expected[y, x], rtol=0, atol=1e-5)
+
+
 def test_views_are_taken():
     search = torch.randn(2, 50, 60, generator=torch.Generator().manual_seed(0)).transpose(1, 2)
     templates = torch.randn(1, 1, 9, 11, generator=torch.Generator().manual_seed(1)).expand(2, 3, -1, -1)
@@ -157,34 +178,3 @@ def test_gradients_of_templates_come_from_the_tensor_ops():
     templates = torch.randn(1, 1, 8, 9, generator=torch.Generator().manual_seed(1)).requires_grad_()
     ncc(search, templates).max().backward()
     assert templates.grad is not None
-
-
-# How many transforms a flight plans: sides are rounded up to lengths that are fast, which many windows share
-
-
-def adaptive_windows(count):
-    """(H, W) of windows of a climb from 100 to 200 m on a curve at 15 m/s, one frame a second, 0.5 m a pixel."""
-    for i in range(count):
-        extent = 2.0 * (100.0 + 100.0 * i / count) * math.tan(math.radians(30.0)) / 0.5
-        course = 2.0 * math.pi * i / count
-        moved = (30.0 * math.sin(course), 30.0 * math.cos(course))
-        window = place_window((2000.0, 2000.0), window_size_px((extent, extent), moved), (4000, 4000))
-        assert window is not None
-        yield window.height_px, window.width_px
-
-
-def test_a_flight_of_many_window_sizes_plans_few_transforms(monkeypatch):
-    plans, real = set(), torch.fft.rfft2
-
-    def recorded(picture, s=None):
-        plans.add(tuple(s or picture.shape[-2:]))
-        return real(picture, s=s)
-
-    monkeypatch.setattr(torch.fft, "rfft2", recorded)
-    sizes = set(adaptive_windows(64))
-    assert len(sizes) > 50
-    template = torch.rand(1, 1, 48, 40, generator=torch.Generator().manual_seed(0))
-    for height, width in sizes:
-        products = tensors.correlate(torch.zeros(1, height, width), template)
-        assert products.shape == (1, 1, height - 47, width - 39)
-    assert len(plans) <= 24

@@ -14,7 +14,6 @@ from rich.console import Console
 
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher
 from engine.maps import metric_copy
-from engine.maps.rasters import GrayReader
 from engine.values import Window
 from scenematch.cli import console
 from scenematch.cli.app import run
@@ -325,12 +324,3 @@ def test_a_copy_that_is_not_what_its_hash_says_is_made_anew(picture, tmp_path, t
     assert made
     assert np.array_equal(again.valid(whole(again)), valid)
     assert np.array_equal(again.gray(whole(again))[valid], pixels[valid])
-
-
-def test_an_all_valid_file_says_so_without_being_read(tmp_path, large_path):
-    from engine.maps.rasters import open_source
-
-    plain = np.full((40, 50), 9, np.uint8)
-    path = write_raster(tmp_path / "plain.tif", plain, crs=UTM, transform=Affine(1, 0, 6e5, 0, -1, 5e6))
-    assert GrayReader(open_source(path)).all_valid
-    assert not GrayReader(open_source(large_path)).all_valid

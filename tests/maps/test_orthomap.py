@@ -325,6 +325,9 @@ def test_surface_is_bilinear_and_ground_is_a_low_percentile(site):
     assert site.has_surface
     xy = np.array([[10.5, 20.25], [0.0, 0.0], [118.9, 88.9]])
     assert np.allclose(site.surface_at(xy), xy @ [0.25, 0.5], atol=1e-4)
+    corners, outside = [[-0.5, -0.5], [119.5, 89.5]], [[-0.6, 2.0], [119.6, 2.0], [2.0, -0.6], [2.0, 89.6]]
+    assert np.allclose(site.surface_at(corners), [0.0, 74.25])  # pixels reach half a pixel out
+    assert (site.surface_at(outside) == site.ground_m).all()
     heights = 0.25 * np.arange(120) + 0.5 * np.arange(90)[:, None]
     assert site.ground_m == pytest.approx(np.percentile(heights, 20), abs=0.5)
 
@@ -370,7 +373,10 @@ def test_surface_nodata_and_what_lies_outside_is_ground(tmp_path, nodata):
     path = write(tmp_path / "map.tif", noise(60, 60))
     site = OrthoMap.open(path, write(tmp_path / "dsm.tif", heights, nodata=nodata))
     assert site.ground_m == 40.0
-    assert np.array_equal(site.surface_at([[30, 5], [15, 15], [50, 5], [5, 50]]), [100, 40, 40, 40])
+    beside_nodata = [19.5, 15]
+    assert np.array_equal(
+        site.surface_at([[30, 5], beside_nodata, [15, 15], [50, 5], [5, 50]]), [100, 40, 40, 40, 40]
+    )
     assert site.info()["surface_range_m"] == [40.0, 100.0]
 
 

@@ -165,41 +165,6 @@ def test_a_template_that_does_not_fit_is_named(model):
         match_template(search, torch.zeros(model), exclusion_px=3.0)
 
 
-# Below the pixel
-
-
-FINER = 8
-FRACTIONS = (0, 1, 2, 3, 4)  # eighths of a pixel
-
-
-@pytest.mark.slow
-def test_positions_below_the_pixel_are_within_a_twentieth_and_drawn_to_no_pixel():
-    """Errors (fraction, case, axis) in pixels over textures of detail from 0.7 to 1.5 pixels."""
-    errors = np.zeros((len(FRACTIONS), 12, 2))
-    for number in range(12):
-        rng = np.random.default_rng(number)
-        detail_px = (0.7, 1.0, 1.5)[number % 3]
-        fine = cv2.GaussianBlur(
-            rng.standard_normal((200 * FINER, 200 * FINER), dtype=np.float32), (0, 0), detail_px * FINER
-        )
-        fine = 128.0 + 45.0 * fine / fine.std()
-
-        def photograph(y, x, n, fine=fine, rng=rng):
-            part = fine[y : y + n * FINER, x : x + n * FINER]
-            levels = part.reshape(n, FINER, n, FINER).mean(axis=(1, 3)) + rng.normal(0.0, 2.0, (n, n))
-            return enhance(np.clip(np.rint(levels), 0, 255).astype(np.uint8))
-
-        search = prepare(torch.from_numpy(photograph(0, 0, 200)))
-        for i, fraction in enumerate(FRACTIONS):
-            x, y = rng.integers(25, 60, 2)
-            other = int(rng.integers(0, 5))
-            template = photograph(y * FINER + other, x * FINER + fraction, 120)
-            peak = match_template(search, torch.from_numpy(template), exclusion_px=10.0)
-            errors[i, number] = peak.x - x - fraction / FINER, peak.y - y - other / FINER
-    assert np.sqrt(np.mean(errors**2)) <= 0.05
-    assert np.abs(errors[..., 0].mean(axis=1)).max() <= 0.02
-
-
 # Over nodata: the reference is the masked surface, which has tests of its own against sums by hand
 
 

@@ -245,17 +245,6 @@ needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA d
 
 
 @needs_cuda
-@SIZES
-def test_a_gpu_finds_the_same_peak(size, model):
-    image = picture(*size, 1)
-    template = cut(image, model, 2)
-    expected = match_template(prepare(image), template, exclusion_px=5.0, exhaustive=True)
-    found = match_template(prepare(image.cuda()), template.cuda(), exclusion_px=5.0, exhaustive=True)
-    assert (found.x, found.y) == pytest.approx((expected.x, expected.y), abs=1e-3)
-    assert (found.score, found.second_score) == pytest.approx((expected.score, expected.second_score), abs=1e-5)
-
-
-@needs_cuda
 @pytest.mark.parametrize("zero_mean", [True, False])
 def test_a_gpu_makes_the_surfaces_of_float64(zero_mean):
     windows = torch.stack([picture(170, 181, i) for i in range(2)]) + 3.0
@@ -267,15 +256,6 @@ def test_a_gpu_makes_the_surfaces_of_float64(zero_mean):
         given = None if mask is None else mask.cuda()
         found = ncc(windows.cuda(), templates.cuda(), zero_mean=zero_mean, search_valid=given)
         assert_close(found.cpu().double(), expected, atol=2e-5, rtol=0)
-
-
-@needs_cuda
-@pytest.mark.parametrize("name", OPTIONS)
-def test_a_gpu_finds_the_features_of_the_cpu(name):
-    pictures = scenes()
-    expected = sift(pictures, backend="kornia", **OPTIONS[name])
-    found = sift(pictures.cuda(), **OPTIONS[name])
-    assert_same_features(download([found.valid, found.xy_px, found.scale_px, found.descriptors]), expected)
 
 
 @needs_cuda

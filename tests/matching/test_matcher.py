@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -12,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from rasterio.warp import Resampling, reproject
 
 from engine import (
     Budget,
@@ -27,7 +25,6 @@ from engine import (
     Prior,
     Reason,
     SceneMatcher,
-    Window,
 )
 from engine.budget import Deadline
 from engine.features import match, sift
@@ -37,13 +34,12 @@ from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.ncc import Ncc
 from engine.matching.peak_evidence import PeakCandidate
 from engine.matching.query import Query
-from engine.options import AssumedErrors, LearnedOptions, NccOptions, PoseOptions, SiftOptions
+from engine.options import AssumedErrors, NccOptions, SiftOptions
 from engine.values import GridPose, Peak
 from tests.support.fixes import a_fix, px_off, values_of
 from tests.support.ground import Ground
 from tests.support.landmarks import landmarks_of
 from tests.support.matches import pairs_of
-from tests.support.rasters import from_corner, write_raster
 
 METHODS = ("ncc", "sift")
 NADIR = np.array([315.0, 296.0])
@@ -338,16 +334,6 @@ def test_features_of_the_map_prepared_or_found_per_frame_give_the_same_place(gro
         assert fixes[0].score > 0.8
 
 
-@pytest.mark.parametrize(("turned", "heading_deg"), [(1, 100.0), (-1, 250.0)])
-def test_features_agree_about_the_turn_also_where_the_maps_up_is_not_north(camera, turned, heading_deg):
-    ground = Ground(lat_deg=60.0, lon_deg=17.9)  # 2.5 degrees of convergence
-    shown = ground.frame(camera, NADIR, heading_deg=heading_deg, pitch_deg=8.0)
-    mounted = replace(camera, mount=np.diag([turned, turned, 1.0]) @ camera.mount)
-    matcher = with_sift(ground, mounted, search_widely=False)
-    given = replace(shown, image=shown.image[::turned, ::turned].copy())
-    assert px_off(matcher.locate(given, ground.prior(NADIR)), NADIR) < 0.5
-
-
 @pytest.mark.parametrize("mounted_deg", [0.0, 30.0, 60.0])
 def test_an_error_of_one_sigma_weighs_one_however_the_camera_is_mounted(camera, mounted_deg):
     """Of roll, pitch and heading by turns; of the two tilts each by whether it was given."""
@@ -440,14 +426,6 @@ def test_a_prior_wider_than_any_map_is_a_search_of_all_of_it(matchers, ground, f
     assert isinstance(result, NoFix) or px_off(result, NADIR) < 1.0
 
 
-def test_an_explanation_asks_about_the_middle_of_its_window(matchers, ground, frame, monkeypatch):
-    seen, real = [], SceneMatcher._query
-    monkeypatch.setattr(SceneMatcher, "_query", lambda self, *asked: seen.append(asked[1]) or real(self, *asked))
-    matchers["ncc"].explain(frame, Window(100, 80, 400, 401))
-    middle = ground.site.pixel_from_enu([seen[0].east_m, seen[0].north_m])
-    np.testing.assert_allclose(middle, [299.5, 280.0], atol=1e-3)
-
-
 @pytest.mark.parametrize(
     ("missing", "reason"), [("height_agl_m", Reason.NO_HEIGHT), ("heading_deg", Reason.NO_HEADING)]
 )
@@ -487,24 +465,6 @@ def test_a_frame_of_another_place_is_refused(mirrored_site, sim_flight, method):
         assert isinstance(matcher.locate(shown, HERE), NoFix)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("known", [True, False])
-def test_a_frame_of_another_town_is_refused(other_site, sim_flight, method, known):
-    matcher = SceneMatcher(other_site, sim_flight.camera, method, "cpu")
-    results = [matcher.locate(shown, HERE if known else None) for shown in sim_flight.frames[:20]]
-    assert sum(isinstance(result, NoFix) for result in results) >= 19
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_noise_is_refused(matchers, prior, method):
-    rng = np.random.default_rng(4)
-    for _ in range(2):
-        image = rng.integers(0, 256, (300, 300), dtype=np.uint8)
-        for given in (prior, None):
-            assert isinstance(matchers[method].locate(with_telemetry(image), given), NoFix)
-
-
 def test_a_map_that_repeats_itself_is_ambiguous(ground, camera):
     """A chessboard of one picture: every place has its double 100 m away."""
     tile = ground.gray[:200, :200]
@@ -533,33 +493,6 @@ def test_options_are_refused_by_name(ground, camera):
         SceneMatcher(ground.site, camera, "auto", "cpu", MatcherOptions(profile="paper"))
 
 
-@pytest.mark.parametrize(
-    ("options", "name", "value", "text"),
-    [
-        (NccOptions, "exclusion_m", math.nan, "a number above 0"),
-        (NccOptions, "enhance_radius_px", -1, "0 or more"),
-        (SiftOptions, "scale", 0.0, "above 0 and at most 1"),
-        *((SiftOptions, name, 3, "4 or more") for name in ("max_keypoints", "max_map_keypoints")),
-        *((SiftOptions, n, math.inf, "a finite number") for n in ("max_height_m", "height_factor")),
-        (SiftOptions, "height_factor", 0.9, "1 or more"), (SiftOptions, "max_height_m", 0.5, "above 1"),
-        (SiftOptions, "map_features", "sometimes", "one of prepared, per_frame"),
-        *((SiftOptions, "upsample", value, "1 or 2") for value in (0, 3)),
-        (SiftOptions, "max_tilt_deg", -1, "above 0"),
-        (NccOptions, "score", "census", "one of grey, local, gradient, mixed"),
-        *((PoseOptions, name, value, "a positive number") for name, value in (
-            ("reprojection_px", 0), ("distinct_px", -1))),
-        (PoseOptions, "min_inliers", 3, "at least 4"), (PoseOptions, "max_log10_nfa", math.nan, "a number"),
-        (LearnedOptions, "max_keypoints", 1, ".+"), (LearnedOptions, "max_picture_px", 10, ".+"),
-        (LearnedOptions, "max_window_px", 10, ".+"), (MatcherOptions, "profile", "fast", "one of engine, paper"),
-        *((MatcherOptions, "risk", value, "a probability above 0 and below 1") for value in (0.0, 98.0, math.nan)),
-        (MatcherOptions, "risk", 1.0, "a probability above 0 and below 1"),
-    ],
-)  # fmt: skip
-def test_options_by_which_every_frame_would_fail_are_refused(options, name, value, text):
-    with pytest.raises(OptionError, match=rf"^{name}: expected {text}, got '?{value}"):
-        options(**{name: value})
-
-
 # The paper's profile
 
 
@@ -584,43 +517,6 @@ def test_the_papers_profile_refuses_what_it_cannot_do(ground, camera, frame, pri
         assert_refused(matcher.locate(with_telemetry(frame.image, heading_deg=None), prior), Reason.NO_HEADING)
         for height in (0.01, 65_535.0, 1e7):
             assert_refused(matcher.locate(with_telemetry(frame.image, height), prior), Reason.OUTSIDE_MAP)
-
-
-# The map's projection does not matter
-
-
-def projections(folder, ground):
-    """The same map as UTM, as degrees and as web Mercator, warped with cubic splines by GDAL."""
-    gray = np.maximum(ground.gray, 1)  # 0 is nodata
-    for crs in (f"EPSG:{ground.epsg}", "EPSG:4326", "EPSG:3857"):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PendingDeprecationWarning)  # rasterio's own use of affine
-            warped, transform = reproject(
-                gray, src_transform=from_corner(ground.pixel_to_crs), src_crs=f"EPSG:{ground.epsg}", dst_crs=crs,
-                resampling=Resampling.cubic, src_nodata=0, dst_nodata=0,
-            )  # fmt: skip
-        path = write_raster(folder / f"{crs[5:]}.tif", warped, nodata=0, crs=crs, transform=transform)
-        yield crs, OrthoMap.open(path)
-
-
-@pytest.mark.slow
-def test_ground_without_relief_is_where_it_is_in_any_projection(tmp_path, camera):
-    ground = Ground(lon_deg=16.45)  # 1.1 degrees of convergence
-    rng = np.random.default_rng(0)
-    nadirs, tilts = rng.uniform((260.0, 250.0), (380.0, 350.0), (8, 2)), rng.uniform(-6, 6, (8, 2))
-    questions = [
-        (ground.frame(camera, nadir, heading_deg=45.0 * k, roll_deg=roll, pitch_deg=pitch), ground.prior(nadir))
-        for k, (nadir, (roll, pitch)) in enumerate(zip(nadirs, tilts, strict=True))
-    ]
-    truth = ground.enu_from_pixel(nadirs)
-    by_peak = MatcherOptions(ncc=NccOptions(refine=False))
-    for name, site in projections(tmp_path, ground):
-        for method, most_m in (("ncc", 0.02), ("sift", 0.2)):
-            matcher = SceneMatcher(site, camera, method, "cpu", by_peak)
-            fixes = [matcher.locate(*question) for question in questions]
-            off_m = [ground.site.frame.enu_from_geodetic(fix.lat_deg, fix.lon_deg) for fix in fixes] - truth
-            assert np.hypot(*off_m.mean(axis=0)) < 0.1, (method, name)
-            assert np.hypot(*off_m.T).max() < most_m, (method, name)
 
 
 def test_a_place_that_contradicts_its_prior_is_less_certain(ground, camera, frame):

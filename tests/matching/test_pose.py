@@ -6,11 +6,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from scipy.stats import chi2, norm
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.kernels.pose_fit import biweight_factors
 from engine.matching.pose import AttitudePrior, PoseStart, PoseStats, solve_pose
 from engine.options import PoseOptions
 from tests.support.poses import CAMERA, GROUNDS, SIZE_PX, WRONG, Scene, any_scene, attitude, measured, scene
@@ -99,8 +97,9 @@ def test_unusable_matches_are_ignored():
     s.points_px[5, 0] = np.inf
     weights = np.ones(40)
     weights[8] = 0
+    s.points_m[11] = 2.0 * s.center_m - s.points_m[11]  # behind the camera, on the same line of sight
     pose = solved(s, weights=weights)
-    assert np.flatnonzero(~pose.inliers).tolist() == [3, 5, 8]
+    assert np.flatnonzero(~pose.inliers).tolist() == [3, 5, 8, 11]
     np.testing.assert_allclose(pose.center_m, s.center_m, atol=1e-5)
 
 
@@ -147,15 +146,6 @@ def test_errors_lie_within_three_sigma_whatever_the_ground(ground, with_prior, c
         assert 2.4 < np.mean(nees_turn) < 3.6
 
 
-@pytest.mark.parametrize("u", [1.0, 4.5, 8.0, 60.0])
-def test_biweight_factors_are_their_integrals(u):
-    def mean(f):
-        return quad(lambda q: f(q, (1 - q / u) ** 2) * math.exp(-q), 0, u)[0]
-
-    weight, pull, noise = mean(lambda q, w: w), mean(lambda q, w: w * q), mean(lambda q, w: w * w * q)
-    np.testing.assert_allclose(biweight_factors(u), (pull / weight, noise / pull), rtol=1e-6)
-
-
 def test_where_the_search_began_does_not_show():
     """The attitude of the telemetry and three random matches lead to one pose."""
     rng = np.random.default_rng(22)
@@ -199,14 +189,6 @@ def test_a_prior_on_attitude_separates_tilt_from_displacement():
     assert np.mean(helped) < 0.5 * np.mean(plain)
 
 
-def test_the_precision_of_a_prior_is_its_covariance_inverted():
-    mount = cv2.Rodrigues(np.deg2rad([3.0, 30.0, -20.0]))[0]
-    prior = AttitudePrior(np.eye(3), (0.3, 0.6, 2.0), axes=mount)
-    about_body = np.diag(np.deg2rad([0.3, 0.6, 2.0]) ** 2)
-    np.testing.assert_allclose(np.linalg.inv(prior.precision), mount.T @ about_body @ mount, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(AttitudePrior(np.eye(3), 0.3).precision, np.eye(3) / np.deg2rad(0.3) ** 2)
-
-
 # Refused.
 
 
@@ -233,10 +215,10 @@ def test_many_matches_on_one_spot_count_once():
         assert (pose is not None) == carried
 
 
-@pytest.mark.parametrize("count", [0, 1, 3, 4, 5])
-def test_too_few_are_refused(count):
-    s = scene(np.random.default_rng(14), max(count, 1))
-    assert solve_pose(s.points_m[:count], s.points_px[:count], K) is None
+@pytest.mark.parametrize("found", [*map(range, (0, 1, 3, 4, 5)), 12 * [0, 1, 2, 3, 4], 30 * [0]], ids=len)
+def test_too_few_are_refused_however_often_they_are_found(found):
+    s, slots = scene(np.random.default_rng(14), 5), np.array(found, int)
+    assert solve_pose(s.points_m[slots], s.points_px[slots], K) is None
 
 
 def test_fewer_wrong_matches_are_surer():
@@ -255,14 +237,6 @@ def test_points_on_a_line_are_refused():
     for noise in (0.0, 0.5):
         pixels = (x @ K.T)[:, :2] / x[:, 2:] + rng.normal(0, noise, (40, 2))
         assert solve_pose(points, pixels, K) is None
-
-
-def test_repeated_matches_count_once():
-    s = scene(np.random.default_rng(17), 5)
-    index = np.tile(np.arange(5), 12)
-    assert solve_pose(s.points_m[index], s.points_px[index], K) is None
-    one = np.zeros(30, int)
-    assert solve_pose(s.points_m[one], s.points_px[one], K) is None
 
 
 def test_points_in_one_place_of_the_map_are_refused():

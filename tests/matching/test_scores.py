@@ -12,10 +12,7 @@ import torch
 
 from engine import Frame, MatcherOptions, NoFix, OptionError, SceneMatcher
 from engine.kernels.scores import SCORES, enhance, orientation
-from engine.maps import prepared as prepared_map
-from engine.maps.prepared import PreparedMap
 from engine.options import NccOptions
-from engine.values import Window
 from tests.support.fixes import px_off
 from tests.support.paths import ROOT
 
@@ -136,24 +133,6 @@ def test_the_edge_of_nodata_is_no_edge_on_the_ground(score):
     assert np.abs(enhance(np.where(valid, 230, 0).astype(np.uint8), score=score, valid=valid)).max() < 1e-2
 
 
-@pytest.mark.parametrize("score", SCORES)
-@pytest.mark.parametrize("nodata", [False, True])
-def test_regions_of_a_large_map_join_without_a_seam(score, nodata, ground, monkeypatch):
-    gray = np.tile(ground.gray, (2, 2))[:1080, :1080]
-    valid = None
-    if nodata:
-        valid = np.ones(gray.shape, bool)
-        valid[500:530, 490:540] = False
-    site = ground.map_of(gray, valid=valid)
-    inside = Window(512, 512, 512, 512)
-    whole = PreparedMap(site, CPU, 8, score).cut(inside, 0)
-    monkeypatch.setattr(prepared_map, "WHOLE_LEVEL_PX", 1)
-    part = PreparedMap(site, CPU, 8, score).cut(inside, 0)
-    # Whole grey levels where a region has no nodata, parts of them where it has: a rounding apart.
-    images = part.search.image, whole.search.image
-    np.testing.assert_allclose(*images, atol=1e-3 if not nodata else 0.6, rtol=0.0, equal_nan=False)
-
-
 # Finding a place
 
 
@@ -218,12 +197,7 @@ def test_no_heading_makes_another_place_look_right(ground, camera, heading_deg):
     assert isinstance(SceneMatcher(ground.site, camera, "ncc", "cpu").locate(mirrored, ground.prior(NADIR)), NoFix)
 
 
-# Options and the page
-
-
-def test_a_score_that_does_not_exist_is_refused():
-    with pytest.raises(OptionError, match=r"^score: expected one of grey, local, gradient, mixed, got 'census'"):
-        enhance(noise(), score="census")
+# The page
 
 
 def test_the_page_lists_every_score_and_measures_it():

@@ -168,13 +168,6 @@ def test_a_pose_refined_to_another_height_is_not_taken(ground, camera, matcher, 
     assert abs(fix.up_m - by_features.up_m) < 4.0 * sigma_m
 
 
-def test_samples_of_another_method_are_shared(site, camera):
-    both = SceneMatcher(site, camera, "auto", "cpu")
-    parts = both._method.parts
-    assert isinstance(parts["sift"], Sift)
-    assert parts["sift"].samples is parts["ncc"].samples
-
-
 @pytest.mark.parametrize("scale", [0.35, 1.0])
 def test_the_cost_of_features_goes_by_the_pixels_that_are_drawn(ground, camera, matcher, monkeypatch, scale):
     """Not by the frame's: at one height they are up to four times as many as at another. Borders are not shown."""

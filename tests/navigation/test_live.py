@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from engine.errors import OptionError, StateError, TelemetryError
+from engine.errors import StateError, TelemetryError
 from engine.navigation.live import Live, LiveOptions
 from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason
@@ -152,25 +152,6 @@ def test_the_newest_wins_and_drops_are_counted():
     assert live.counts.dropped == 6
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("times", [2, 5, 10])
-def test_more_frames_than_it_can_take(times):
-    """The age at output stays within the deadline and one frame, however many come."""
-    takes_ms, deadline_ms = 20.0, 60.0
-    begun_ns = time.monotonic_ns()
-    with running(Navigators(takes_ms=takes_ms), deadline_ms) as (live, answers):
-        for number in range(30 * times):
-            live.submit(frame(number))
-            time.sleep(takes_ms / times * 1e-3)
-        wait_for(answers, 5)
-    counts, took_ms = live.counts, (time.monotonic_ns() - begun_ns) * 1e-6
-    assert counts.submitted == 30 * times == counts.answered + counts.dropped
-    assert counts.answered <= took_ms / takes_ms + took_ms / deadline_ms + 2  # one in work, one that waits
-    stamps = [a.frame.timestamp_ns for a in answers]
-    assert stamps == sorted(set(stamps))
-    assert all(isinstance(a.result, NoFix) or a.age_ms <= deadline_ms for a in answers)
-
-
 def test_an_answer_comes_at_the_deadline_and_the_late_fix_never():
     gate = Gate()
     with running(Navigators({0: gate}), deadline_ms=50, patience_ms=60_000) as (live, answers):
@@ -234,17 +215,6 @@ def test_a_frame_that_cannot_be_used_costs_no_worker():
     assert live.counts.workers_replaced == 0
 
 
-@pytest.mark.slow
-def test_a_maker_that_fails_is_asked_again(caplog):
-    navigators = Navigators({0: die}, fail)
-    with running(navigators, deadline_ms=1000) as (live, answers):
-        number = 0
-        while send(live, answers, number)[-1] != "fix":
-            number += 1
-    assert len(navigators.starts) == 3
-    assert "make_navigator failed" in caplog.text
-
-
 def test_a_receiver_that_fails_stops_nothing(caplog):
     with running(Navigators(), fails=ValueError("the receiver's own")) as (live, answers):
         assert send(live, answers, 0, 1, 2) == ["fix"] * 3
@@ -273,24 +243,16 @@ def test_closing_waits_for_a_worker_whose_frame_was_answered_without_it(patience
     assert gate.left
 
 
-def test_closing_ends_the_attempts_of_a_maker_that_fails(caplog):
+def test_a_maker_that_fails_is_asked_again_until_closing(caplog):
     navigators = Navigators({0: die}, *[fail] * 1000)
     with running(navigators, patience_ms=60) as (live, answers):
         send(live, answers, 0)
-        wait_until(lambda: len(navigators.starts) > 1)
+        wait_until(lambda: len(navigators.starts) > 2)
     wait_until(no_threads)
+    assert "make_navigator failed" in caplog.text
     made, replaced = len(navigators.starts), live.counts.workers_replaced
     time.sleep(0.15)
     assert (len(navigators.starts), live.counts.workers_replaced) == (made, replaced)
-
-
-@pytest.mark.parametrize("name", ["deadline_ms", "patience_ms"])
-@pytest.mark.parametrize(
-    ("value", "wanted"), [(1e13, "at most 60000, got 1e\\+13"), (0, "a number above 0, got 0")]
-)
-def test_what_is_waited_for_is_above_0_and_at_most_a_minute(name, value, wanted):
-    with pytest.raises(OptionError, match=f"{name}: expected {wanted}"):
-        LiveOptions(**{name: value})
 
 
 def test_closing_does_not_replace_a_worker_that_hangs(monkeypatch):

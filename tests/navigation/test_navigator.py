@@ -17,8 +17,6 @@ from engine import (
     NavigatorOptions,
     NavigatorState,
     NoFix,
-    OptionError,
-    OrthoMap,
     Prior,
     Reason,
     SceneMatcher,
@@ -303,32 +301,12 @@ def test_a_late_frame_that_contradicts_the_track_is_refused_and_counts_for_nothi
 # What is handed on
 
 
-def test_the_height_of_a_fix_is_handed_on_to_frames_without_one():
-    """SIFT's height is in the datum of the surface; its ground lies at 30 m."""
-    surface = np.full((64, 64), 30.0, np.float32)
-    grid = np.array([[0.5, 0.0, 5e5], [0.0, -0.5, 5.3e6]])
-    site = OrthoMap.from_arrays(np.zeros((64, 64), np.uint8), grid, "EPSG:32633", surface_m=surface)
-    matcher = script((10.0, 20.0), (10.0, 20.0), None, site=site, up_m=130.0)
-    navigator = Navigator(matcher, START)
-    navigator.update(at(0.0, height_agl_m=None))
-    navigator.update(at(1.0, height_agl_m=None))
-    navigator.update(at(2.0, height_agl_m=95.0))
-    assert [frame.height_agl_m for frame in matcher.frames] == [None, 100.0, 95.0]
-
-
 def test_every_frame_gets_the_budget():
     matcher = script(None, None)
     navigator = Navigator(matcher, START, Budget(total_ms=40.0))
     for k in range(2):
         navigator.update(at(k))
     assert matcher.budgets == [Budget(total_ms=40.0)] * 2
-
-
-@pytest.mark.parametrize("name", [name for name in NavigatorOptions.__dataclass_fields__ if name != "odometry"])
-def test_options_are_refused_by_name(name):
-    for value in (0, -1.0, math.nan, math.inf):
-        with pytest.raises(OptionError, match=rf"^{name}: expected a number above 0, got "):
-            NavigatorOptions(**{name: value})
 
 
 # The simulated flight

@@ -257,20 +257,16 @@ def test_photographs_seconds_apart_are_fixes_with_and_without_positions_of_their
     assert off_m is None or [prior.sigma_m for prior in navigator._matcher.priors] == [15.0] * 8
 
 
-@pytest.mark.parametrize(("stage", "first"), [("fine", 1), ("coarse", None), ("unconfirmed", None)])
-def test_an_attitude_that_nothing_confirmed_does_not_outweigh_a_start_however_often(stage, first):
-    """Its error moves all matches by 80 m alike: they agree with each other, and not with the start."""
-    fixes = [replace(fix_at(80.0 + 1.4 * k), stage=stage) for k in range(20)]
+@pytest.mark.parametrize(("off_m", "confirmed", "first"), [(80.0, True, 1), (80.0, False, 20), (3.0, False, 0)])
+@pytest.mark.parametrize("stage", ["coarse", "unconfirmed"])
+def test_an_attitude_that_nothing_confirmed_is_believed_only_where_the_start_predicts(
+    stage, off_m, confirmed, first
+):
+    """Its error moves all matches alike, however many: they agree with each other, and not with the start."""
+    fixes = [replace(fix_at(off_m + 1.4 * k), stage="fine" if confirmed else stage) for k in range(20)]
     start = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0)
     run = flown(ScriptedMatcher(*fixes), start, every_s=0.2, velocity=(7.0, 0.0))
-    assert run.fixed == ([] if first is None else list(range(first, 20)))
-
-
-@pytest.mark.parametrize("stage", ["coarse", "unconfirmed"])
-def test_an_attitude_that_nothing_confirmed_is_believed_where_the_start_predicts(stage):
-    fixes = [replace(fix_at(1.4 * k), stage=stage) for k in range(20)]
-    start = Prior(east_m=3.0, north_m=0.0, sigma_m=10.0)
-    assert len(flown(ScriptedMatcher(*fixes), start, every_s=0.2, velocity=(7.0, 0.0)).fixed) == 20
+    assert run.fixed == list(range(first, 20))
 
 
 @pytest.mark.parametrize("stage", ["coarse", "unconfirmed"])

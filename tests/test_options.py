@@ -1,0 +1,61 @@
+"""Options: frozen, stated by name, and refused by name where every frame would fail."""
+
+import dataclasses
+import math
+
+import pytest
+
+from engine import LearnedOptions, LiveOptions, MatcherOptions, NavigatorOptions, OptionError
+from engine.options import AssumedErrors, NccOptions, PoseOptions, SiftOptions
+
+ENGINE = (AssumedErrors, LearnedOptions, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, SiftOptions)
+
+
+@pytest.mark.parametrize("options", [*ENGINE, LiveOptions])
+def test_options_are_frozen_and_stated_by_name(options):
+    assert options.__dataclass_params__.frozen
+    assert all(field.kw_only for field in dataclasses.fields(options))
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        (options, field.name)
+        for options in (AssumedErrors, NavigatorOptions, LiveOptions)
+        for field in dataclasses.fields(options)
+        if field.name not in ("height_share", "odometry", "realtime")
+    ],
+)
+def test_numbers_are_above_0(options, name, value):
+    with pytest.raises(OptionError, match=rf"^{name}: expected a number above 0, got {value}"):
+        options(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "value", "text"),
+    [
+        *((AssumedErrors, "height_share", value, "a number from 0 up") for value in (-1e-9, math.nan, math.inf)),
+        *((LiveOptions, name, 60_001, "at most 60000") for name in ("deadline_ms", "patience_ms")),
+        (NccOptions, "exclusion_m", math.nan, "a number above 0"),
+        (NccOptions, "enhance_radius_px", -1, "0 or more"),
+        (SiftOptions, "scale", 0.0, "above 0 and at most 1"),
+        *((SiftOptions, name, 3, "4 or more") for name in ("max_keypoints", "max_map_keypoints")),
+        *((SiftOptions, n, math.inf, "a finite number") for n in ("max_height_m", "height_factor")),
+        (SiftOptions, "height_factor", 0.9, "1 or more"), (SiftOptions, "max_height_m", 0.5, "above 1"),
+        (SiftOptions, "map_features", "sometimes", "one of prepared, per_frame"),
+        *((SiftOptions, "upsample", value, "1 or 2") for value in (0, 3)),
+        (SiftOptions, "max_tilt_deg", -1, "above 0"),
+        (NccOptions, "score", "census", "one of grey, local, gradient, mixed"),
+        *((PoseOptions, name, value, "a positive number") for name, value in (
+            ("reprojection_px", 0), ("distinct_px", -1))),
+        (PoseOptions, "min_inliers", 3, "at least 4"), (PoseOptions, "max_log10_nfa", math.nan, "a number"),
+        (LearnedOptions, "max_keypoints", 1, ".+"), (LearnedOptions, "max_picture_px", 10, ".+"),
+        (LearnedOptions, "max_window_px", 10, ".+"), (MatcherOptions, "profile", "fast", "one of engine, paper"),
+        *((MatcherOptions, "risk", value, "a probability above 0 and below 1")
+          for value in (0.0, 1.0, 98.0, math.nan)),
+    ],
+)  # fmt: skip
+def test_options_by_which_every_frame_would_fail_are_refused(options, name, value, text):
+    with pytest.raises(OptionError, match=rf"^{name}: expected {text}, got '?{value}"):
+        options(**{name: value})
