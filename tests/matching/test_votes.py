@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from engine.kernels.clusters import count_near_pairs, densest
+from engine.kernels.clusters import count_apart, count_near_pairs, densest
 from engine.matching.votes import SCALES, TURNS_DEG, similarity, vote
 
 RADIUS_PX, DISTINCT_PX = 4.0, 2.0
@@ -70,6 +72,14 @@ def test_a_second_place_with_as_many_votes_is_a_rival():
     assert found.rival_surprise == pytest.approx(found.surprise, rel=0.2)  # as many, but crowded otherwise
 
 
+def test_the_densest_place_is_where_brute_force_finds_it():
+    rng = np.random.default_rng(11)
+    for _ in range(20):
+        points = np.concatenate([rng.uniform(0, 100, (60, 2)), rng.normal(rng.uniform(10, 90, 2), 1.0, (12, 2))])
+        near = np.hypot(*(points[:, None] - points).transpose(2, 0, 1)) <= 4.0
+        assert np.count_nonzero(densest(points, 4.0)) >= 0.9 * near.sum(axis=1).max()
+
+
 @pytest.mark.parametrize("spread", [0.01, 1.0, 1e5])
 def test_the_densest_place_holds_every_point_where_all_lie_together(spread):
     points = np.random.default_rng(12).uniform(0.0, spread, (50, 2)) + 3e5
@@ -84,6 +94,16 @@ def test_near_pairs_are_counted_one_by_one():
     apart = np.hypot(*(a[:, :, None] - b[:, None, :]))
     assert count_near_pairs(*a, *b, 6.0) == np.count_nonzero(apart <= 6.0) > 50
     assert count_near_pairs(*a[:, :0], *b, 6.0) == 0
+
+
+@given(st.integers(0, 60), st.floats(0.1, 50.0), st.integers(0, 2**32 - 1))
+def test_points_apart_are_a_set_that_nothing_can_join(count, apart, seed):
+    points = np.random.default_rng(seed).uniform(0.0, 100.0, (count, 2))
+    kept: list[np.ndarray] = []
+    for point in points:
+        if all(np.hypot(*(point - other)) > apart for other in kept):
+            kept.append(point)
+    assert count_apart(points, apart) == len(kept)
 
 
 def test_without_matches_nothing_is_voted_for():
