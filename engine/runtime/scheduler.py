@@ -23,6 +23,8 @@ DEVIATIONS, SEVERAL = (2.0, 5.0), 10.0  # median absolute deviations, before and
 FADE, FORGOTTEN = 0.99, 4  # per refusal: share of the cost that is left, and stages; so a step is tried again
 MAX_WAIT_MS = 20.0  # longest wait for the processor that a fix is protected from
 
+Stopwatch = Callable[[], tuple[float, float] | None]
+
 
 def loops_compiled() -> int:
     """How often numba compiled a loop, or loaded one from its cache, so far; numba need not be imported."""
@@ -35,7 +37,7 @@ class OutOfTime(Exception):  # noqa: N818 - no error, and never seen by a caller
 
 
 class Costs:
-    """Costs of steps on this machine per unit of work, and the machine's load."""
+    """Costs of steps, and of their rest from each stage on, per unit of work; and the machine's load."""
 
     def __init__(self) -> None:
         self._runs: dict[Hashable, deque[tuple[float, float]]] = {}  # milliseconds on the processor, and taken
@@ -43,15 +45,17 @@ class Costs:
         self._stages_ms: deque[tuple[float, float]] = deque(maxlen=STAGES)  # used and waited, of all steps
         self._waits_ms: deque[float] = deque(maxlen=WAITS)
 
-    def learn(self, step: Hashable, work: float, used_ms: float, took_ms: float, *, stage: bool = False) -> None:
-        """Record a run of a step or stage; it replaces one earlier run for each refusal in between."""
+    def learn(self, step: Hashable, work: float, used_ms: float, took_ms: float) -> None:
+        """Record a run of a step or of its rest; it replaces one earlier run for each refusal in between."""
         runs, work = self._runs.setdefault(step, deque(maxlen=RUNS)), max(work, 1.0)
         for _ in range(min(self._refusals.pop(step, 0), len(runs) - 1)):
             runs.popleft()
         runs.append((used_ms / work, took_ms / work))
-        if stage:
-            self._waits_ms.append(max(took_ms - used_ms, 0.0))
-            self._stages_ms.append((used_ms, self._waits_ms[-1]))
+
+    def note_stage(self, used_ms: float, took_ms: float) -> None:
+        """Record how long a stage used the processor and waited for it."""
+        self._waits_ms.append(max(took_ms - used_ms, 0.0))
+        self._stages_ms.append((used_ms, self._waits_ms[-1]))
 
     def note_refusal(self, step: Hashable, *, is_idle: bool) -> None:
         """Record that a step was refused for its cost; in a frame that ran none, the load may be over."""
@@ -94,8 +98,9 @@ class Scheduler:
         self.deadline, self._device, self.costs = deadline, device, costs or Costs()
         self.stages_ms: dict[str, float] = {}
         self._step: tuple[Hashable, float] | None = None  # the running step and its work
+        self._begun: list[tuple[Hashable, Stopwatch]] = []  # its stages so far
         self._refused: set[Hashable] = set()
-        self.has_fix = self._is_under_way = self._has_run = False
+        self.has_fix = self._has_run = False
 
     def can_afford(self, works: Mapping[Hashable, float]) -> bool:
         """Whether time allows successive steps of this work; with a fix, also for one scheduling delay."""
@@ -123,44 +128,53 @@ class Scheduler:
 
     @contextmanager
     def costed(self, step: Hashable, work: float) -> Iterator[None]:
-        """Learn a step's cost for this work; an abandoned step costs more than the time it had."""
-        outer, self._step, self._is_under_way, self._has_run = self._step, (step, work), False, True
-        learn, had_ms = self._stopwatch(), self.deadline.remaining_ms
+        """Learn a step's cost for this work, and that of its rest from each stage on.
+
+        An abandoned step costs more than the time it had.
+        """
+        outer, self._step, self._begun, self._has_run = (self._step, self._begun), (step, work), [], True
+        spent, had_ms = self._stopwatch(), self.deadline.remaining_ms
         try:
             yield
         except OutOfTime:
             self.costs.learn(step, work, had_ms / self.costs.load(), had_ms)
             raise
+        else:
+            for key, since in [(step, spent), *self._begun]:
+                if (used_and_took := since()) is not None:
+                    self.costs.learn(key, work, *used_and_took)
         finally:
-            self._step = outer
-        learn(step, work)
+            self._step, self._begun = outer
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time one stage; OutOfTime within a step if the deadline has passed, or would pass despite a fix."""
-        key, work = ((self._step[0], name), self._step[1]) if self._step else (None, 0.0)
-        if key and not self.deadline.met:
-            raise OutOfTime
-        if key and self.has_fix and self._is_under_way and not self.can_afford({key: work}):
-            self.note_refusal(key)  # of later stages: the step's start checked the first
-            raise OutOfTime
-        start_ms, learn, self._is_under_way = self.deadline.elapsed_ms, self._stopwatch(), True
+        """Time one stage; OutOfTime within a step if the deadline has passed, or its rest would lose a fix."""
+        if self._step is not None:
+            (step, work), count = self._step, len(self._begun)
+            rest = (step, name, count)
+            if not self.deadline.met:
+                raise OutOfTime
+            if count and self.has_fix and not self.can_afford({rest: work}):  # the step's start checked all of it
+                self.note_refusal(rest)
+                raise OutOfTime
+            self._begun.append((rest, self._stopwatch()))
+        start_ms, spent = self.deadline.elapsed_ms, self._stopwatch()
         try:
             yield
         finally:
             synchronise(self._device)
             self.stages_ms[name] = self.stages_ms.get(name, 0.0) + self.deadline.elapsed_ms - start_ms
-        learn(key, work, stage=True)
+        if (used_and_took := spent()) is not None:
+            self.costs.note_stage(*used_and_took)
 
-    def _stopwatch(self) -> Callable[..., None]:
-        """A function that learns the time since, unless loops were compiled."""
+    def _stopwatch(self) -> Stopwatch:
+        """A function that gives the milliseconds used and taken since; None if loops were compiled."""
         start_ms, start_ns, compiled = self.deadline.elapsed_ms, time.thread_time_ns(), loops_compiled()
 
-        def learn(step: Hashable, work: float, *, stage: bool = False) -> None:
+        def spent() -> tuple[float, float] | None:
             took_ms, used_ms = self.deadline.elapsed_ms - start_ms, (time.thread_time_ns() - start_ns) * 1e-6
             if self._device.type != "cpu" or threads.count() > 1:  # other threads worked while this one waited
                 used_ms = took_ms
-            if loops_compiled() == compiled:
-                self.costs.learn(step, work, used_ms, took_ms, stage=stage)
+            return (used_ms, took_ms) if loops_compiled() == compiled else None
 
-        return learn
+        return spent

@@ -19,7 +19,8 @@ REGULAR = st.floats(0.8, 1.2)
 
 def note(costs, step, took_ms, used_share=1.0):
     """A run of a step, which is one stage."""
-    costs.learn(step, 1.0, used_share * took_ms, took_ms, stage=True)
+    costs.learn(step, 1.0, used_share * took_ms, took_ms)
+    costs.note_stage(used_share * took_ms, took_ms)
 
 
 def learned(runs):
@@ -158,13 +159,14 @@ def clocked(budget_ms, costs, monkeypatch):
     return clock, Scheduler(deadline, Device("cpu"), costs)
 
 
-def abandoned(one, clock, **stages_ms):
-    """The stage before which a step was abandoned, None if it was not."""
+def abandoned(one, clock, *, after_each_ms=0.0, **stages_ms):
+    """The stage before which a step was abandoned, None if it was not; some time is in no stage."""
     try:
         with one.costed("step", 1.0):
             for name, ms in stages_ms.items():
                 with one.stage(name):
                     clock["ms"] += ms
+                clock["ms"] += after_each_ms
     except OutOfTime:
         return name
     return None
@@ -178,14 +180,16 @@ def test_what_is_abandoned_costs_more_than_the_time_that_it_had(monkeypatch):
     assert costs.needed_ms("step", 1.0) == pytest.approx(10.0)
 
 
-def test_beside_a_fix_a_step_is_abandoned_before_a_stage_that_would_lose_it(monkeypatch):
+@pytest.mark.parametrize("after_each_ms", [0.0, 0.5, 4.0])
+def test_beside_a_fix_a_step_is_abandoned_as_soon_as_its_rest_would_lose_it(monkeypatch, after_each_ms):
+    """Its rest is all that follows, whether it belongs to a stage or not."""
     costs = Costs()
     for _ in range(3):
         clock, one = clocked(100.0, costs, monkeypatch)
-        assert abandoned(one, clock, match=4.0, pose=5.0) is None
-    clock, one = clocked(10.0, costs, monkeypatch)
-    with one.with_fix():
-        assert abandoned(one, clock, match=6.0, pose=5.0) == "pose"  # the first took longer than usual
+        assert abandoned(one, clock, match=4.0, vote=0.5, pose=5.0, after_each_ms=after_each_ms) is None
+    clock, one = clocked(10.0 + 3.0 * after_each_ms, costs, monkeypatch)
+    with one.with_fix():  # the first takes longer than usual
+        assert abandoned(one, clock, match=6.0, vote=0.5, pose=5.0, after_each_ms=after_each_ms) == "vote"
     assert one.deadline.met
 
 
@@ -196,7 +200,7 @@ def test_only_if_one_thread_works_its_waiting_is_told_apart(count, used_ms, monk
     clock_ns, processor_ns = iter([0, 0, 0, 9_000_000]), iter([0, 1_000_000])
     monkeypatch.setattr(scheduler.time, "thread_time_ns", lambda: next(processor_ns))
     learned, costs = [], Costs()
-    monkeypatch.setattr(costs, "learn", lambda *run, stage: learned.append(run))
+    monkeypatch.setattr(costs, "learn", lambda *run: learned.append(run))
     one = Scheduler(Deadline(Budget(), lambda: next(clock_ns)), Device("cpu"), costs)
     with one.costed("step", 5.0):
         pass

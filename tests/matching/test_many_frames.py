@@ -92,7 +92,8 @@ def test_threads_learn_one_cost_while_others_ask_for_it():
     costs = Costs()
 
     def learn_and_ask(work):
-        costs.learn("step", work, 2.0 * work, 2.0 * work, stage=True)
+        costs.learn("step", work, 2.0 * work, 2.0 * work)
+        costs.note_stage(2.0 * work, 2.0 * work)
         return costs.needed_ms("step", 100.0)
 
     works = [float(work) for work in range(1, 200)] * 8

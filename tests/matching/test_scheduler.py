@@ -40,7 +40,7 @@ class FixedCosts:
     def learn(self, *_, **__):
         pass
 
-    note_refusal = learn
+    note_refusal = note_stage = learn
 
     def load(self):
         return 1.0
