@@ -176,6 +176,7 @@ class SceneMatcher:
             detail = f"the map of {self.site.size_km} is not searched as a whole; a start position is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method)
         result = self._method.locate(query)
+        query.scheduler.note_answer()
         if isinstance(result, Fix) and not deadline.met:
             detail = "the answer came after the budget"
             return query.refuse(Reason.LATE, detail, result.method, window=result.window)

@@ -22,6 +22,8 @@ RUNS, STAGES, WAITS = 15, 48, 240  # of a step, of all stages (some six frames),
 DEVIATIONS, SEVERAL = (2.0, 5.0), 10.0  # median absolute deviations, before and beside a fix; medians at most
 FADE, FORGOTTEN = 0.99, 4  # per refusal: share of the cost that is left, and stages; so a step is tried again
 MAX_WAIT_MS = 20.0  # longest wait for the processor that a fix is protected from
+ANSWER = "answer"
+"""What follows the last step, as a step."""
 
 Stopwatch = Callable[[], tuple[float, float] | None]
 
@@ -46,9 +48,15 @@ class Costs:
         self._waits_ms: deque[float] = deque(maxlen=WAITS)
 
     def learn(self, step: Hashable, work: float, used_ms: float, took_ms: float) -> None:
-        """Record a run of a step or of its rest; it replaces one earlier run for each refusal in between."""
+        """Record a run of a step or of its rest.
+
+        If it was tried again after refusals, and took no more than it then seemed to need, it replaces an earlier
+        run for each of them.
+        """
         runs, work = self._runs.setdefault(step, deque(maxlen=RUNS)), max(work, 1.0)
-        for _ in range(min(self._refusals.pop(step, 0), len(runs) - 1)):
+        is_cheaper = took_ms <= self.needed_ms(step, work)
+        refusals = self._refusals.pop(step, 0)
+        for _ in range(min(refusals, len(runs) - 1) if is_cheaper else 0):
             runs.popleft()
         runs.append((used_ms / work, took_ms / work))
 
@@ -99,13 +107,16 @@ class Scheduler:
         self.stages_ms: dict[str, float] = {}
         self._step: tuple[Hashable, float] | None = None  # the running step and its work
         self._begun: list[tuple[Hashable, Stopwatch]] = []  # its stages so far
+        self._since_step: Stopwatch | None = None  # the last one ended
         self._refused: set[Hashable] = set()
         self.has_fix = self._has_run = False
 
     def can_afford(self, works: Mapping[Hashable, float]) -> bool:
-        """Whether time allows successive steps of this work; with a fix, also for one scheduling delay."""
+        """Whether time allows successive steps of this work; with a fix, also the answer and one wait."""
         needed_ms = sum(self.costs.needed_ms(step, work, has_fix=self.has_fix) for step, work in works.items())
-        return needed_ms + (self.costs.wait_ms() if self.has_fix else 0.0) <= self.deadline.remaining_ms
+        if self.has_fix:
+            needed_ms += self.costs.needed_ms(ANSWER, 1.0) + self.costs.wait_ms()
+        return needed_ms <= self.deadline.remaining_ms
 
     def is_hopeless(self, step: Hashable, work: float) -> bool:
         """Whether no recent run of a step was quick enough for the time left, or a fix would be at stake."""
@@ -145,6 +156,12 @@ class Scheduler:
                     self.costs.learn(key, work, *used_and_took)
         finally:
             self._step, self._begun = outer
+            self._since_step = self._stopwatch()
+
+    def note_answer(self) -> None:
+        """Learn how long the answer takes after the last step."""
+        if self._since_step is not None and (spent := self._since_step()) is not None:
+            self.costs.learn(ANSWER, 1.0, *spent)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -123,6 +123,7 @@ def test_a_refusal_makes_a_step_seem_cheaper_until_it_runs():
     assert costs.needed_ms("step", 1.0) < 2.0
     note(costs, "step", 5.0)  # tried in vain
     assert costs.needed_ms("step", 1.0) == pytest.approx(5.0)
+    assert len(costs._runs["step"]) == 10  # it was right, and so were the earlier runs
     for _ in range(100):
         costs.note_refusal("step", is_idle=False)
     note(costs, "step", 1.0)  # and has become cheap
@@ -193,11 +194,23 @@ def test_beside_a_fix_a_step_is_abandoned_as_soon_as_its_rest_would_lose_it(monk
     assert one.deadline.met
 
 
+def test_beside_a_fix_there_must_be_time_for_the_answer_too(monkeypatch):
+    costs = learned([("step", 4.0)] * 3)
+    for _ in range(3):
+        clock, one = clocked(100.0, costs, monkeypatch)
+        assert abandoned(one, clock, match=4.0) is None
+        clock["ms"] += 2.0  # what the methods do with it
+        one.note_answer()
+    assert can_afford(costs, "step", 6.0, has_fix=True)
+    assert not can_afford(costs, "step", 5.9, has_fix=True)
+    assert can_afford(costs, "step", 4.0)
+
+
 @pytest.mark.parametrize(("count", "used_ms"), [(1, 1.0), (2, 9.0)])
 def test_only_if_one_thread_works_its_waiting_is_told_apart(count, used_ms, monkeypatch):
     """A thread that lets others work is off the processor for as long as they work."""
     monkeypatch.setattr(threads, "count", lambda: count)
-    clock_ns, processor_ns = iter([0, 0, 0, 9_000_000]), iter([0, 1_000_000])
+    clock_ns, processor_ns = iter([0, 0, 0, *[9_000_000] * 2]), iter([0, *[1_000_000] * 2])
     monkeypatch.setattr(scheduler.time, "thread_time_ns", lambda: next(processor_ns))
     learned, costs = [], Costs()
     monkeypatch.setattr(costs, "learn", lambda *run: learned.append(run))
@@ -208,7 +221,7 @@ def test_only_if_one_thread_works_its_waiting_is_told_apart(count, used_ms, monk
 
 
 def test_what_compiled_is_nobodys_cost(monkeypatch):
-    compiled = iter([0, 1, 1, 1])
+    compiled = iter([0, 1, 1, 1, 1, 1])
     monkeypatch.setattr(scheduler, "loops_compiled", lambda: next(compiled))
     costs = Costs()
     for _ in range(2):
