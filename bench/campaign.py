@@ -105,7 +105,7 @@ def done(job: Job, unfinished: Path) -> str | None:
     shutil.rmtree(folder, ignore_errors=True)
     # A surface model and truth are optional in a flight folder.
     given = [a for a in job.arguments if not (a.startswith(("--surface=", "--truth=")) and not _is_there(a))]
-    command = [sys.executable, "-m", "scenematch.cli", *given, f"--out={folder}"]
+    command = [sys.executable, "-m", "scenematch", *given, f"--out={folder}"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     if ended.returncode:
         return ended.stderr.strip().rpartition("\n")[2].removeprefix("scenematch: ") or f"exit {ended.returncode}"

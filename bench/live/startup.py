@@ -20,8 +20,8 @@ from typing import Any
 Row = dict[str, Any]
 PARTS = ("Python", "import engine", "open map and flight", "warm-up", "first frame")
 ENTRIES = {
-    "scenematch --help": ("-m", "scenematch.cli", "--help"),
-    "scenematch track --help": ("-m", "scenematch.cli", "track", "--help"),
+    "scenematch --help": ("-m", "scenematch", "--help"),
+    "scenematch track --help": ("-m", "scenematch", "track", "--help"),
     "import engine": ("-c", "import engine"),
     "from engine import Camera, Frame, OrthoMap": ("-c", "from engine import Camera, Frame, OrthoMap"),
     "from engine import SceneMatcher": ("-c", "from engine import SceneMatcher"),

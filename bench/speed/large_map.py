@@ -133,7 +133,7 @@ def _write_tiles(folder: Path, path: Path, side: int, corner: list[int]) -> None
 
 
 def _run(*arguments: str) -> None:
-    subprocess.run([sys.executable, "-m", "scenematch.cli", *arguments], check=True, capture_output=True)
+    subprocess.run([sys.executable, "-m", "scenematch", *arguments], check=True, capture_output=True)
 
 
 # ------------------------------------------------------------------------------------------------- watching
@@ -143,7 +143,7 @@ def watch(name: str, site: Path, surface: Path, flight: Path, method: str) -> Ru
     """Run `scenematch track` and look at its memory from outside while it writes its rows."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out"
-        command = [sys.executable, "-m", "scenematch.cli", "track", "--method", method, "--device", "cpu"]
+        command = [sys.executable, "-m", "scenematch", "track", "--method", method, "--device", "cpu"]
         files = {"map": site, "surface": surface, "camera": flight / "camera.yaml", "frames": flight / "frames"}
         files |= {"telemetry": flight / "telemetry.csv", "out": out}
         for option, path in files.items():

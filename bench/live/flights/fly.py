@@ -54,7 +54,7 @@ class Bridge:
         self._begin.unlink(missing_ok=True)
         camera = f"exec:{sys.executable} -m bench.live.flights.camera {folder / 'frames'} {self._begin} {RATE_HZ}"
         self._command = [
-            sys.executable, "-m", "scenematch.cli", "bridge", "mavlink", "--supervise", "--method", method,
+            sys.executable, "-m", "scenematch", "bridge", "mavlink", "--supervise", "--method", method,
             "--connect", f"udpin:127.0.0.1:{port}", "--map", str(folder / "map.tif"),
             "--surface", str(folder / "dsm.tif"), "--camera", str(folder / "camera.yaml"),
             "--camera-source", camera, "--start", f"{start.lat_deg},{start.lon_deg},15",

@@ -1,4 +1,4 @@
-"""``python -m scenematch.cli`` is ``scenematch``."""
+"""``python -m scenematch`` is ``scenematch``."""
 
 from scenematch.cli import main
 
