@@ -30,7 +30,7 @@ def members(root: Path = ROOT) -> dict[str, Path]:
     for package in PACKAGES:
         files = [*(root / package).glob("*.py"), *(root / package).glob("*/__init__.py")]
         found |= {_member(path.relative_to(root)): path for path in files if path.parent.name != path.stem}
-    return {name: path for name, path in found.items() if name not in PACKAGES}
+    return {name: path for name, path in found.items() if name not in PACKAGES and path.stem != "__main__"}
 
 
 def _member(path: Path) -> str:
