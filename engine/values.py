@@ -166,8 +166,9 @@ class GridPose:
     @property
     def known_attitude(self) -> Attitude:
         """The attitude; only of a pose that has a heading, or its frame would have been refused."""
-        assert self.grid_attitude is not None
-        return self.grid_attitude
+        attitude = self.grid_attitude
+        assert attitude is not None
+        return attitude
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,5 +4,5 @@ Tests compare every kernel of NCC with :mod:`engine.kernels.reference`, which is
 
 Loops compiled by numba (SIFT from picture to votes, dense refinement, surfaces and the georeference of maps) are
 imported where they are called, since numba takes a while to import. Tests compare SIFT's with the paper written
-out in float64, the others with OpenCV and NumPy.
+out in float64, the others with OpenCV, NumPy and difference quotients.
 """

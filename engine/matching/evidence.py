@@ -101,6 +101,11 @@ class Candidate:
         """The candidate by other evidence."""
         return replace(self, evidence=evidence, fix=replace(self.fix, confidence=probability(evidence.nats)))
 
+    def untested(self, risk: float) -> Self:
+        """The candidate without a test of the null hypothesis, which counts only if it is beyond doubt."""
+        is_tested = is_beyond_doubt(self.evidence.nats, risk)
+        return replace(self, evidence=replace(self.evidence, is_tested=is_tested))
+
 
 def independent_places(positions: float) -> float:
     """Number of independent places among this many pixel positions: neighbours belong to one place."""

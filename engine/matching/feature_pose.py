@@ -87,10 +87,7 @@ class FeatureMatcher:
     def find_at_once(self) -> Candidate | NoFix:
         """The pose of a frame by its own telemetry, with no second attempt and no null hypothesis."""
         found = self.query.refuse_flat(self.method) or self._find_with(next(self._attempts())[1])
-        if isinstance(found, NoFix):
-            return found
-        is_tested = is_beyond_doubt(found.evidence.nats, self.query.risk)
-        return found.weighed(replace(found.evidence, is_tested=is_tested))
+        return found if isinstance(found, NoFix) else found.untested(self.query.risk)
 
     def judge(self, found: Candidate | NoFix) -> Fix | NoFix:
         """The fix if there is a pose with enough evidence, else a refusal."""

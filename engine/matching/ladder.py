@@ -80,8 +80,9 @@ def _affordable(scheduler: Scheduler, works: Works) -> Hashable | None:
     for step, work in works.items():
         if scheduler.can_afford({step: work}):
             return step
-    if works and not scheduler.is_hopeless(step, work):
+    if not works:
+        return None
+    if not scheduler.is_hopeless(step, work):
         return step
-    if works:
-        scheduler.note_refusal(step)
+    scheduler.note_refusal(step)
     return None

@@ -13,7 +13,6 @@ from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.matching import hypothesis_search
 from engine.matching.acceptance import agree_in_place, edge_refusal, offset_between_m, peak_refusal
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
-from engine.matching.evidence import is_beyond_doubt
 from engine.matching.explanation import Explanation, explain_correlation
 from engine.matching.ladder import Rung, Works, climb, is_coarse, is_late, rehearse
 from engine.matching.method import Method
@@ -157,8 +156,7 @@ class Ncc(Method):
         found = candidate_of(correlator, aligned, peak, window, searched=searched, tried=tried)
         if is_window:
             return null_tested(correlator, found)
-        is_tested = not searched and is_beyond_doubt(found.evidence.nats, query.risk)
-        return found.weighed(replace(found.evidence, is_tested=is_tested))
+        return found if searched else found.untested(query.risk)
 
     def judge(self, query: Query, found: PeakCandidate | NoFix) -> Result:
         """The fix if there is a peak with enough evidence, else a refusal."""

@@ -54,10 +54,11 @@ class Costs:
         run for each of them.
         """
         runs, work = self._runs.setdefault(step, deque(maxlen=RUNS)), max(work, 1.0)
-        is_cheaper = took_ms <= self.needed_ms(step, work)
-        refusals = self._refusals.pop(step, 0)
-        for _ in range(min(refusals, len(runs) - 1) if is_cheaper else 0):
-            runs.popleft()
+        refusals = self._refusals.get(step, 0)
+        if refusals and took_ms <= self.needed_ms(step, work):
+            for _ in range(min(refusals, len(runs) - 1)):
+                runs.popleft()
+        self._refusals.pop(step, None)
         runs.append((used_ms / work, took_ms / work))
 
     def note_stage(self, used_ms: float, took_ms: float) -> None:
@@ -166,6 +167,7 @@ class Scheduler:
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Time one stage; OutOfTime within a step if the deadline has passed, or its rest would lose a fix."""
+        start_ms, spent = self.deadline.elapsed_ms, self._stopwatch()
         if self._step is not None:
             (step, work), count = self._step, len(self._begun)
             rest = (step, name, count)
@@ -174,8 +176,7 @@ class Scheduler:
             if count and self.has_fix and not self.can_afford({rest: work}):  # the step's start checked all of it
                 self.note_refusal(rest)
                 raise OutOfTime
-            self._begun.append((rest, self._stopwatch()))
-        start_ms, spent = self.deadline.elapsed_ms, self._stopwatch()
+            self._begun.append((rest, spent))
         try:
             yield
         finally:
