@@ -21,18 +21,6 @@ _RUN = (
     ("up m", "height_rms_m", "{:.2f}"),
 )
 """Columns of a table of runs, after the name: head, figure, form."""
-_SUMMARY = (
-    ("frames", "frames", "{}"),
-    ("fixes", "fixes", "{}"),
-    ("availability", "availability", "{:.1%}"),
-    ("RMS error", "rms_m", "{:.2f} m"),
-    ("median error", "median_m", "{:.2f} m"),
-    ("95 % within", "r95_m", "{:.2f} m"),
-    ("largest error", "max_m", "{:.2f} m"),
-    ("false fixes", "false_fixes", "{}"),
-    ("mean NEES (consistent: 2)", "nees_mean", "{:.2f}"),
-    ("height RMS error", "height_rms_m", "{:.2f} m"),
-)
 
 
 def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Path) -> None:
@@ -40,35 +28,15 @@ def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Pa
     if as_json:
         console.print_json(summary)
         return
-    hidden = {"false_fixes"} if summary.get("scored_fixes") == 0 else set()  # 0 of 0 would read as a result
-    shown_rows = [row for row in _SUMMARY if row[1] not in hidden]
-    known = [(name, form, summary[key]) for name, key, form in shown_rows if summary.get(key) is not None]
-    # An extreme value must fit its column.
-    pairs = [(name, form.replace(".2f", ".1e" if abs(v) >= 1e5 else ".2f").format(v)) for name, form, v in known]
-    if summary.get("rms_m") is None:
-        pairs += _stated(summary)
-    latency = summary["latency_ms"]
-    if latency["p50"] is not None:
-        shown = ", ".join(f"{name} {latency[name]:.1f}" for name in ("p50", "p95", "p99", "max"))
-        pairs.append(("latency", f"{shown} ms"))
+    from scenematch.report.verdict import key_figures
+
+    pairs = key_figures(summary)
     if summary["deadlines_missed"]:
         pairs.append(("deadlines missed", str(summary["deadlines_missed"])))
     pairs += [(f"refused: {reason}", str(count)) for reason, count in summary["reasons"].items()]
     pairs += list((summary["settings"].get("diagnosis") or {}).items())
     console.print_pairs(title, pairs)
     console.say(f"written to {out}")
-
-
-def _stated(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What a track says about itself without truth; this does not measure its accuracy."""
-    pairs, motion = [], summary.get("motion_consistency")
-    if summary.get("stated_sigma_median_m") is not None:
-        median_m, p95_m = summary["stated_sigma_median_m"], summary["stated_sigma_p95_m"]
-        pairs.append(("stated sigma (not measured)", f"median {median_m:.2f} m, 95 % below {p95_m:.2f} m"))
-    if motion is not None:
-        text = f"median {motion['median_m']:.2f} m, 95 % below {motion['p95_m']:.2f} m off the velocity"
-        pairs.append((f"from fix to fix ({motion['steps']} steps)", text))
-    return pairs
 
 
 def print_comparison(results: Mapping[str, Mapping[str, Any]], title: str) -> None:

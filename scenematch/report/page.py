@@ -16,8 +16,8 @@ from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.page_charts import draw_charts
 from scenematch.report.page_map import TrackMap, draw_map, loop_marks, map_of_tracks, track_marks
 from scenematch.report.page_parts import CROSS, charts_with_axis, fill_page, map_with_legend, section
-from scenematch.report.page_tables import draw_inputs, draw_refusals, draw_tiles
-from scenematch.report.verdict import loop_sentence, metres, verdict_of
+from scenematch.report.page_tables import draw_inputs, draw_refusals
+from scenematch.report.verdict import key_figures, loop_sentence, metres, verdict_of
 
 Legend = list[tuple[str, str]]
 
@@ -75,7 +75,7 @@ def _where(track: FinishedTrack, track_map: TrackMap, slider: bool) -> str:
     label = f"Map with {fixes} fixes, {beyond} of them beyond three sigmas; {refused} refused."
     drawn = map_with_legend(draw_map(track_map, label, marks), track_map, _map_legend(track, slider))
     tiles = "\n".join(
-        f"<li><strong>{escape(v)}</strong><span>{escape(k)}</span></li>" for k, v in draw_tiles(track)
+        f"<li><strong>{escape(v)}</strong><span>{escape(k)}</span></li>" for k, v in key_figures(track.summary)
     )
     return f'<div class="where">\n<div>\n{drawn}\n</div>\n<ul class="tiles">\n{tiles}\n</ul>\n</div>'
 

@@ -1,4 +1,4 @@
-"""Tables of the report: key figures, refusals, inputs and versions."""
+"""Tables of the report: refusals, inputs and versions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from engine.values import Reason
 from scenematch.report.explain import SliderFrame
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.verdict import MEANINGS, metres
+from scenematch.report.verdict import MEANINGS
 
 _FACTS = {
     "map": "map", "map_sigma_m": "map sigma (m)", "surface": "surface model", "camera": "camera",
@@ -23,40 +23,6 @@ _FACTS = {
     "log_offset_s": "log offset (s)", "truth": "truth", "method": "method", "profile": "profile",
     "device": "device", "start": "start", "budget_ms": "budget (ms)",
 }  # fmt: skip
-
-
-def draw_tiles(track: FinishedTrack) -> list[tuple[str, str]]:
-    """Label and value of the key figures that are known."""
-    summary = track.summary
-    share = summary["availability"]
-    tiles = [(f"fixed, {summary['fixes']} of {summary['frames']}", "-" if share is None else f"{share:.1%}")]
-    if summary.get("median_m") is not None:
-        tiles += [
-            ("median error", metres(summary["median_m"])),
-            ("95 % of errors below", metres(summary["r95_m"])),
-            ("largest error", metres(summary["max_m"])),
-        ]
-        if summary["nees_mean"] is not None:
-            tiles += [
-                ("within 3 stated sigmas; 98.9 % if consistent", f"{summary['within_3_sigma']:.1%}"),
-                ("within 1 stated sigma; 39.3 % if consistent", f"{summary['within_1_sigma']:.1%}"),
-                ("NEES: 2 is consistent, less cautious, more overconfident", f"{summary['nees_mean']:.2f}"),
-            ]
-    elif (sigma_m := summary["stated_sigma_median_m"]) is not None:
-        tiles.append(("stated by the fixes, not measured: median sigma", metres(sigma_m)))
-        tiles.append(("stated, not measured: 95 % of the sigmas below", metres(summary["stated_sigma_p95_m"])))
-        if (motion := summary.get("motion_consistency")) is not None:
-            every = f"{motion['steps']} steps of {motion['interval_s']:.2g} s"
-            tiles += [
-                (f"off the telemetry's velocity from fix to fix, median of {every}", metres(motion["median_m"])),
-                ("95 % of these steps below; an offset that stays does not show", metres(motion["p95_m"])),
-            ]
-    if summary.get("height_rms_m") is not None:
-        tiles.append(("RMS error of height", metres(summary["height_rms_m"])))
-    for name, key in (("latency, median", "p50"), ("latency, 95 % below", "p95")):
-        if summary["latency_ms"][key] is not None:
-            tiles.append((name, f"{summary['latency_ms'][key]:.1f} ms"))
-    return tiles
 
 
 def draw_refusals(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:

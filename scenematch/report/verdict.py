@@ -1,9 +1,9 @@
-"""State the verdict on a track in two sentences, and the meaning of each reason for refusal."""
+"""A track in words: its key figures, the verdict in two sentences, and the meaning of each reason for refusal."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,6 +32,8 @@ MEANINGS = {
 # Of fixes with a consistent covariance 1 % lie beyond three sigmas, and the mean NEES is 2.
 _BEYOND_SHARE, _MOST_NEES = 0.05, 8.0
 _CAUTIOUS = 2.0  # ratio of sigmas to errors from which sigmas are called cautious
+Figures = tuple[tuple[str, str, Callable[[Any], str]], ...]
+"""Names for people, keys of the summary, and what writes the value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,5 +138,42 @@ def _count(count: int, one: str, many: str) -> str:
 
 
 def metres(value: float) -> str:
-    """Format a length: centimetres below 10 m, decimetres below 100 m."""
+    """Format a length: centimetres below 10 m, decimetres below 100 m, powers of ten from 100 km on."""
+    if value >= 1e5:
+        return f"{value:.1e} m"
     return f"{value:.2f} m" if value < 10.0 else f"{value:.1f} m" if value < 100.0 else f"{value:,.0f} m"
+
+
+_SHARE = "{:.1%}".format
+_MEASURED: Figures = (
+    ("RMS error", "rms_m", metres),
+    ("median error", "median_m", metres),
+    ("95 % within", "r95_m", metres),
+    ("largest error", "max_m", metres),
+    ("false fixes", "false_fixes", str),
+    ("within 3 stated sigmas; 98.9 % if consistent", "within_3_sigma", _SHARE),
+    ("within 1 stated sigma; 39.3 % if consistent", "within_1_sigma", _SHARE),
+    ("NEES: 2 is consistent, less cautious, more overconfident", "nees_mean", "{:.3g}".format),
+    ("RMS error of height", "height_rms_m", metres),
+)
+_STATED: Figures = (
+    ("stated by the fixes, not measured: median sigma", "stated_sigma_median_m", metres),
+    ("stated, not measured: 95 % of the sigmas below", "stated_sigma_p95_m", metres),
+)
+_LATENCY: Figures = (
+    ("latency, median", "p50", "{:.1f} ms".format),
+    ("latency, 95 % below", "p95", "{:.1f} ms".format),
+    ("latency, largest", "max", "{:.1f} ms".format),
+)
+
+
+def key_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Name and value of each key figure that is known; without truth, what the fixes state of themselves.
+
+    Args:
+        summary: by :func:`scenematch.report.metrics.summarise`.
+    """
+    known = {**summary, **summary["latency_ms"]}
+    fixed = (f"fixed, {summary['fixes']} of {summary['frames']}", "availability", _SHARE)
+    figures = (fixed, *(_MEASURED if summary.get("scored_fixes") else _STATED), *_LATENCY)
+    return [(name, form(known[key])) for name, key, form in figures if known.get(key) is not None]

@@ -19,7 +19,6 @@ from scenematch.report.explain import explain_frames
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.loop_record import read_loop_csv
 from scenematch.report.metrics import summarise
-from scenematch.report.motion import motion_consistency
 from scenematch.report.page import write_page
 from scenematch.runs.output import SILENT, Progress, write_json
 from scenematch.runs.record import RunRecord
@@ -53,8 +52,7 @@ def write_results(
 ) -> dict[str, Any]:
     """Write summary.json and, if requested, the report page, replacing older ones."""
     telemetry = None if frames.flight is None else frames.flight.rows
-    more = {"motion_consistency": motion_consistency(rows, telemetry, site.frame), "settings": record.facts()}
-    summary = summarise(rows, truth, frame=site.frame, ground=record.ground) | more
+    summary = summarise(rows, truth, frame=site.frame, ground=record.ground) | {"settings": record.facts()}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
         fixed = [row.timestamp_ns for row in rows if row.fixed and row.timestamp_ns is not None]
         given = [row.timestamp_ns for row in truth or []]

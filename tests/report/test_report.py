@@ -1,19 +1,15 @@
-"""Figures of merit against hand-made tracks; steps by velocity against plain loops."""
+"""Figures of merit against hand-made tracks."""
 
 import json
 import math
-from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from engine.geo import LocalFrame
 from engine.values import Truth
-from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
 from scenematch.report.metrics import Ground, errors_en_m, summarise
-from scenematch.report.motion import motion_consistency
 
 HERE = LocalFrame(32.79, 34.99)
 SECOND_NS = 1_000_000_000
@@ -147,48 +143,3 @@ def test_a_summary_is_json_without_nan():
 
 
 # ---------------------------------------------------------------------------------- the telemetry's velocity
-
-
-STEP_S = 2
-
-
-def turned(count=60):
-    """A turn with velocities that a trapezoid integrates exactly, fixes with known errors and an offset that
-    stays, and some refusals.
-    """
-    rng = np.random.default_rng(4)
-    velocity = np.array([[8.0 - 0.1 * k, 0.2 * k] for k in range(count)])
-    way = np.vstack([np.zeros(2), np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * STEP_S, axis=0)])
-    error = rng.normal(0.0, 0.4, (count, 2))
-    places = way + error + [30.0, -20.0]
-    seconds = range(0, STEP_S * count, STEP_S)
-    rows = [refusal_at(t) if k % 7 == 3 else fix_at(*places[k], t) for k, t in enumerate(seconds)]
-    telemetry = [
-        TelemetryRow(timestamp_ns=t * SECOND_NS, frame=str(k), east_velocity_mps=east, north_velocity_mps=north)
-        for k, (t, (east, north)) in enumerate(zip(seconds, velocity, strict=True))
-    ]
-    return rows, telemetry, error
-
-
-def test_steps_are_off_by_what_the_errors_of_their_ends_differ_and_no_offset_that_stays():
-    rows, telemetry, error = turned()
-    found = motion_consistency(rows, telemetry, HERE)
-    fixed = [k for k, row in enumerate(rows) if row.fixed]
-    off_m = [math.dist(error[a], error[b]) for a, b in pairwise(fixed)]
-    assert (found["steps"], found["interval_s"]) == (len(off_m), STEP_S)
-    assert found["median_m"] == pytest.approx(np.median(off_m), abs=1e-4)
-    assert found["p95_m"] == pytest.approx(np.percentile(off_m, 95), abs=1e-4)
-    assert found["max_m"] == pytest.approx(max(off_m), abs=1e-4)
-
-
-def test_steps_without_a_velocity_or_too_long_do_not_count():
-    rows, telemetry, _ = turned(count=20)
-    before = motion_consistency(rows, telemetry, HERE)["steps"]
-    gap = [replace(row, east_velocity_mps=None) if row.frame == "3" else row for row in telemetry]
-    assert motion_consistency(rows, gap, HERE)["steps"] == before - 1  # frame 3 was refused: one step spans it
-    refused = [refusal_at(STEP_S * k) for k in range(4, 15)]
-    assert motion_consistency([*rows[:4], *refused, *rows[15:]], telemetry, HERE)["steps"] == 2 + 3
-    bare = [TelemetryRow(timestamp_ns=row.timestamp_ns, frame=row.frame) for row in telemetry]
-    for stated in (None, [], bare, telemetry[:-1]):
-        assert motion_consistency(rows, stated, HERE) is None
-    assert motion_consistency(refused[:1], telemetry[4:5], HERE) is None
