@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
@@ -53,6 +54,15 @@ class BagMessages(MessageFactory):
             roi=roi,
             **(blocks if self.ros1 else {name.lower(): values for name, values in blocks.items()}),
         )
+
+    def image(self, time_ns: int, frame_id: str, pixels: NDArray[np.uint8]) -> Any:
+        """A sensor_msgs/Image of (H, W) grey or (H, W, 3) RGB, uint8."""
+        height, width = pixels.shape[:2]
+        encoding, data = "mono8" if pixels.ndim == 2 else "rgb8", np.ascontiguousarray(pixels).ravel()
+        return self.make(
+            "sensor_msgs/msg/Image", header=self.header(time_ns, frame_id), height=height, width=width,
+            encoding=encoding, is_bigendian=0, step=pixels[0].size, data=data,
+        )  # fmt: skip
 
     def imu(self, time_ns: int, frame_id: str, roll_deg: float, pitch_deg: float, heading_deg: float) -> Any:
         """A sensor_msgs/Imu with orientation only."""

@@ -23,7 +23,7 @@ from engine.navigation.navigator import Navigator
 from engine.orthomap import OrthoMap
 from engine.values import Fix, Frame, NoFix, Prior
 from scenematch.bridges.ros_in import RESTART_NS, RosTelemetry, RosTopics
-from scenematch.bridges.ros_out import FRAME_ID, RosOptions, diagnostics, pose, window_picture
+from scenematch.bridges.ros_out import RosOptions, diagnostics, pose
 from scenematch.bridges.vehicle import is_finite
 from scenematch.files.ros.bags import QUANTITIES
 from scenematch.files.ros.messages import ODOMETRY_TYPES, MessageFactory, image_from_message, stamp_ns
@@ -35,7 +35,6 @@ __all__ = ["RosBridge", "RosNode", "RosOptions", "RosStatus", "RosTopics"]
 OUTPUTS = {
     "pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "fix": "sensor_msgs/msg/NavSatFix",
-    "window": "sensor_msgs/msg/Image",
     "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
 """Message type of each topic that is published."""
@@ -64,9 +63,6 @@ class RosNode(Protocol):
 
     def publish(self, output: str, message: Any) -> None:
         """Publish a message of one of :data:`OUTPUTS`."""
-
-    def has_subscribers(self, output: str) -> bool:
-        """Whether a topic of :data:`OUTPUTS` has subscribers."""
 
     def spin(
         self, handlers: dict[str, tuple[str, Handler]], every_second: Callable[[], None], seconds: float | None
@@ -251,9 +247,6 @@ class RosBridge:
             values |= {"reason": reason, "detail": "" if refusal is None else refusal.detail}
             self._say(reason, f"first frame without a fix for this reason: {reason}; {values['detail']}")
             self._diagnose(captured_ns, _WARN, f"no fix: {reason}", values)
-        if result.window is not None and self._node.has_subscribers("window"):
-            crop = window_picture(self._site, result.window, result if isinstance(result, Fix) else None)
-            self._node.publish("window", self._node.messages.image(captured_ns, FRAME_ID, crop))
         if self._watch is not None:
             self._watch(answer)
 

@@ -40,7 +40,7 @@ class Node:
             raise BackendError(f"bridge: expected a ROS master at {rosgraph.get_master_uri()}, got no answer")
         self._rospy = rospy
         rospy.init_node(name, argv=list(arguments))
-        self.messages = MessageFactory(find_class, True, genpy.Time, octets=lambda values: values.tobytes())
+        self.messages = MessageFactory(find_class, True, genpy.Time)
         self._publishers = {
             output: rospy.Publisher(_topic(output), find_class(kind), queue_size=10, tcp_nodelay=True)
             for output, kind in OUTPUTS.items()
@@ -61,10 +61,6 @@ class Node:
         """Publish a message; after shutdown it is discarded."""
         if not self._rospy.is_shutdown():
             self._publishers[output].publish(message)
-
-    def has_subscribers(self, output: str) -> bool:
-        """Whether the topic has subscribers."""
-        return bool(self._publishers[output].get_num_connections())
 
     def spin(
         self, handlers: dict[str, tuple[str, Handler]], every_second: Callable[[], None], seconds: float | None

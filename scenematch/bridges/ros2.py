@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import array
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -50,12 +49,7 @@ class Node:
         self._rclpy, self._qos = rclpy, qos_profile_sensor_data
         self._shutdown_error, self._name_error = ExternalShutdownException, NameValidationException
         self._any_type = ParameterDescriptor(dynamic_typing=True)
-        self.messages = MessageFactory(
-            find_class,
-            False,
-            octets=lambda values: array.array("B", values.tobytes()),  # a list would be checked byte by byte
-            octet=lambda value: bytes([value]),
-        )
+        self.messages = MessageFactory(find_class, False, octet=lambda value: bytes([value]))
         self._publishers = {
             output: self._node.create_publisher(find_class(kind), _topic(output), 10)
             for output, kind in OUTPUTS.items()
@@ -96,10 +90,6 @@ class Node:
         """Publish a message; after shutdown it is discarded."""
         if self._rclpy.ok():
             self._publishers[output].publish(message)
-
-    def has_subscribers(self, output: str) -> bool:
-        """Whether the topic has subscribers."""
-        return bool(self._publishers[output].get_subscription_count())
 
     def spin(
         self, handlers: dict[str, tuple[str, Handler]], every_second: Callable[[], None], seconds: float | None

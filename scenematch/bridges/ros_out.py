@@ -1,4 +1,4 @@
-"""Build the messages that the ROS nodes publish: a fix's pose, the diagnostics and the image of its window."""
+"""Build the messages that the ROS nodes publish: a fix's pose and the diagnostics."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from engine.errors import OptionError
 from engine.geo import LocalFrame, enu_turn_covariance_rad2
 from engine.orthomap import OrthoMap
-from engine.values import Fix, Window
+from engine.values import Fix
 from scenematch.bridges.vehicle import ANGLE_VARIANCE, MOUNT_VARIANCE, NedOrigin, VehicleState, north_east_m
 from scenematch.files.ros.messages import MessageFactory
 
@@ -23,7 +23,6 @@ FRAME_ID = "map"
 """Frame of the poses, which are east-north-up about the origin."""
 _UNKNOWN_ANGLE_VARIANCE = math.pi**2
 _UNKNOWN_HEIGHT_M2 = 1e6
-_MAX_VIEW_PX = 640  # longer side of the window's image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,22 +141,3 @@ def diagnostics(messages: MessageFactory, time_ns: int, level: int, text: str, v
     )
     header = messages.header(time_ns, "")
     return messages.make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status])
-
-
-def window_picture(site: OrthoMap, window: Window, fix: Fix | None) -> NDArray[np.uint8]:
-    """The searched part of the map with the fix as a red cross, (H, W, 3) RGB, at most 640 px long."""
-    import cv2
-
-    longest_px = max(window.width_px, window.height_px)
-    level = min(max(math.floor(math.log2(longest_px / _MAX_VIEW_PX)), 0), site.levels - 1)
-    step, (rows, columns) = 2**level, site.level_shape(level)
-    x0, y0 = min(window.x0 // step, columns - 1), min(window.y0 // step, rows - 1)
-    width, height = (math.ceil(side / step) for side in (window.width_px, window.height_px))
-    gray = site.gray(Window(x0, y0, min(width, columns - x0), min(height, rows - y0)), level)
-    scale = min(_MAX_VIEW_PX / max(gray.shape), 1.0)
-    size = max(round(gray.shape[1] * scale), 1), max(round(gray.shape[0] * scale), 1)
-    rgb = np.repeat(cv2.resize(gray, size, interpolation=cv2.INTER_AREA)[:, :, None], 3, axis=2)
-    if fix is not None:
-        x, y = (site.level_from_full(fix.map_xy_px, level) - (x0, y0)) * scale
-        cv2.drawMarker(rgb, (round(float(x)), round(float(y))), (255, 0, 0), cv2.MARKER_CROSS, 15, 1)
-    return np.asarray(rgb, np.uint8)

@@ -23,7 +23,7 @@ from engine.values import Attitude, NoFix, Reason, Window
 from scenematch import CameraInput, MapInput, RosSettings, run_ros_bridge
 from scenematch.bridges.ros import OUTPUTS, RosBridge
 from scenematch.bridges.ros_in import RosTelemetry, RosTopics
-from scenematch.bridges.ros_out import RosOptions, pose, window_picture
+from scenematch.bridges.ros_out import RosOptions, pose
 from scenematch.bridges.vehicle import NedOrigin, VehicleState, north_east_m
 from scenematch.cli.app import run as main
 from scenematch.cli.argument_names import ros_arguments_last
@@ -425,23 +425,6 @@ def test_ardupilot_finds_the_fix_again_and_the_height_drowns_nothing(maker, sim_
     assert not covariance[2, :2].any()
 
 
-def test_the_window_is_shown_with_the_fix_in_it(sim_site):
-    fix = fix_on(sim_site)
-    x, y = (round(v) for v in fix.map_xy_px)
-    window = Window(x - 60, y - 40, 200, 100)
-    shown = window_picture(sim_site, window, fix)
-    assert shown.shape == (100, 200, 3)
-    red = np.argwhere((shown == (255, 0, 0)).all(axis=2))
-    assert np.abs(red.mean(axis=0) - (40, 60)).max() < 1.0
-    plain = window_picture(sim_site, window, None)
-    assert np.array_equal(plain[:, :, 0], sim_site.gray(window))
-    whole = window_picture(sim_site, Window(0, 0, sim_site.width_px, sim_site.height_px), fix)
-    assert max(whole.shape) <= 640
-    share = whole.shape[1] / sim_site.width_px
-    red = np.argwhere((whole == (255, 0, 0)).all(axis=2)).mean(axis=0)
-    assert np.abs(red - np.array([y, x]) * share).max() < 1.5
-
-
 # ----------------------------------------------------------------------------------------------- the bridge
 
 
@@ -480,7 +463,7 @@ def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, node, sim_
     with bridge_of(node, sim_site) as (bridge, seen):
         bridge.telemetry.add("imu", maker.imu(captured_ns, "", 1.0, 2.0, 3.0), 0)
         bridge.on_image(an_image(maker, captured_ns))
-        node.wait_for("window", 1)
+        node.wait_for("diagnostics", 1)
     for output, kind in OUTPUTS.items():
         (message,) = (wired(ros, m) for m in node.of(output))  # each can be sent
         assert message.__msgtype__ == kind
@@ -511,14 +494,6 @@ def test_a_refusal_is_told_and_never_a_pose(maker, node, sim_site):
     assert (stated[0].name, stated[0].message) == ("scenematch: position", f"no fix: {first}")
     assert status.refused == {**{reason.value: 1 for reason in Reason}, "not finite": 2}
     assert {pair.key: pair.value for pair in stated[0].values}["reason"] == first
-
-
-def test_nobody_looks_at_the_window(maker, node, sim_site):
-    node.wanted = False
-    with bridge_of(node, sim_site) as (bridge, _):
-        bridge.on_image(an_image(maker, NOW_NS))
-        node.wait_for("diagnostics", 1)
-    assert not node.of("window")
 
 
 def test_pictures_that_cannot_be_read_are_told(maker, node, sim_site):
@@ -700,7 +675,7 @@ class Rclpy(ModuleType):
 
     def create_publisher(self, kind, topic, depth):
         sent = self.published.setdefault(topic, [])
-        return SimpleNamespace(publish=sent.append, get_subscription_count=lambda: 1, kind=kind)
+        return SimpleNamespace(publish=sent.append, kind=kind)
 
     def create_subscription(self, kind, topic, handler, quality):
         if " " in topic:
@@ -758,9 +733,8 @@ def test_the_ros2_node_hears_and_publishes_until_its_context_ends(rclpy_with, si
     with bridge_of(node, sim_site) as (bridge, _):
         node.spin(bridge.handlers(RosTopics()), bridge.check_input, None)
     assert {topic: len(sent) for topic, sent in rclpy.published.items()} == {
-        "~/pose": 1, "~/fix": 1, "~/window": 1, "/diagnostics": 1,
+        "~/pose": 1, "~/fix": 1, "/diagnostics": 1,
     }  # fmt: skip
-    assert isinstance(rclpy.published["~/window"][0].data, array.array)
     assert rclpy.published["/diagnostics"][0].status[0].level == b"\x00"
     with pytest.raises(KeyboardInterrupt):  # and not "got none within 30 s"
         node.wait_for("/silent", "sensor_msgs/msg/CameraInfo", 5.0)
@@ -832,7 +806,7 @@ class Rospy(ModuleType):
 
     def Publisher(self, topic, kind, queue_size, tcp_nodelay):  # noqa: N802
         sent = self.published.setdefault(topic, [])
-        return SimpleNamespace(publish=sent.append, get_num_connections=lambda: 1)
+        return SimpleNamespace(publish=sent.append)
 
     def Subscriber(self, topic, kind, handler, tcp_nodelay, **options):  # noqa: N802
         self.subscribed[topic] = options
@@ -862,7 +836,7 @@ def test_the_ros1_node_hears_and_publishes(monkeypatch, sim_site):
     with bridge_of(node, sim_site) as (bridge, _):
         node.spin(bridge.handlers(RosTopics()), bridge.check_input, 1.0)
     assert {topic: len(sent) for topic, sent in rospy.published.items()} == {
-        "~pose": 1, "~fix": 1, "~window": 1, "/diagnostics": 1,
+        "~pose": 1, "~fix": 1, "/diagnostics": 1,
     }  # fmt: skip
     assert stamp_ns(rospy.published["~pose"][0]) == NOW_NS
     # By rospy's own buffer pictures would grow old in the socket.

@@ -21,7 +21,7 @@ class StandInNode:
     """A node that keeps what is published, and whose clock stands still."""
 
     def __init__(self, maker):
-        self.messages, self.wanted, self.published, self.changed = maker, True, [], threading.Condition()
+        self.messages, self.published, self.changed = maker, [], threading.Condition()
         self.time_ns = NOW_NS
 
     def now_ns(self):
@@ -31,9 +31,6 @@ class StandInNode:
         with self.changed:
             self.published.append((output, message))
             self.changed.notify_all()
-
-    def has_subscribers(self, output):
-        return self.wanted
 
     def of(self, output):
         """The messages of an output."""

@@ -199,7 +199,7 @@ def ros(
 ) -> None:
     """Run as a node of ROS 1 or ROS 2.
 
-    Subscribes to images, attitude and height; publishes poses, fixes, diagnostics and the searched window. Leave a
+    Subscribes to images, attitude and height; publishes poses, fixes and diagnostics. Leave a
     topic out by giving it an empty name.
 
     Options:

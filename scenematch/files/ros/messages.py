@@ -231,14 +231,12 @@ class MessageFactory:
         find: returns the class of a name such as "sensor_msgs/msg/Image".
         ros1: whether headers have ``seq`` and the fields of calibrations are upper case.
         time: constructs a stamp from seconds and nanoseconds; None uses the class builtin_interfaces/msg/Time.
-        octets: converts the bytes of an image to the stored type.
         octet: converts a single byte to the stored type.
     """
 
     find: Callable[[str], Any]
     ros1: bool
     time: Callable[[int, int], Any] | None = None
-    octets: Callable[[NDArray[np.uint8]], Any] = lambda values: values
     octet: Callable[[int], Any] = int
 
     def make(self, kind: str, /, **fields: Any) -> Any:
@@ -259,20 +257,6 @@ class MessageFactory:
         """A geometry_msgs/Quaternion of an attitude."""
         x, y, z, w = quaternion_xyzw(roll_deg, pitch_deg, heading_deg)
         return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-
-    def image(self, time_ns: int, frame_id: str, pixels: NDArray[np.uint8]) -> Any:
-        """A sensor_msgs/Image of (H, W) grey or (H, W, 3) RGB, uint8."""
-        height, width = pixels.shape[:2]
-        return self.make(
-            "sensor_msgs/msg/Image",
-            header=self.header(time_ns, frame_id),
-            height=height,
-            width=width,
-            encoding="mono8" if pixels.ndim == 2 else "rgb8",
-            is_bigendian=0,
-            step=pixels[0].size,
-            data=self.octets(np.ascontiguousarray(pixels).ravel()),
-        )
 
     def position(self, time_ns: int, frame_id: str, lat_deg: float, lon_deg: float, covariance_m2: Array) -> Any:
         """A sensor_msgs/NavSatFix with covariance (3, 3) of east, north, up; the altitude is NaN, unknown."""
