@@ -18,14 +18,14 @@ from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.values import Frame, Prior, Truth
 from scenematch.files.frames import VIDEO_SUFFIXES, FrameSource, VideoFile, open_frames
 from scenematch.files.geotiff import write_geotiff
-from scenematch.files.logs.readers import AS_LOGGED, LogClock, is_log, open_log, stamp_frames
+from scenematch.files.logs.readers import is_log, open_log, stamp_frames
 from scenematch.files.photos import photo_telemetry
 from scenematch.files.resampling import rows_and_sources_at
 from scenematch.files.ros.bags import BagFrames, is_bag
 from scenematch.files.telemetry import TelemetryRow, open_telemetry, write_telemetry
 from scenematch.files.truth import write_truth
 
-__all__ = ["Flight", "FlightFrame", "LogClock", "open_flight", "write_flight_folder"]
+__all__ = ["Flight", "FlightFrame", "open_flight", "write_flight_folder"]
 
 _JPEG_QUALITY = 95
 
@@ -116,7 +116,9 @@ def open_flight(
     frames: str | Path,
     telemetry: str | Path | None = None,
     camera: Camera | None = None,
-    clock: LogClock = AS_LOGGED,
+    *,
+    frame_stamps: Path | None = None,
+    log_offset_s: float = 0.0,
     image_topic: str | None = None,
     columns: Mapping[str, str] = {},
     odometry_topic: str | None = None,
@@ -129,7 +131,9 @@ def open_flight(
             None uses the bag's own telemetry, the .SRT beside a video, or the EXIF of photographs; without EXIF
             times the images come in natural order and without telemetry.
         camera: checked against the size of the first image.
-        clock: capture times of the frames, if the telemetry is a log.
+        frame_stamps: capture times of the frames, if the telemetry is a log, see
+            :func:`scenematch.files.logs.readers.stamp_frames`.
+        log_offset_s: added to them.
         image_topic: topic of a bag's images; None if there is only one.
         columns: column names of telemetry.csv, by our names in :data:`scenematch.files.telemetry.COLUMNS`.
         odometry_topic: topic of another odometry that provides the velocity, if the telemetry is a bag.
@@ -149,7 +153,7 @@ def open_flight(
     of_gimbal = telemetry is None or Path(telemetry).suffix.lower() == ".srt"
     if telemetry is not None and is_log(telemetry):
         log = open_log(telemetry, odometry_topic)
-        rows, height_sources = rows_and_sources_at(log, *stamp_frames(source, log, clock))
+        rows, height_sources = rows_and_sources_at(log, *stamp_frames(source, log, frame_stamps, log_offset_s))
     elif telemetry is not None:
         _check_is_table(Path(telemetry))
         table = open_telemetry(telemetry, source, source.description, columns)

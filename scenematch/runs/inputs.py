@@ -16,15 +16,14 @@ from engine.values import Prior, Truth
 from scenematch.files.corrections import Corrections
 from scenematch.files.flight import Flight, open_flight, subtitles_beside
 from scenematch.files.frames import VIDEO_SUFFIXES, PictureFolder
-from scenematch.files.logs.readers import LogClock, is_log, is_photographs, open_truth
+from scenematch.files.logs.readers import MAX_OFFSET_S, is_log, is_photographs, open_truth
 from scenematch.files.ros.bags import is_bag
 from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
-from scenematch.runs.arguments import check_every, parse_position
+from scenematch.runs.arguments import check_between, check_every, parse_position
 from scenematch.runs.cameras import CameraInput, check_size
 from scenematch.runs.map_input import MapInput, check_position
 from scenematch.runs.output import SILENT, Progress, StrPath
-from scenematch.runs.renaming import renamed_in_errors
 from scenematch.runs.settings import TrackSettings
 
 FOLDER_LAYOUT = {
@@ -88,8 +87,7 @@ class FlightFiles:
         every: int = 1,
         corrections: Corrections | None = None,
     ) -> None:
-        with renamed_in_errors(offset_s="log_offset_s"):
-            LogClock(offset_s=log_offset_s)
+        check_between("log_offset_s", log_offset_s, -MAX_OFFSET_S, MAX_OFFSET_S)
         camera = CameraInput.of(camera)
         if telemetry is None:
             telemetry = subtitles_beside(frames)
@@ -136,15 +134,6 @@ class FlightFiles:
         there = {name: path for name, path in paths.items() if name not in _OPTIONAL or path.exists()}
         return cls.from_flat(**there)
 
-    @property
-    def has_clock(self) -> bool:
-        """Whether the capture times of the frames are given."""
-        return self.frame_stamps is not None or self.log_offset_s != 0.0
-
-    def clock(self) -> LogClock:
-        """The capture times of the frames, if the telemetry is a log."""
-        return LogClock(self.frame_stamps, self.log_offset_s)
-
     def load_camera(self, flight: Flight, progress: Progress = SILENT) -> Camera:
         """The calibration from a file, a bag or the photographs of the flight."""
         camera = self.camera.load(flight.source, flight.names, image_topic=self.image_topic, progress=progress)
@@ -163,8 +152,8 @@ class FlightFiles:
         if columns and (self.telemetry is None or is_log(self.telemetry)):
             raise OptionError(f"telemetry_columns: expected a table as telemetry, got {self.telemetry}")
         flight = open_flight(
-            self.frames, self.telemetry, clock=self.clock(), image_topic=self.image_topic, columns=columns,
-            odometry_topic=self.odometry_topic,
+            self.frames, self.telemetry, frame_stamps=self.frame_stamps, log_offset_s=self.log_offset_s,
+            image_topic=self.image_topic, columns=columns, odometry_topic=self.odometry_topic,
         )  # fmt: skip
         if not self.corrections.changes_nothing:  # before frames are dropped, because it interpolates between rows
             flight = replace(flight, rows=self.corrections.applied(flight.rows))

@@ -119,7 +119,7 @@ def _record(files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, d
     for name in PATHS:
         given[name] = None if given[name] is None else str(Path(given[name]).resolve())
     given |= {
-        "log_offset_s": files.log_offset_s if files.has_clock else None,
+        "log_offset_s": files.log_offset_s or None,
         "every": files.every if files.every > 1 else None,
         "corrections": None if files.corrections.changes_nothing else asdict(files.corrections),
     }

@@ -23,7 +23,7 @@ from bench.inputs.log_files import (
 from engine.errors import OptionError
 from scenematch.cli.app import run
 from scenematch.files.flight import open_flight
-from scenematch.files.logs.readers import LogClock, open_log, open_truth, stamp_frames
+from scenematch.files.logs.readers import open_log, open_truth, stamp_frames
 from scenematch.files.resampling import MAX_SAMPLE_GAP_NS, interpolate, make_series, rows_and_sources_at
 from scenematch.files.telemetry import read_telemetry, take_off_sigma_m
 from scenematch.files.truth import interpolate_truth, read_truth
@@ -216,7 +216,7 @@ def test_camera_messages_stamp_pictures_in_their_order(pictures, tmp_path):
     assert [row.timestamp_ns for row in flight.rows] == [61 * S, 62 * S, 64 * S + S // 2]
     assert [item.frame.heading_deg for item in flight] == pytest.approx([352.0, 354.0, 359.0])
     assert flight.heights == {"rangefinder": 3}
-    late = open_flight(pictures, log, clock=LogClock(offset_s=0.25))
+    late = open_flight(pictures, log, log_offset_s=0.25)
     assert [row.timestamp_ns for row in late.rows] == [61 * S + S // 4, 62 * S + S // 4, 64 * S + 3 * S // 4]
     more = ulog_flight(tmp_path / "1.ulg", more=[("camera_capture", us, 0) for us in (30_500_000, 31, 31_500_000)])
     assert [row.timestamp_ns for row in open_flight(pictures, more).rows] == [31_000, 61 * S // 2, 63 * S // 2]
@@ -225,10 +225,10 @@ def test_camera_messages_stamp_pictures_in_their_order(pictures, tmp_path):
 def test_a_list_of_frames_stamps_them(pictures, tmp_path):
     log, stamps = dataflash_flight(tmp_path / "1.BIN"), tmp_path / "stamps.csv"
     stamps.write_text("timestamp_ns,frame\n0,1.png\n2500000000,10.png\n")
-    flight = open_flight(pictures, log, clock=LogClock(stamps, 60.0))
+    flight = open_flight(pictures, log, frame_stamps=stamps, log_offset_s=60.0)
     assert [(row.frame, row.timestamp_ns) for row in flight.rows] == [("1.png", 60 * S), ("10.png", 125 * S // 2)]
     assert [row.heading_deg for row in flight.rows] == pytest.approx([350.0, 355.0])
-    message = refusal(open_flight, pictures, log, clock=LogClock(stamps))
+    message = refusal(open_flight, pictures, log, frame_stamps=stamps)
     assert "expected frames taken from 60.000 to 70.000 s of the log, got frames from 0.000 to 2.500 s" in message
     assert "`log_offset_s`" in message
 
@@ -322,7 +322,8 @@ def test_where_nothing_stamps_the_frames_the_message_says_how(pictures, tmp_path
     two = dataflash_flight(tmp_path / "2.BIN", more=cams(61.0, 62.0))
     message = refusal(open_flight, pictures, two)
     assert "expected a camera message for each of 3 pictures, got 2" in message
-    assert "offset_s: expected finite seconds" in refusal(LogClock, None, math.inf, error=OptionError)
+    message = refusal(open_flight, pictures, log, log_offset_s=math.inf, error=OptionError)
+    assert "log_offset_s: expected finite seconds" in message
 
 
 def test_exif_times_stamp_photographs(monkeypatch, pictures, tmp_path):
@@ -330,7 +331,7 @@ def test_exif_times_stamp_photographs(monkeypatch, pictures, tmp_path):
     rows = [SimpleNamespace(timestamp_ns=UTC_NS + k * S, frame=f"{k}.png") for k in (1, 2)]
     monkeypatch.setattr("scenematch.files.logs.readers.photo_telemetry", lambda _: (rows, []))
     source = SimpleNamespace(path=pictures, names=["1.png", "2.png"])
-    stamps_ns, names = stamp_frames(source, log, LogClock(offset_s=-0.5))
+    stamps_ns, names = stamp_frames(source, log, offset_s=-0.5)
     assert (stamps_ns, names) == ([UTC_NS + S // 2, UTC_NS + 3 * S // 2], ["1.png", "2.png"])
 
 

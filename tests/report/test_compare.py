@@ -9,7 +9,6 @@ import pytest
 from engine import OptionError
 from scenematch import FlightFiles, TrackSettings, track
 from scenematch.cli.app import run
-from scenematch.files.logs.readers import LogClock
 from scenematch.files.track import read_track
 from scenematch.runs.comparison import parse_runs
 from tests.support.commands import file_options, refusal
@@ -80,9 +79,9 @@ def test_when_the_frames_of_a_log_were_taken_is_said_as_to_track(flight, tmp_pat
     options = [f"--frames={tmp_path / 'flight.bag'}", f"--telemetry={log}"]
     options += [f"--settings=input.{name}={value}" for name, value in settings.items()]
     assert run(command(flight, tmp_path, *options)) == 0
-    assert (compared[0].clock(), compared[0].image_topic) == (LogClock(stamps, -1.5), "/down")
+    assert (compared[0].frame_stamps, compared[0].log_offset_s, compared[0].image_topic) == (stamps, -1.5, "/down")
     assert run(command(flight, tmp_path)) == 0
-    assert (compared[1].has_clock, compared[1].image_topic) == (False, None)
+    assert (compared[1].frame_stamps, compared[1].log_offset_s, compared[1].image_topic) == (None, 0.0, None)
     assert run(command(flight, tmp_path, "--settings=input.log_offset_s=2")) == 2  # telemetry.csv is no log
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,31 +25,10 @@ LOG_SUFFIXES = tuple(_READERS)
 """Suffixes of flight logs, in lower or upper case."""
 
 
-@dataclass(frozen=True, slots=True)
-class LogClock:
-    """Where to get a flight's capture times if its telemetry is a log.
-
-    Attributes:
-        stamps: CSV file with ``timestamp_ns`` and ``frame``; None uses the times of the video or bag, the numbers
-            of a video's frames in the pictures' names, the log's camera messages, or the photographs' EXIF.
-        offset_s: added to every frame's stamp.
-
-    Raises:
-        OptionError: the offset is not finite.
-    """
-
-    stamps: Path | None = None
-    offset_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.offset_s) and abs(self.offset_s) < 9e9):
-            raise OptionError(f"offset_s: expected finite seconds, got {self.offset_s}")
-
-
+MAX_OFFSET_S = 9e9
+"""Largest offset of the frames' stamps, within 64 bits of nanoseconds."""
 # Of a video's frames: if fewer are numbered without a gap, they were extracted at another rate.
 _SHARE_OF_ALL = 0.9
-AS_LOGGED = LogClock()
-"""The frames' own stamps, without offset."""
 
 
 def is_log(path: str | Path) -> bool:
@@ -89,28 +66,35 @@ def open_log(path: str | Path, odometry_topic: str | None = None) -> FlightLog:
         raise TelemetryError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def stamp_frames(source: FrameSource, log: FlightLog, clock: LogClock = AS_LOGGED) -> tuple[list[int], list[str]]:
+def stamp_frames(
+    source: FrameSource, log: FlightLog, stamps: Path | None = None, offset_s: float = 0.0
+) -> tuple[list[int], list[str]]:
     """Capture time and name of each frame, in the order of time.
 
     Args:
         source: the frames.
         log: the flight log.
-        clock: source of the times, and their offset.
+        stamps: CSV file with ``timestamp_ns`` and ``frame``; None uses the times of the video or bag, the numbers
+            of a video's frames in the pictures' names, the log's camera messages, or the photographs' EXIF.
+        offset_s: added to every frame's stamp.
 
     Returns:
         Stamps in nanoseconds, on the log's clock or in UTC, and names.
 
     Raises:
+        OptionError: the offset is not finite, or longer than 64 bits of nanoseconds.
         TelemetryError: there are no capture times, or the number of camera messages differs from that of images.
     """
-    stamps_ns, names = _unshifted_stamps(source, log, clock)
-    offset_ns = round(clock.offset_s * 1e9)
+    if not abs(offset_s) <= MAX_OFFSET_S:  # NaN fails too
+        raise OptionError(f"log_offset_s: expected finite seconds, got {offset_s}")
+    stamps_ns, names = _unshifted_stamps(source, log, stamps)
+    offset_ns = round(offset_s * 1e9)
     return [stamp_ns + offset_ns for stamp_ns in stamps_ns], names
 
 
-def _unshifted_stamps(source: FrameSource, log: FlightLog, clock: LogClock) -> tuple[list[int], list[str]]:
-    if clock.stamps is not None:
-        rows = read_telemetry(clock.stamps, source, source.description)
+def _unshifted_stamps(source: FrameSource, log: FlightLog, stamps: Path | None) -> tuple[list[int], list[str]]:
+    if stamps is not None:
+        rows = read_telemetry(stamps, source, source.description)
         return [row.timestamp_ns for row in rows], [row.frame for row in rows]
     if isinstance(source, (VideoFile, BagFrames)):
         stamps_ns = source.stamps_ns()
