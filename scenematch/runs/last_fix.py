@@ -1,8 +1,7 @@
-"""What a bridge leaves for the next: its last fix, and the delay that it measured."""
+"""The last fix of a bridge, which the next one starts from."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import mmap
 import os
@@ -13,7 +12,6 @@ from pathlib import Path
 
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Fix, Prior
-from scenematch.bridges.parameters import MAX_DELAY_MS
 
 _MAX_AGE_S = 60.0  # of a position that a bridge may start from
 _VALUES = struct.Struct("=dddd16s")  # latitude, longitude, sigma, monotonic time, boot
@@ -76,24 +74,3 @@ def _boot() -> bytes:
         return bytes.fromhex(_BOOT_ID.read_text(encoding="ascii").strip().replace("-", ""))
     except (OSError, ValueError):
         return bytes(16)
-
-
-def remember_delay(least_age_ms: float | None) -> None:
-    """Store the least age of a fix; None, if the bridge sent none, keeps the stored one."""
-    if least_age_ms is None:
-        return
-    with contextlib.suppress(OSError):  # a home that cannot be written must not end the run
-        _delay_file().parent.mkdir(parents=True, exist_ok=True)
-        _delay_file().write_text(f"{least_age_ms:.0f}\n", encoding="ascii")
-
-
-def measured_delay_ms() -> int | None:
-    """The stored delay, or None."""
-    try:
-        return min(int(_delay_file().read_text(encoding="ascii")), round(MAX_DELAY_MS))
-    except (OSError, ValueError):
-        return None
-
-
-def _delay_file() -> Path:
-    return cache_folder() / "mavlink-delay-ms"

@@ -26,7 +26,7 @@ from scenematch.bridges.pictures import CapturedImage
 from scenematch.bridges.vehicle import NedOrigin
 from scenematch.runs.arguments import check_between, check_choice, check_device, check_unused, parse_position
 from scenematch.runs.bridge_files import BridgeFiles
-from scenematch.runs.last_fix import LastFix, last_fix_file, remember_delay
+from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from scenematch.runs.map_input import check_position
 from scenematch.runs.output import SILENT, Progress
@@ -224,8 +224,6 @@ def run_mavlink_bridge(
             # Ctrl-C is the usual way to stop a camera's bridge and must keep the counts.
             with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
                 _run(bridge, pictures, camera, settings.seconds, progress, beat)
-            if files.camera_source is not None:
-                remember_delay(bridge.status.least_age_ms)
             return bridge.status
 
 

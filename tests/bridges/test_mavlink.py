@@ -54,7 +54,6 @@ from scenematch.bridges.parameters import MESSAGES, MavlinkOptions, parameter_fi
 from scenematch.bridges.pictures import replay
 from scenematch.bridges.vehicle import NedOrigin, VehicleState, north_east_m
 from scenematch.cli.app import run as main
-from scenematch.runs.last_fix import remember_delay
 from tests.support.fixes import a_fix
 from tests.support.paths import ROOT
 from tests.support.waiting import wait_until
@@ -686,13 +685,12 @@ def test_gps_input_stands_beside_a_receiver_as_the_second():
         MavlinkOptions(gps_id=1)
 
 
-def test_the_delay_is_what_the_last_bridge_measured(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_the_delay_is_the_one_that_is_given_and_said(tmp_path, capsys):
     words = ["bridge", "mavlink", "--force", "--write-params", str(tmp_path / "x.param")]
     assert main(words) == 0
     assert "100 ms" in capsys.readouterr().err
-    remember_delay(33.4)
-    assert main(words) == 0
+    assert main([*words, "--settings", "parameters.delay_ms=33"]) == 0
+    assert "33 ms" in capsys.readouterr().err
     assert "VISO_DELAY_MS,33\n" in (tmp_path / "x.param").read_text(encoding="utf-8")
 
 

@@ -70,7 +70,7 @@ def test_files_that_commands_write_are_named(tmp_path, capsys):
     command = ["bridge", "mavlink", "--firmware=px4", f"--write-params={parameters}"]
     assert run([*command, "--settings=parameters.delay_ms=90", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {
-        "parameters": str(parameters), "delay_ms": 90, "delay_source": "given"
+        "parameters": str(parameters), "delay_ms": 90
     }  # fmt: skip
     assert "EKF2_AGP0_DELAY\t90" in parameters.read_text(encoding="utf-8")
     assert spoken(capsys, command, 2)["argument"] == "--write-params"

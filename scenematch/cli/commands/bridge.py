@@ -176,11 +176,12 @@ def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, fo
     """Write the file and say so; returns the next command."""
     from scenematch.runs.mavlink_parameters import write_parameter_file
 
-    written = write_parameter_file(file, autopilot.link(settings), table(settings, "parameters"), force=force)
+    wanted = table(settings, "parameters")
+    write_parameter_file(file, autopilot.link(settings), wanted, force=force)
     if as_json:
-        console.print_json({"parameters": str(file)} | asdict(written))
+        console.print_json({"parameters": str(file), "delay_ms": wanted.delay_ms})
     else:
-        console.say(f"written to {file}, for a delay of {written.delay_ms} ms ({written.delay_source})")
+        console.say(f"written to {file}, for a delay of {wanted.delay_ms} ms")
     return "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE"
 
 
