@@ -36,9 +36,11 @@ def parse_place(name: str, text: str) -> tuple[float, float]:
     """Read LAT,LON.
 
     Raises:
-        OptionError: the text has another form, or a number is out of range.
+        OptionError: the text has another form, such as a place's name, or a number is out of range.
     """
-    lat_deg, lon_deg = _numbers(name, text, "LAT,LON", (2,), "in degrees")
+    is_name = any(part.strip()[:1].isalpha() for part in text.split(","))
+    hint = "; place names are not looked up" if is_name else ""
+    lat_deg, lon_deg = _numbers(name, text, "LAT,LON", (2,), "in degrees or a folder of photographs", hint)
     if not (abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0):
         raise OptionError(f"{name}: expected a place on the Earth, got {text!r}")
     return lat_deg, lon_deg
@@ -79,14 +81,14 @@ def is_in_degrees(bounds: tuple[float, float, float, float]) -> bool:
 
 
 def _numbers(
-    name: str, text: str, form: str, counts: Sequence[int], units: str = "in degrees and metres"
+    name: str, text: str, form: str, counts: Sequence[int], units: str = "in degrees and metres", hint: str = ""
 ) -> list[float]:
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
-        raise OptionError(f"{name}: expected {form} {units}, got {text!r}")
+        raise OptionError(f"{name}: expected {form} {units}, got {text!r}{hint}")
     return numbers
 
 

@@ -15,7 +15,7 @@ from engine.orthomap import OrthoMap
 from engine.values import Prior, Truth
 from scenematch.files.corrections import Corrections
 from scenematch.files.flight import Flight, open_flight, subtitles_beside
-from scenematch.files.frames import VIDEO_SUFFIXES, PictureFolder
+from scenematch.files.frames import VIDEO_SUFFIXES, PictureFolder, opened_picture
 from scenematch.files.logs.readers import MAX_OFFSET_S, is_log, is_photographs, open_truth
 from scenematch.files.ros.bags import is_bag
 from scenematch.files.telemetry import TelemetryRow
@@ -257,29 +257,23 @@ def check_pictures(flight: Flight, camera: Camera, progress: Progress = SILENT) 
         return
     for name in progress.track(flight.names, len(flight), "checking pictures"):
         path = source.path / name
-        size = _decoded_size(str(path))
+        size = _decoded_size(path)
         try:
             check_size(camera, (size[1], size[0]))
         except CalibrationError as error:
             raise CalibrationError(f"{path}: {error}") from None
 
 
-def _decoded_size(path: str) -> tuple[int, int]:
+def _decoded_size(path: Path) -> tuple[int, int]:
     """Width and height; a JPEG is decoded at 1/8 scale, of a PNG the checksums are read, others are decoded."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as picture:
-            size = picture.size
-            if picture.format == "PNG":
-                picture.verify()
-            else:
-                picture.draft("L", (1, 1))
-                picture.load()
-            return size
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
-        reason = "it is no picture" if isinstance(error, UnidentifiedImageError) else str(error)
-        raise TelemetryError(f"{path}: expected a readable picture: {' '.join(reason.split())}") from None
+    with opened_picture(path, str(path)) as picture:
+        size = picture.size
+        if picture.format == "PNG":
+            picture.verify()
+        else:
+            picture.draft("L", (1, 1))
+            picture.load()
+        return size
 
 
 def _check_gimbal(flight: Flight, camera: Camera) -> None:

@@ -200,28 +200,11 @@ def _wanted(settings: FetchSettings, folder: Path, progress: Progress) -> Wanted
     elif radius_m is None:
         raise OptionError("radius_m: expected with LAT,LON; it is optional only with photographs")
     else:
-        place = Place(*_place(settings.around), radius_m)
+        place = Place(*parse_place("around", settings.around), radius_m)
     gsd_m_per_px = GSD_M_PER_PX if gsd_m_per_px is None else gsd_m_per_px
     names = ("max_tiles", "layer", "crs", "image_format", "tile_px", "timeout_s")
     server = {name: getattr(settings, name) for name in names}
     return Wanted(place=place, gsd_m_per_px=gsd_m_per_px, cache=folder, **server)
-
-
-def _place(around: str) -> tuple[float, float]:
-    """LAT,LON, in the right order.
-
-    Raises:
-        OptionError: it is not such a pair; the message explains why a place name is not.
-    """
-    try:
-        return parse_place("around", around)
-    except OptionError:
-        if any(part.strip()[:1].isalpha() for part in around.split(",")):
-            raise OptionError(
-                f"around: expected LAT,LON in degrees or a folder of photographs, got {around!r}; place names "
-                "are not looked up"
-            ) from None
-        raise
 
 
 def _seen_by_photographs(folder: Path) -> tuple[Place, float]:
