@@ -26,7 +26,7 @@ from scenematch.bridges.ros_in import RESTART_NS, RosTelemetry, RosTopics
 from scenematch.bridges.ros_out import RosOptions, diagnostics, pose
 from scenematch.bridges.vehicle import is_finite
 from scenematch.files.ros.bags import QUANTITIES
-from scenematch.files.ros.messages import ODOMETRY_TYPES, MessageFactory, image_from_message, stamp_ns
+from scenematch.files.ros.messages import MessageFactory, image_from_message, stamp_ns
 
 _log = logging.getLogger("scenematch")
 
@@ -128,7 +128,6 @@ class RosBridge:
         self._live = self._start_live()
         self._held = _Held()
         self._image_topic = ""
-        self._odometry_error = ""  # from the last one
         self._said: set[str] = set()  # printed to the terminal, each once
         self._last_ns: int | None = None
         self._last_image_s = time.monotonic()
@@ -154,9 +153,8 @@ class RosBridge:
         handlers: dict[str, tuple[str, Handler]] = {
             topics.image: (topics.image_type, self.on_image),
             topics.imu: (QUANTITIES["imu"].types[0], self.on_imu),
-            topics.odometry: (ODOMETRY_TYPES[topics.odometry_type], self.on_odometry),
         }
-        for name in ("compass", "height", "range", "velocity"):
+        for name in ("compass", "height", "range", "velocity", "odometry"):
             handlers[getattr(topics, name)] = (QUANTITIES[name].types[0], partial(self._store, name))
         return {topic: handler for topic, handler in handlers.items() if topic}
 
@@ -167,16 +165,6 @@ class RosBridge:
         """Store an attitude, and submit the picture that waited for it."""
         self._store("imu", message)
         self._held.release(lambda captured_ns: not self.telemetry.waits_for_attitude(captured_ns))
-
-    def on_odometry(self, message: Any) -> None:
-        """Store the velocity of another odometry; why it cannot be used is reported with every frame."""
-        try:
-            self._store("odometry", message)
-        except EngineError as error:
-            self._odometry_error = str(error)
-            self._say("odometry", f"an odometry cannot be used: {error}")
-        else:
-            self._odometry_error = ""
 
     def on_image(self, message: Any) -> None:
         """Submit the newest picture once its attitude is known; one without a stamp counts as captured now."""
@@ -227,8 +215,6 @@ class RosBridge:
         captured_ns, result = answer.frame.timestamp_ns, answer.result
         assert captured_ns is not None  # set by on_image
         values = {"method": result.method or "", "age_ms": f"{answer.age_ms:.1f}", **_known(answer.frame)}
-        if self._odometry_error:
-            values["odometry"] = self._odometry_error
         if result.score is not None:
             values["score"] = f"{result.score:.3f}"
         if isinstance(result, Fix) and is_finite(result):

@@ -6,11 +6,9 @@ import threading
 from dataclasses import dataclass
 from typing import Any
 
-from engine.errors import OptionError
 from engine.geo import enu_from_body, wrap_heading_deg
 from scenematch.bridges.vehicle import ANGLES, RecentValues, VehicleState, height_above_ground_m, scalar
 from scenematch.files.ros import bags
-from scenematch.files.ros.messages import ODOMETRY_TYPES
 
 __all__ = ["RESTART_NS", "RosTelemetry", "RosTopics"]
 
@@ -33,12 +31,7 @@ class RosTopics:
         range: sensor_msgs/Range along the body's down axis; takes precedence over the height.
         velocity: geometry_msgs/TwistStamped, east and north in m/s; used if there was no odometry in the last half
             second.
-        odometry: another camera's odometry, with its twist along the body.
-        odometry_type: its message, one of :data:`scenematch.files.ros.messages.ODOMETRY_TYPES`: Odometry,
-            TwistWithCovarianceStamped or TwistStamped.
-
-    Raises:
-        OptionError: the odometry has another message type.
+        odometry: nav_msgs/Odometry of another camera, with its twist along the body.
     """
 
     image: str = bags.IMAGE
@@ -49,12 +42,6 @@ class RosTopics:
     range: str = bags.RANGE
     velocity: str = bags.VELOCITY
     odometry: str = ""
-    odometry_type: str = "Odometry"
-
-    def __post_init__(self) -> None:
-        if self.odometry_type not in ODOMETRY_TYPES:
-            known = ", ".join(ODOMETRY_TYPES)
-            raise OptionError(f"odometry_type: expected one of {known}, got {self.odometry_type!r}")
 
     @property
     def image_type(self) -> str:

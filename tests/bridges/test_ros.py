@@ -7,7 +7,6 @@ import signal
 import sys
 import threading
 import time
-from functools import partial
 from types import ModuleType, SimpleNamespace
 from unittest.mock import Mock
 
@@ -30,7 +29,6 @@ from scenematch.cli.argument_names import ros_arguments_last
 from scenematch.files.quaternions import quaternion_xyzw
 from scenematch.files.ros.messages import (
     NO_POSITION,
-    ODOMETRY_TYPES,
     attitude_from_message,
     body_velocity_from_message,
     camera_from_message,
@@ -41,7 +39,7 @@ from scenematch.files.ros.messages import (
 )
 from tests.support.fixes import a_fix
 from tests.support.ground import body_axes
-from tests.support.odometries import odometry_message, twist_message
+from tests.support.odometries import odometry_message
 from tests.support.ros import NOW_NS, STORES, StandInNode, maker_of
 
 
@@ -263,20 +261,13 @@ def test_a_time_that_goes_back_begins_again(maker):
     assert heard.vehicle(NOW_NS).height_agl_m is None
 
 
-@pytest.mark.parametrize(
-    ("make", "frame"),
-    [
-        *((partial(odometry_message, yaw_deg=77.0), {"child": name}) for name in ("base_link", "", "odom")),
-        *((twist_message, {"frame": name}) for name in ("base_link", "/base_link", "uav1/base_link")),
-    ],
-    ids=lambda value: None if callable(value) else str(value),
-)
-def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, make, frame):
+@pytest.mark.parametrize("child", ["base_link", "", "odom"])
+def test_another_odometry_is_turned_by_the_vehicles_own_attitude(ros, maker, child):
     """Wherever the odometry has its own north, and along whichever of the two frames its twist is."""
     rng = np.random.default_rng(5)
     for angles in random_angles(10):
         enu_mps, heard = rng.normal(0.0, 8.0, 3), RosTelemetry()
-        message = make(maker, NOW_NS, angles, enu_mps, **frame)
+        message = odometry_message(maker, NOW_NS, angles, enu_mps, yaw_deg=77.0, child=child)
         heard.add("odometry", wired(ros, message), 0)
         assert heard.vehicle(NOW_NS).east_velocity_mps is None  # towards nobody knows where
         heard.add("imu", maker.imu(NOW_NS, "", *angles), 0)
@@ -337,15 +328,6 @@ def test_an_odometry_that_says_nothing(maker):
     heard.add("odometry", odometry_message(maker, 0, angles, (1.0, 2.0, 3.0)), NOW_NS)  # unstamped, so of now
     assert heard.vehicle(NOW_NS).north_velocity_mps == pytest.approx(2.0)
     assert heard.vehicle(NOW_NS + 600_000_000).north_velocity_mps is None
-
-
-@pytest.mark.parametrize("frame", ["", "odom", "map", "base_link_frd", "dvl_link", "base_link/"])
-def test_a_twist_along_other_axes_is_refused(maker, frame):
-    for variances in (None, (0.04, 0.04, 0.04)):
-        level, velocity = (0.0, 0.0, 0.0), (1.0, 2.0, 0.0)
-        message = twist_message(maker, NOW_NS, level, velocity, frame=frame, variances=variances)
-        with pytest.raises(TelemetryError, match=f"a velocity along base_link .*, got one along {frame!r}"):
-            body_velocity_from_message(message)
 
 
 # ---------------------------------------------------------------------------------------------------- poses
@@ -521,25 +503,6 @@ def test_a_picture_without_a_stamp_is_of_now_and_a_bag_may_begin_again(maker, no
     assert (status.restarts, status.counts.submitted, status.counts.answered) == (1, 3, 3)
 
 
-def test_an_odometry_along_other_axes_is_reported_with_every_frame(ros, maker, node, sim_site, caplog):
-    level = (0.0, 0.0, 0.0)
-    topics = RosTopics(odometry="/vio/twist", odometry_type="TwistWithCovarianceStamped")
-    with bridge_of(node, sim_site) as (bridge, seen):
-        _, heard = bridge.handlers(topics)["/vio/twist"]
-        bridge.on_imu(maker.imu(NOW_NS, "", *level))
-        for k, frame in enumerate(("odom", "odom", "base_link")):
-            message = twist_message(maker, NOW_NS, level, (1.0, 2.0, 0.0), frame=frame, variances=(0.04,) * 3)
-            heard(wired(ros, message))
-            bridge.on_image(an_image(maker, NOW_NS - 3 + k))
-            node.wait_for("diagnostics", k + 1)
-    stated = [{pair.key: pair.value for pair in message.status[0].values} for message in node.of("diagnostics")]
-    assert [each.get("odometry", "") != "" for each in stated] == [True, True, False]
-    assert "along base_link (forward-left-up), got one along 'odom'" in stated[0]["odometry"]
-    assert [each["velocity"] for each in stated] == ["unknown", "unknown", "known"]
-    assert caplog.text.count("an odometry cannot be used: frame_id: expected") == 1
-    assert seen.frames[2].north_velocity_mps == pytest.approx(2.0)
-
-
 def test_compressed_pictures_are_live_too(ros, maker, node, sim_site):
     picture = np.random.default_rng(1).integers(0, 256, (5, 7), dtype=np.uint8)
     with bridge_of(node, sim_site) as (bridge, seen):
@@ -606,13 +569,12 @@ def test_an_empty_name_leaves_a_topic_out(maker, node, sim_site):
         kinds = {topic: kind for topic, (kind, _) in handlers.items()}
         handlers[RosTopics().height][1](maker.float64(42.0))
         assert bridge.telemetry.vehicle(NOW_NS).height_agl_m == 42.0
-        for name, kind in ODOMETRY_TYPES.items():
-            of_type = bridge.handlers(RosTopics(odometry="/vio", odometry_type=name))
-            assert of_type["/vio"][0] == kind
-            assert of_type[RosTopics().velocity][0] == "geometry_msgs/msg/TwistStamped"
+        both = {topic: kind for topic, (kind, _) in bridge.handlers(RosTopics(odometry="/vio")).items()}
+        assert both["/vio"] == "nav_msgs/msg/Odometry"
+        assert both[RosTopics().velocity] == "geometry_msgs/msg/TwistStamped"
     assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height, RosTopics().range}
     known = set(STORES["ros1"].types) & set(STORES["ros2"].types)
-    assert known >= {*kinds.values(), *ODOMETRY_TYPES.values()}
+    assert known >= {*kinds.values(), *both.values()}
 
 
 # ---------------------------------------------------------------------------------- the nodes, on stand-ins
@@ -898,6 +860,5 @@ def test_arguments_of_another_ros_are_refused(capsys, tmp_path):
 def test_the_settings_name_the_topics_of_the_code(capsys):
     assert main(["doctor", "--settings"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert all(name in text for name in ODOMETRY_TYPES)
     for name in RosTopics.__slots__:
         assert getattr(RosTopics(), name) in text

@@ -89,13 +89,11 @@ def test_an_option_that_would_say_nothing_is_refused(command, option, wanted, ca
     assert refusal(capsys, command) == f"{option}: expected with {wanted} only\n"
 
 
-def test_a_topic_is_of_a_bag_an_odometry_of_known_type_and_a_start_on_the_earth(capsys):
+def test_a_topic_is_of_a_bag_and_a_start_on_the_earth(capsys):
     line = refusal(capsys, [*TRACK, "--settings=input.image_topic=/down"])
     assert line == "--settings input.image_topic: expected a bag as frames, got f\n"
     line = refusal(capsys, [*TRACK, "--telemetry=t.csv", "--settings=input.odometry_topic=/vio"])
     assert line == "--settings input.odometry_topic: expected a bag as telemetry, got t.csv\n"
-    given = [*ROS, "--settings=ros.topics.odometry=/vio", "--settings=ros.topics.odometry_type=PoseStamped"]
-    assert refusal(capsys, given).startswith("ros.topics.odometry_type: expected one of Odometry, Twist")
     for start in ("95,35", "33,35,-1"):
         assert refusal(capsys, [*TRACK, f"--start={start}"]).startswith("--start: ")
 

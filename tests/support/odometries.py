@@ -39,25 +39,3 @@ def odometry_message(maker, time_ns, angles_deg, enu_mps, *, yaw_deg=0.0, child=
         pose=make("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=np.zeros(36)),
         twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance),
     )
-
-
-def twist_message(maker, time_ns, angles_deg, enu_mps, *, frame="base_link", variances=None):
-    """The same velocity along the body by itself.
-
-    Args:
-        maker: of messages.
-        time_ns: the stamp.
-        angles_deg: roll, pitch and heading.
-        enu_mps: (3,) velocity east, north, up.
-        frame: that the message states.
-        variances: (3,) with them it is a TwistWithCovarianceStamped, without them a TwistStamped.
-    """
-    along = Rotation.from_quat(quaternion_xyzw(*angles_deg)).inv().apply(enu_mps)
-    zero, header = maker.vector(0.0, 0.0, 0.0), maker.header(time_ns, frame)
-    twist = maker.make("geometry_msgs/msg/Twist", linear=maker.vector(*along), angular=zero)
-    if variances is None:
-        return maker.make("geometry_msgs/msg/TwistStamped", header=header, twist=twist)
-    covariance = np.zeros(36)
-    covariance[[0, 7, 14]] = variances
-    stated = maker.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance)
-    return maker.make("geometry_msgs/msg/TwistWithCovarianceStamped", header=header, twist=stated)

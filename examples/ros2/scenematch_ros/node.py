@@ -10,7 +10,6 @@ from scenematch.bridges.ros2 import Node
 FILES = ("map", "surface", "camera", "start", "origin", "mount")
 """Text parameters; an empty one counts as not given."""
 TOPICS = RosTopics()
-TOPIC_NAMES = [name for name in RosTopics.__slots__ if name != "odometry_type"]
 
 
 class Printed(Progress):
@@ -24,8 +23,7 @@ class Printed(Progress):
 def settings_of(node):
     """The settings from the parameters: for ROS and for matching."""
     text = {name: node.parameter(name, "") or None for name in FILES}
-    topics = {name: node.parameter(f"{name}_topic", getattr(TOPICS, name)) for name in TOPIC_NAMES}
-    topics["odometry_type"] = node.parameter("odometry_type", TOPICS.odometry_type)
+    topics = {name: node.parameter(f"{name}_topic", getattr(TOPICS, name)) for name in RosTopics.__slots__}
     if text["map"] is None:
         raise OptionError("map: expected a file, got nothing; give it as -p map:=site.tif")
     map_sigma_m, hfov_deg = node.parameter("map_sigma_m", 0.0), node.parameter("hfov_deg", 0.0)

@@ -31,7 +31,6 @@ from scenematch.files.resampling import (
     make_series,
 )
 from scenematch.files.ros.messages import (
-    ODOMETRY_TYPES,
     attitude_from_message,
     body_velocity_from_message,
     camera_from_message,
@@ -85,7 +84,7 @@ QUANTITIES = {
     "altitude": Quantity(_FLOAT, lambda message: (message.data,)),
     "velocity": Quantity(("geometry_msgs/msg/TwistStamped",), lambda m: (m.twist.linear.x, m.twist.linear.y)),
     "place": Quantity(("sensor_msgs/msg/NavSatFix",), position_from_message),
-    "odometry": Quantity(tuple(ODOMETRY_TYPES.values()), body_velocity_from_message),
+    "odometry": Quantity(("nav_msgs/msg/Odometry",), body_velocity_from_message),
 }
 """The quantities of a bag's and of a live vehicle's telemetry, by name."""
 
@@ -196,8 +195,7 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
     Args:
         path: the bag.
         truth: whether the ``/truth`` topics replace these, if the bag has them.
-        odometry_topic: another camera's odometry, used for velocity and its accuracy: nav_msgs/Odometry,
-            geometry_msgs/TwistWithCovarianceStamped or TwistStamped.
+        odometry_topic: another camera's nav_msgs/Odometry, used for velocity and its accuracy.
 
     Raises:
         TelemetryError: the bag cannot be read, or has no usable series, or no usable velocity on that topic.
@@ -212,10 +210,7 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
         known: dict[str, list[Sample]] = {name: [] for name in names.values()}
         kinds = {kind for name in known for kind in QUANTITIES[name].types}
         for topic, time_ns, message in _messages(path, reader, set(names), kinds) if names else ():
-            try:
-                numbers = QUANTITIES[names[topic]].values(message)
-            except TelemetryError as error:
-                raise TelemetryError(f"{path}: {topic}: {error}") from None
+            numbers = QUANTITIES[names[topic]].values(message)
             if numbers is not None:
                 known[names[topic]].append((time_ns, numbers))
     if _is_same_mavros(found.get("imu"), found.get("compass")):
@@ -260,7 +255,7 @@ def _odometry_topic(path: Path, reader: Any, topic: str) -> str:
     kinds = QUANTITIES["odometry"].types
     names = _topic_names(reader, kinds)
     if topic not in names:
-        raise TelemetryError(f"{path}: expected {' or '.join(kinds)} on {topic}, got {', '.join(names) or 'none'}")
+        raise TelemetryError(f"{path}: expected {kinds[0]} on {topic}, got {', '.join(names) or 'none'}")
     return topic
 
 

@@ -37,14 +37,6 @@ _FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])  # its own inverse
 _NORM_TOLERANCE = 0.01  # of the squared norm of a quaternion
 _NOT_STATED = -1.0  # first element of a covariance
 _COVARIANCE_KNOWN = 3  # NavSatFix.COVARIANCE_TYPE_KNOWN
-ODOMETRY_TYPES = {
-    "Odometry": "nav_msgs/msg/Odometry",
-    "TwistWithCovarianceStamped": "geometry_msgs/msg/TwistWithCovarianceStamped",
-    "TwistStamped": "geometry_msgs/msg/TwistStamped",
-}
-"""Messages with a velocity along the body, by name."""
-BODY_FRAME = "base_link"
-"""The vehicle's body by REP-105, forward-left-up; a prefix, as in "uav1/base_link", names the vehicle."""
 NO_POSITION = -1
 """NavSatStatus.status of a receiver without a fix."""
 
@@ -151,27 +143,19 @@ def body_velocity_from_message(message: Any) -> tuple[float, float, float, float
     Args:
         message: nav_msgs/Odometry, whose twist is by definition along the axes of ``child_frame_id``, the body's
             (forward-left-up). If some odometry uses the pose's frame for it, the pose's orientation rotates the
-            twist back into the body; the frame's north does not matter. Or
-            geometry_msgs/TwistWithCovarianceStamped or TwistStamped, along the axes of ``header.frame_id``.
+            twist back into the body; the frame's north does not matter.
 
     Returns:
         None if the message has no valid velocity, by
         :func:`scenematch.files.velocities.velocity_sigma_mps`, or no orientation if one is needed. The standard
-        deviation is per axis, and 0 if the covariance is not stated: zeros, -1, not finite, or missing.
-
-    Raises:
-        TelemetryError: the frame of a twist without a pose is not :data:`BODY_FRAME`.
+        deviation is per axis, and 0 if the covariance is not stated: zeros, -1, or not finite.
     """
-    linear, variances = _twist(message)
+    linear = message.twist.twist.linear
     velocity = np.array([linear.x, linear.y, linear.z], np.float64)
+    covariance = np.asarray(message.twist.covariance, np.float64)
+    variances = [0.0] * 3 if covariance[0] == _NOT_STATED else covariance[0:15:7].tolist()
     sigma_mps = velocity_sigma_mps(velocity, variances, turned=True)
-    if not hasattr(message, "child_frame_id"):
-        # A velocity in a world of unknown north, or along a sensor's axes, cannot be rotated.
-        frame_id = message.header.frame_id
-        if frame_id.rpartition("/")[2] != BODY_FRAME:
-            expected = f"a velocity along {BODY_FRAME} (forward-left-up)"
-            raise TelemetryError(f"frame_id: expected {expected}, got one along {frame_id!r}")
-    elif message.child_frame_id and message.child_frame_id == message.header.frame_id:
+    if message.child_frame_id and message.child_frame_id == message.header.frame_id:
         rotation = _rotation(message.pose.pose.orientation)
         if rotation is None:
             return None
@@ -180,15 +164,6 @@ def body_velocity_from_message(message: Any) -> tuple[float, float, float, float
         return None
     forward, right, down = (float(v) for v in _FLU_FROM_FRD @ velocity)
     return forward, right, down, sigma_mps
-
-
-def _twist(message: Any) -> tuple[Any, list[float]]:
-    """The linear velocity of a message and its three variances; zeros if none are stated."""
-    if not hasattr(message.twist, "covariance"):
-        return message.twist.linear, [0.0] * 3
-    covariance = np.asarray(message.twist.covariance, np.float64)
-    unknown = covariance[0] == _NOT_STATED
-    return message.twist.twist.linear, [0.0] * 3 if unknown else covariance[0:15:7].tolist()
 
 
 def _rotation(q: Any) -> Array | None:
