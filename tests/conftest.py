@@ -3,8 +3,6 @@
 What takes long to import is imported by the fixtures: the process that hands tests to workers runs none of them.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Docstrings of public functions that take or return arrays: they say what goes in and what comes out."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The ground floor: budget and clock, the device switch, the values that travel, the tree of errors."""
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import math
@@ -15,28 +13,12 @@ import pytest
 import torch
 
 import engine.errors
-from engine import (
-    Attitude,
-    Budget,
-    DeviceError,
-    DtypeError,
-    EngineError,
-    Fix,
-    Frame,
-    NavigatorOptions,
-    NoFix,
-    OptionError,
-    Prior,
-    Reason,
-    ShapeError,
-    TelemetryError,
-    Timings,
-    Window,
-)
-from engine.budget import Deadline
+from engine.budget import Budget, Deadline
+from engine.errors import DeviceError, DtypeError, EngineError, OptionError, ShapeError, TelemetryError
+from engine.options import NavigatorOptions
 from engine.runtime.device import resolve
 from engine.runtime.threads import set_threads
-from engine.values import Peak
+from engine.values import Attitude, Fix, Frame, NoFix, Peak, Prior, Reason, Timings, Window
 from tests.support.fixes import a_fix
 
 IMAGE = np.zeros((4, 6), np.uint8)

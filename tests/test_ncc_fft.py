@@ -1,7 +1,5 @@
 """Normalised cross-correlation against OpenCV, scikit-image and the reference; its invariants; the peak."""
 
-from __future__ import annotations
-
 import re
 
 import cv2

@@ -1,7 +1,5 @@
 """What ``import engine`` gives and does not load; documents use no other name."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import json

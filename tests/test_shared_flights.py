@@ -1,7 +1,5 @@
 """Recorded flights over two towns and a campus: as accurate as the paper's recipe with tilt, and never wrong."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The adaptive window: equations 4 and 5 in the paper's own figures, the edge of the map, growth in flight."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import assume, example, given

@@ -1,7 +1,5 @@
 """Dense refinement: the pose that a picture was made with is found again, and what cannot be known is said."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The loops of dense refinement and of the plane under a surface, by OpenCV, NumPy and difference quotients."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """Every NCC kernel against the reference, which ``test_ncc_fft`` holds to OpenCV by way of the front door."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Polynomials and bilinear heights by NumPy's and OpenCV's own."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.polynomial.polynomial import polyval2d

@@ -1,7 +1,5 @@
 """Masked NCC: small windows against sums pixel by pixel, whole templates against sums over the whole window."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

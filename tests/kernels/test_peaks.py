@@ -1,7 +1,5 @@
 """The highest places of a surface and the summits between them, on the host and on a device."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The prepared map: what is cut from it is the same however it was prepared, in bounded memory."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Samples of the map: where large levels end, and without a prepared map."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import fields
 from functools import partial

@@ -1,7 +1,5 @@
 """Sigmas of chance and covariance: figures done by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 The frames of :class:`Ground` are drawn ray by ray, so that no homography of the engine checks itself.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from functools import lru_cache

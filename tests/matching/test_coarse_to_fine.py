@@ -5,8 +5,6 @@ coarse to fine it is that of half-resolution scores where the rival cannot win, 
 nodata the peak is that of every place by the masked sums, and wide windows are looked at quickly.
 """
 
-from __future__ import annotations
-
 import math
 
 import cv2

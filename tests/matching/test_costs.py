@@ -1,7 +1,5 @@
 """What steps are thought to cost after the runs that were seen; the clock is the numbers that a test gives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import example, given

@@ -1,7 +1,5 @@
 """What crosses between the host and a GPU, counted on a pretended device; and that its answers are the CPU's."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

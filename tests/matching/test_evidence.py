@@ -1,7 +1,5 @@
 """Log-evidence of poses and peaks: what adds to it, what takes away, and the probability that follows."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The bank of headings and heights, frame by frame over a simulated town: the right place, or a refusal."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Many frames at once: the answers of one at a time, in their order, by processes and by threads."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -14,22 +12,13 @@ import numpy as np
 import pytest
 import torch
 
-from engine import (
-    BackendError,
-    Budget,
-    CalibrationError,
-    Fix,
-    Frame,
-    MatcherOptions,
-    NoFix,
-    OptionError,
-    Prior,
-    Reason,
-    SceneMatcher,
-    SiftOptions,
-)
+from engine import SceneMatcher
+from engine.budget import Budget
+from engine.errors import BackendError, CalibrationError, OptionError
+from engine.options import MatcherOptions, SiftOptions
 from engine.runtime import workers as processes
 from engine.runtime.scheduler import Costs
+from engine.values import Fix, Frame, NoFix, Prior, Reason
 from tests.support.fixes import values_of
 from tests.support.threads import called_at_once
 

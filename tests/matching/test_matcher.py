@@ -1,7 +1,5 @@
 """One frame, one prior, one budget: fixes with a sound covariance, and a reason for every refusal."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial
@@ -12,21 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from engine import (
-    Budget,
-    Camera,
-    DeviceError,
-    Fix,
-    Frame,
-    MatcherOptions,
-    NoFix,
-    OptionError,
-    OrthoMap,
-    Prior,
-    Reason,
-    SceneMatcher,
-)
-from engine.budget import Deadline
+from engine import Camera, OrthoMap, SceneMatcher
+from engine.budget import Budget, Deadline
+from engine.errors import DeviceError, OptionError
 from engine.features import match, sift
 from engine.matching.align import to_gray
 from engine.matching.evidence import Candidate, Evidence, probability
@@ -34,8 +20,8 @@ from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.ncc import Ncc
 from engine.matching.peak_evidence import PeakCandidate
 from engine.matching.query import Query
-from engine.options import AssumedErrors, NccOptions, SiftOptions
-from engine.values import GridPose, Peak
+from engine.options import AssumedErrors, MatcherOptions, NccOptions, SiftOptions
+from engine.values import Fix, Frame, GridPose, NoFix, Peak, Prior, Reason
 from tests.support.fixes import a_fix, px_off, values_of
 from tests.support.ground import Ground
 from tests.support.landmarks import landmarks_of

@@ -1,7 +1,5 @@
 """The paper's stack for ROS 1 and 2: its files agree with each other, with the camera, the map and the node."""
 
-from __future__ import annotations
-
 import importlib.machinery
 import importlib.util
 import math

@@ -1,7 +1,5 @@
 """Over hills: the ground below is found under what stands on it, and a fix lies where the truth is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The scheduler: what is done of each method within a budget, and what is refused before it is begun."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Scores and structure: each is what its line says, respects nodata, finds its place where it is meant to."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The delay of a camera: pictures that lag behind the attitude by a known time."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

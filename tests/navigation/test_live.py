@@ -1,7 +1,5 @@
 """The live pipeline: every frame answered once and in time, the newest first, and no fix under another's stamp."""
 
-from __future__ import annotations
-
 import threading
 import time
 from contextlib import contextmanager

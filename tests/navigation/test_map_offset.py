@@ -1,7 +1,5 @@
 """The map's own error: one for all fixes of a map, and what another source says of it in flight."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

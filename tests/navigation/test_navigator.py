@@ -1,28 +1,16 @@
 """Frames in order: dead reckoning against figures done by hand, loss and re-acquisition, and a whole flight."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from engine import (
-    Attitude,
-    Budget,
-    Fix,
-    MatcherOptions,
-    Navigator,
-    NavigatorOptions,
-    NavigatorState,
-    NoFix,
-    Prior,
-    Reason,
-    SceneMatcher,
-    TelemetryError,
-)
-from engine.options import ACCEPT_ALL
+from engine import Navigator, NavigatorState, SceneMatcher
+from engine.budget import Budget
+from engine.errors import TelemetryError
+from engine.options import ACCEPT_ALL, MatcherOptions, NavigatorOptions
+from engine.values import Attitude, Fix, NoFix, Prior, Reason
 from tests.support import matchers
 from tests.support.fixes import a_fix
 from tests.support.matchers import ScriptedMatcher, a_site, at

@@ -1,7 +1,5 @@
 """Visual odometry: pictures of a plane by two known poses, what must be refused, and dead reckoning by it."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace

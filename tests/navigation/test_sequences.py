@@ -1,7 +1,5 @@
 """Sequences of frames as nobody should send them: each ends in a fix, a refusal or a documented error."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

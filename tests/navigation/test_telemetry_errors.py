@@ -1,7 +1,5 @@
 """Lasting errors of the telemetry: learnt from fixes within their own sigmas, taken off new and late frames."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The guard before the autopilot: a shifted map is not followed, a covered camera is recovered from."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

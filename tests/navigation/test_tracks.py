@@ -1,7 +1,5 @@
 """Tracks: their motion against independent figures, their odds by Bayes' rule, and flights."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Headings count from true north at the place, wherever on the map: near a pole it turns within a street."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

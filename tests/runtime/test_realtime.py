@@ -1,7 +1,5 @@
 """Real time: what the kernel says of a thread that asked for it, and what a refusal says."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """Work divided among threads: in order, whatever fails, and nobody works on after a failure."""
 
-from __future__ import annotations
-
 import threading
 import time
 

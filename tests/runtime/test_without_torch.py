@@ -1,7 +1,5 @@
 """A flight on the CPU loads no torch: the rule that keeps it so, and flights that show it."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The compiled loops of SIFT do what the paper says, written out in float64."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

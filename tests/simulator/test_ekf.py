@@ -1,7 +1,5 @@
 """The reference filter: derivatives against differences, consistency over seeds, and delayed measurements."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

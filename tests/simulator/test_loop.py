@@ -1,7 +1,5 @@
 """The closed loop with a scripted matcher: the vehicle on its plan, and what each fault leads to."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

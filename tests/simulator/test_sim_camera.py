@@ -1,7 +1,5 @@
 """The simulated camera: motion, shutter, lens, exposure and obliquity against what optics and geometry say."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
