@@ -8,13 +8,11 @@ the sensors, and begins at its true place. Prints a row a flight and the counts.
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 
+from bench.command import parser_on_one_thread
 from bench.faults import START_SIGMA_M
 from engine import Prior
-from engine.runtime.threads import set_threads
 from scenematch.check import Diagnosis, diagnose
 from scenematch.simulator import CONDITIONS, FlightStyle, plan_flight
 
@@ -35,11 +33,10 @@ def checked(seed: int, condition: str) -> Diagnosis:
 
 def main() -> None:
     """A row a flight."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("--flights", type=int, default=100)
     parser.add_argument("--first-seed", type=int, default=500)
     wanted = parser.parse_args()
-    set_threads(1)
     alarms = placed = 0
     for count in range(wanted.flights):
         condition = sorted(CONDITIONS)[count % len(CONDITIONS)]

@@ -10,7 +10,6 @@ table of docs/results/wrong-inputs.md.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Iterator
@@ -20,12 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from bench import RESULTS
+from bench.command import parser_on_one_thread
 from bench.inputs.faults import Fault, FlightInputs, faults, load
 from bench.pages.text import rewrite, shown, table
 from engine import Fix, Navigator, Prior, SceneMatcher
 from engine.geo import Array
 from engine.navigation.telemetry_errors import Calibration
-from engine.runtime.threads import set_threads
 from scenematch.check import diagnose
 from scenematch.files.truth import interpolate_truth
 
@@ -191,7 +190,7 @@ def lines_of(cells: list[Cell]) -> list[str]:
 
 def main() -> None:
     """Print a row a cell."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--methods", nargs="*", default=["ncc", "sift", "auto"])
     parser.add_argument("--step", type=int, default=1)
@@ -201,7 +200,6 @@ def main() -> None:
     parser.add_argument("--no-diagnosis", action="store_true")
     parser.add_argument("--docs", type=Path, nargs="?", const=RESULTS)
     wanted = parser.parse_args()
-    set_threads(1)
     begin, cells = time.monotonic(), []
     for folder in wanted.folders:
         inputs = load(folder, wanted.map, wanted.step, wanted.count)

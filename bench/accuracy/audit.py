@@ -8,7 +8,6 @@ are not reported on, prints its weights, and writes nothing.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from bench import RESULTS, SHARED
 from bench.accuracy.flights import STEPS, Recorded, recorded
+from bench.command import parser_on_one_thread
 from bench.inputs.farmland import farmland
 from bench.inputs.scenes import mosaic
 from bench.pages.integrity import auc
@@ -29,7 +29,6 @@ from bench.pages.text import machine, paragraph, table
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.geo import Array
 from engine.matching.align import view_of
-from engine.runtime.threads import set_threads
 from engine.values import Attitude, Window
 from scenematch.check.availability import Audit, audit_site, regressors
 from scenematch.simulator import build_town
@@ -360,12 +359,11 @@ def section(
 
 def main() -> None:
     """Measure, and write the section of the page; or fit."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("--quick", action="store_true", help="few frames")
     parser.add_argument("--fit", action="store_true", help="fit the rule and print its weights")
     parser.add_argument("--page", type=Path, default=PAGE, help="what to rewrite")
     options = parser.parse_args()
-    set_threads(1)
     count = 15 if options.quick else 60
     if options.fit:
         found = all_trials(list(fitted_on()), count, 0)

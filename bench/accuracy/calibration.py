@@ -9,7 +9,6 @@ of the fixes as given, with what ``check`` says taken off, and without the error
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.command import parser_on_one_thread
 from bench.faults import Flown, fly, stamps_of, start_of
 from bench.inputs.faults import FlightInputs, late, lens, load, mounted, raised, turned
 from bench.pages.text import shown
 from engine.navigation.telemetry_errors import Calibration
-from engine.runtime.threads import set_threads
 from scenematch.check import Finding, diagnose
 from scenematch.files.truth import interpolate_truth
 
@@ -163,14 +162,13 @@ def row(error: Error, true: FlightInputs, method: str, right: Flown, found: list
 
 def main() -> None:
     """A row an error and method."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--methods", nargs="*", default=["ncc", "sift"])
     parser.add_argument("--step", type=int, default=1)
     parser.add_argument("--count", type=int, default=400)
     parser.add_argument("--map", default="map.tif")
     wanted = parser.parse_args()
-    set_threads(1)
     for folder in wanted.folders:
         true = load(folder, wanted.map, wanted.step, wanted.count)
         right = {method: fly(true, stamps_of(true), method) for method in wanted.methods}

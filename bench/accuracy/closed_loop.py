@@ -5,11 +5,10 @@
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from pathlib import Path
 
-from engine.runtime.threads import set_threads
+from bench.command import parser_on_one_thread
 from scenematch import ClosedLoopSettings, WorldSettings, fly_closed_loop
 
 FLIGHTS = (
@@ -29,13 +28,12 @@ HEAD = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[31, 32])
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--out", type=Path, help="keeps every flight's folder here")
     parser.add_argument("--flights", type=int, nargs="+", default=list(range(len(FLIGHTS))), help="which of them")
     arguments = parser.parse_args()
-    set_threads(1)
     print("|", " | ".join(HEAD), "|")
     print("|---" * len(HEAD) + "|")
     for seed in arguments.seeds:

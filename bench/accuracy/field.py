@@ -17,17 +17,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from bench import RESULTS, SHARED
+from bench import SHARED
 from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
 from bench.accuracy.flights import MIDDLE, moved_to_middle
+from bench.command import parser_on_one_thread
 from bench.pages import field
 from engine import Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.geo import Array
 from engine.options import ACCEPT_ALL, LearnedOptions
-from engine.runtime.threads import set_threads
 from scenematch import FlightFiles, TrackSettings, track
 from scenematch.files.track import TrackRow, read_track, track_row
 from scenematch.files.truth import interpolate_truth
@@ -212,15 +211,12 @@ def measure(options: argparse.Namespace) -> Iterator[Figures]:
 
 def main() -> None:
     """Measure, print, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--sets", nargs="+", choices=[*REAL, *DRAWN], default=[*REAL, *DRAWN])
     parser.add_argument("--step", type=int, help="every how many frames one is taken, of every set")
     parser.add_argument("--weights", type=Path, nargs="+", default=(), help="of the learned method, else left out")
-    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
-    set_threads(1)
-    cv2.setNumThreads(1)
     rows = []
     for row in measure(options):
         rows.append(row)

@@ -7,19 +7,18 @@ Writes docs/results/flights.md. Recorded flights that are missing are left out; 
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import RESULTS, SHARED
+from bench import SHARED
+from bench.command import parser_on_one_thread
 from bench.inputs.views import FRAMES
 from bench.pages import flights
 from bench.pages.flights import Run
@@ -28,7 +27,6 @@ from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMa
 from engine.geo import enu_from_body
 from engine.navigation.navigator import Matcher
 from engine.options import ACCEPT_ALL, SiftOptions
-from engine.runtime.threads import set_threads
 from engine.values import Attitude, Truth
 from scenematch.files.flight import open_flight
 from scenematch.files.telemetry import ground_amsl_m
@@ -191,11 +189,9 @@ def fly_variants(flight: Recorded) -> Iterator[Run]:
 
 def main() -> None:
     """Fly, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("--quick", action="store_true", help="a few frames of each flight")
-    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page and of its picture")
     options = parser.parse_args()
-    set_threads(1)
     there = [(name, step) for name, step in STEPS.items() if (SHARED / name).is_dir()]
     runs, built_in = [], simulated()
     for name, step in [*there, (built_in.name, built_in.step)]:

@@ -10,7 +10,6 @@ object a row.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Iterator
@@ -22,7 +21,8 @@ import numpy as np
 
 from bench import SHARED
 from bench.accuracy.flights import recorded
-from engine import Camera, Fix, Frame, Navigator, OrthoMap, SceneMatcher, set_threads
+from bench.command import parser_on_one_thread
+from engine import Camera, Fix, Frame, Navigator, OrthoMap, SceneMatcher
 from engine.geo import Array
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import Motion, SensorNoise, build_town, plan_flight
@@ -170,12 +170,11 @@ def rows(seeds: list[int], starts: int, names: tuple[str, ...]) -> Iterator[dict
 
 def main() -> None:
     """Fly and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("--quick", action="store_true", help="one town and six starts")
     parser.add_argument("--starts", type=int, default=40, help="of each flight")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), help="of the towns")
     options = parser.parse_args()
-    set_threads(1)
     seeds, starts, names = options.seeds, options.starts, RECORDED
     if options.quick:
         seeds, starts, names = seeds[:1], 6, RECORDED[:1]

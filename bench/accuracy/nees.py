@@ -9,20 +9,18 @@ table into docs/results/integrity.md.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
-from bench import RESULTS, SHARED
+from bench import SHARED
 from bench.accuracy.flights import MIDDLE, Recorded, moved_to_middle, recorded
+from bench.command import parser_on_one_thread
 from bench.pages.text import paragraph, rewrite, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
 from engine.geo import Array
 from engine.options import AssumedErrors, NccOptions, SiftOptions
-from engine.runtime.threads import set_threads
 from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import plan_flight
@@ -276,14 +274,12 @@ def section(rows: list[Row]) -> list[str]:
 
 def main() -> None:
     """Measure, and write the section."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--docs", type=Path, default=RESULTS)
+    parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument(
         "--flights", nargs="*", default=None, choices=[*TOWNS, *RECORDED], help="print, write nothing"
     )
     parser.add_argument("--map-alone", action="store_true", help="withhold the surface models of these flights")
     options = parser.parse_args()
-    set_threads(1)
     names = options.flights or [*TOWNS, *(name for name in RECORDED if (SHARED / name).exists())]
     rows = measure(names, with_surface=not options.map_alone)
     if options.flights is not None or options.map_alone:

@@ -8,7 +8,6 @@ nust; gazebo-a2 and "built-in" are what the covariance was fitted to.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ import numpy as np
 
 from bench import SHARED
 from bench.accuracy.flights import MIDDLE, START_SIGMA_M, Recorded, moved_to_middle, recorded
+from bench.command import parser_on_one_thread
 from engine import (
     Budget,
     Camera,
@@ -36,7 +36,6 @@ from engine.matching.align import to_gray
 from engine.matching.covariance import map_sigma_of
 from engine.navigation.motion import GroundMotion
 from engine.navigation.odometry import NoMotion, VisualOdometry
-from engine.runtime.threads import set_threads
 from scenematch.report.metrics import Ground
 from scenematch.simulator import plan_flight
 
@@ -291,11 +290,10 @@ def velocity_rows(flight: Recorded, strides: tuple[int, ...]) -> Iterator[str]:
 
 def main() -> None:
     """Fly, and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("flights", nargs="*", default=REPORTED)
     parser.add_argument("--quick", action="store_true", help="the first 20 s of each flight")
     options = parser.parse_args()
-    set_threads(1)
     there = [name for name in options.flights if name == BUILT_IN or (SHARED / name).is_dir()]
     flights = [flight_of(name) for name in there]
     if options.quick:

@@ -8,7 +8,6 @@ is the median distance of the right ones, the time that of one picture on one th
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -21,10 +20,11 @@ from rasterio.windows import Window
 
 from bench import SHARED
 from bench.accuracy.quality import Gray, Keypoints, Quality, ViewPair, judge
+from bench.command import parser_on_one_thread
 from bench.inputs.views import by_homography
 from bench.pages.text import table
 from bench.speed.detectors import keypoints_of_features, keypoints_of_opencv, picture_tensor
-from engine import Frame, set_threads
+from engine import Frame
 from engine.features import sift
 from engine.matching.align import to_gray
 from scenematch.files.flight import open_flight
@@ -95,11 +95,10 @@ def measured(detect: Detect, count: int, pairs: list[ViewPair]) -> tuple[list[Qu
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("--keypoints", type=int, nargs="+", default=[150, 300, 1000])
     parser.add_argument("--data", type=Path, default=SHARED)
     options = parser.parse_args(arguments)
-    set_threads(1)
     pairs = [warped(*picture, *warp) for picture in pictures(options.data) for warp in WARPS]
     sources = list(dict.fromkeys(pair.source for pair in pairs))
     rows = []

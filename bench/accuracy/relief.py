@@ -7,18 +7,13 @@ Writes the table of docs/results/simulator.md, section "Hills", between its mark
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
-import cv2
-
-from bench import RESULTS
 from bench.accuracy.simulated import PAGE, RATE_HZ, WAYS, Run, fly, matchers
+from bench.command import parser_on_one_thread
 from bench.pages.text import machine, paragraph, rewrite, table
-from engine.runtime.threads import set_threads
 from scenematch.simulator import plan_flight
 
 SEEDS = (1, 2, 31, 32, 71)
@@ -72,12 +67,9 @@ def lines(runs: list[tuple[float, Run]]) -> list[str]:
 
 def main() -> None:
     """Fly, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("--quick", action="store_true", help="a few frames over one town with high hills")
-    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
-    set_threads(1)
-    cv2.setNumThreads(1)
     seeds, reliefs_m, frames = (SEEDS[:1], RELIEFS_M[-1:], 5) if options.quick else (SEEDS, RELIEFS_M, None)
     runs = []
     for relief_m, run in flights(seeds, reliefs_m, frames):

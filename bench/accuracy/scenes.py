@@ -9,22 +9,19 @@ start. Writes docs/results/field-simulated.md.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from bench import RESULTS
 from bench.accuracy.field import figures
+from bench.command import parser_on_one_thread
 from bench.pages import scenes as page
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.geo import Array, enu_from_body
-from engine.runtime.threads import set_threads
 from engine.values import Attitude, Truth
 from scenematch.files.track import TrackRow, track_row
 from scenematch.report.metrics import errors_en_m
@@ -219,15 +216,12 @@ def pooled(results: list[Result]) -> page.Row:
 
 def main() -> None:
     """Match, print, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--seeds", type=int, default=2, help="how many towns of each scene")
     parser.add_argument("--quick", action="store_true", help="eight frames of each town")
-    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
-    set_threads(1)
-    cv2.setNumThreads(1)
     results: dict[tuple[str, str, str], list[Result]] = {}
     for name in options.scenes:
         for seed in range(FIRST_SEED, FIRST_SEED + options.seeds):

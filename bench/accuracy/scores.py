@@ -5,20 +5,19 @@ Writes docs/results/scores.md. Every figure comes from the engine's own steps; i
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from bench import RESULTS
 from bench.accuracy.trials import Ground, flown
+from bench.command import parser_on_one_thread
 from bench.inputs.farmland import farmland, vintages
 from bench.pages.text import machine, paragraph, table
 from engine import MatcherOptions, OrthoMap, Prior
@@ -33,7 +32,6 @@ from engine.matching.query import Query
 from engine.ncc_fft import match_template, prepare
 from engine.options import NccOptions
 from engine.runtime.scheduler import Scheduler
-from engine.runtime.threads import set_threads
 from engine.window import level_for
 from scenematch.simulator import plan_flight
 
@@ -219,11 +217,9 @@ Height, heading and tilt are the telemetry's, the prior is up to {PRIOR_OFF_M:.0
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("--page", type=Path, default=RESULTS / "scores.md", help="what to write")
     options = parser.parse_args()
-    set_threads(1)
-    cv2.setNumThreads(1)
     made = "\n".join(paragraph(f"Made by `python -m bench.accuracy.scores` on {machine()}, one thread."))
     options.page.write_text(PAGE.format(made=made) + "\n".join(table(HEAD, measure())), encoding="utf-8")
 

@@ -7,7 +7,6 @@ Writes the tables of docs/results/simulator.md; --sheet draws docs/img/sim-condi
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import time
@@ -20,12 +19,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import DOCS, RESULTS
+from bench import DOCS
+from bench.command import parser_on_one_thread
 from bench.pages.text import machine, paragraph, rewrite, table
 from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.geo import LocalFrame
 from engine.options import ACCEPT_ALL
-from engine.runtime.threads import set_threads
 from engine.values import Attitude
 from scenematch.files.track import track_row
 from scenematch.report.metrics import Ground, summarise
@@ -173,13 +172,10 @@ def _column(name: str, camera: Camera) -> NDArray[np.uint8]:
 
 def main() -> None:
     """Fly, and write the tables; or draw the sheet."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("--quick", action="store_true", help="a few frames over one town")
     parser.add_argument("--sheet", action="store_true", help="draw the frames of every condition, fly nothing")
-    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page")
     options = parser.parse_args()
-    set_threads(1)
-    cv2.setNumThreads(1)
     if options.sheet:
         draw_sheet(DOCS / "img" / "sim-conditions.png")
         return

@@ -8,7 +8,6 @@ Every second match has no answer on its map. Nothing may be fitted on the half "
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,10 +18,10 @@ import numpy as np
 from bench.accuracy.judged import Bench, Row
 from bench.accuracy.trials import Ground, Trial
 from bench.accuracy.years import HALVES, SETS, YearPair, pairs, trial
+from bench.command import parser_on_one_thread
 from bench.pages.integrity import calibration_error
 from bench.pages.text import table
 from engine import NoFix
-from engine.runtime.threads import set_threads
 from engine.window import level_crop
 
 WITHIN_M = 6.0  # nearer than this a rival is the peak itself; a year's measured shift is good to a metre or two
@@ -110,15 +109,13 @@ HEAD = ["set, method", "matches", "best candidate right", "availability", "wrong
 
 def main() -> None:
     """Match, and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("--half", choices=HALVES, default="report")
     parser.add_argument("--set", choices=SETS, help="one of them alone")
     parser.add_argument("--methods", default=f"NCC,{PLAIN}")
     parser.add_argument("--matches", type=int, default=20_000, help="of each set, by each method")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    set_threads(1)
-    cv2.setNumThreads(1)
     cells = []
     for source in [options.set] if options.set else SETS:
         methods = options.methods.split(",")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import random
 import socket
@@ -15,6 +14,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from bench import RESULTS
+from bench.command import parser_on_one_thread
 from bench.live.bridge_counts import RATE_NS, SAMPLE, Growth, Received, free_port, place_off_m
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
 from bench.pages.text import paragraph, rewrite, table
@@ -268,7 +268,7 @@ def hour_rows(r: dict[str, Any]) -> list[list[str]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--write", action="store_true", help="into docs/results/mavlink.md")
     told = parser.parse_args()
@@ -280,9 +280,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    import cv2
     import torch
 
     torch.set_num_threads(1)
-    cv2.setNumThreads(1)
     main()

@@ -9,7 +9,6 @@ Figures go to .benchmarks/latency.json, section by section; ``all`` writes docs/
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import time
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import RESULTS, ROOT
+from bench.command import parser_on_one_thread
 from bench.live.burden import PERIOD_S, hogs, throttle
 from bench.live.embedded import embedded
 from bench.live.endless import Course, draw, fly, summary, warm
@@ -126,12 +126,11 @@ QUICK_DRAWN = 24
 
 def main() -> None:
     """Measure what is asked for, keep the figures, and write the page of a whole run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("section", nargs="?", default="all", choices=[*SECTIONS, "all"])
     parser.add_argument("--quick", action="store_true", help="a few frames of everything: does it run?")
     parser.add_argument("--docs", type=Path, help="folder of the page; docs/results, and .benchmarks if quick")
     options = parser.parse_args()
-    set_threads(1)
     course = draw(QUICK_DRAWN if options.quick else None)
     kept = JSON.with_stem("latency-quick") if options.quick else JSON
     whole = options.section == "all"

@@ -7,7 +7,6 @@ Beside the run it measures the stages of a frame, in a process of its own.
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from bench import RESULTS
+from bench.command import parser_on_one_thread
 from bench.pages import sift
 from bench.pages.text import machine, paragraph, table_of
 from bench.speed import stages
-from engine.runtime.threads import set_threads
 
 BASELINE = {"peak": "OpenCV", "step": "OpenCV", "hypotheses": "OpenCV loop"}
 INTRO = (
@@ -30,13 +28,11 @@ INTRO = (
 
 def main() -> None:
     """Read the run, measure the rest, write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("run", type=Path, help="what pytest-benchmark wrote")
     parser.add_argument("--quick", action="store_true", help="leave out the stages of a frame")
-    parser.add_argument("--docs", type=Path, default=RESULTS, help="folder of the page and of its pictures")
     options = parser.parse_args()
     run = json.loads(options.run.read_text(encoding="utf-8"))
-    set_threads(1)
     rows = [_row(entry) for entry in run["benchmarks"]]
     flown = [] if options.quick else stages.in_own_process()
     charts = sift.charts(rows)
