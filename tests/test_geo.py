@@ -24,6 +24,7 @@ from engine.geo import (
     wrap_difference_deg,
     wrap_heading_deg,
 )
+from tests.support.ground import body_axes
 
 LATITUDES = st.floats(-90.0, 90.0)
 LONGITUDES = st.floats(-180.0, 180.0)
@@ -87,26 +88,12 @@ def test_true_north_is_where_a_step_of_latitude_leads(lat_deg, lon_deg, away_lat
     assert abs(math.remainder(frame.convergence_deg(lat, lon) - expected, 360.0)) < 1e-5
 
 
-FORWARD, RIGHT, DOWN = np.eye(3)
-
-
-C, S = math.cos(math.radians(20.0)), math.sin(math.radians(20.0))
-
-
-@pytest.mark.parametrize(
-    ("angles_deg", "axis", "expected"),
-    [
-        ((0.0, 0.0, 0.0), FORWARD, [0, 1, 0]),
-        ((0.0, 0.0, 90.0), FORWARD, [1, 0, 0]),  # the heading turns clockwise from north
-        ((0.0, 0.0, 180.0), FORWARD, [0, -1, 0]),
-        ((0.0, 0.0, 270.0), DOWN, [0, 0, -1]),
-        ((0.0, 20.0, 0.0), FORWARD, [0, C, S]),  # positive pitch lifts the nose
-        ((20.0, 0.0, 0.0), RIGHT, [C, 0, -S]),  # positive roll lowers the right side
-        ((35.0, 20.0, 90.0), FORWARD, [C, 0, S]),  # the roll is about the nose, and leaves it where it is
-    ],
-)
-def test_angles_turn_heading_then_pitch_then_roll(angles_deg, axis, expected):
-    np.testing.assert_allclose(enu_from_body(*angles_deg) @ axis, expected, atol=1e-12)
+@given(st.floats(-180.0, 180.0), st.floats(-90.0, 90.0), st.floats(0.0, 360.0))
+def test_angles_turn_heading_then_pitch_then_roll(roll_deg, pitch_deg, heading_deg):
+    """Clockwise from north, the nose up, the right side down: axis by axis, as the drawn grounds turn theirs."""
+    forward, right, down = body_axes(roll_deg, pitch_deg, heading_deg)
+    found = enu_from_body(roll_deg, pitch_deg, heading_deg)
+    np.testing.assert_allclose(found, np.stack([forward, right, down], axis=1), atol=1e-12)
 
 
 @given(st.floats(-179.0, 179.0), st.floats(-89.0, 89.0), st.floats(0.0, 359.999))

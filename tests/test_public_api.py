@@ -4,12 +4,11 @@ import ast
 import importlib
 import json
 import re
-import subprocess
-import sys
 
 import pytest
 
 import engine
+from tests.support.interpreters import done_by
 from tests.support.paths import ROOT
 
 PUBLIC = [
@@ -53,7 +52,7 @@ def fresh():
         "import scenematch.runs.tracking, scenematch.runs.closed_loop, scenematch.runs.mavlink_bridge; "
         "found['rerun'] = 'rerun' in sys.modules; print('REPORT', json.dumps(found))"
     )
-    done = subprocess.run([sys.executable, "-c", report], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = done_by(report)
     before, _, found = done.stdout.partition("REPORT ")
     return {"printed": before + done.stderr, **json.loads(found)}
 

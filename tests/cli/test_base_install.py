@@ -1,7 +1,6 @@
 """What an installation without extras does: all that a vehicle needs; the rest names the extra that it needs."""
 
 import json
-import subprocess
 import sys
 import tomllib
 
@@ -9,6 +8,7 @@ import pytest
 
 from scenematch.cli.app import run
 from tests.support.commands import file_options
+from tests.support.interpreters import done_by
 from tests.support.paths import ROOT
 
 OF_DESKS = ("matplotlib",)
@@ -27,7 +27,7 @@ print("CODES", json.dumps([run(line) for line in {lines}]))
 def run_without(lines):
     """Exit codes of commands in a new interpreter that has none of these packages, and what they said."""
     program = PROGRAM.format(absent=OF_DESKS, lines=[[str(word) for word in line] for line in lines])
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = done_by(program)
     return json.loads(done.stdout.rpartition("CODES ")[2]), done.stderr
 
 

@@ -115,14 +115,6 @@ def test_json_is_all_there_is_on_standard_output(flight, tmp_path, capsys):
     assert {row["deadline_met"] for row in cells(out / "track.csv")} == {"true"}
 
 
-def test_evaluate_reproduces_the_summary(done, tmp_path, capsys):
-    folder = Path(shutil.copytree(done, tmp_path / "again"))
-    before = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    assert run(["evaluate", str(folder), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == before
-    assert json.loads((folder / "summary.json").read_text(encoding="utf-8")) == before
-
-
 def test_a_truth_of_other_times_is_named_with_both_and_counts_no_false_fix(done, flight, tmp_path, capsys):
     folder = Path(shutil.copytree(done, tmp_path / "again"))
     late = Path(shutil.copy(flight / "truth.csv", tmp_path / "late.csv"))

@@ -3,14 +3,12 @@
 import json
 import os
 import re
-import subprocess
-import sys
 
 import pytest
 
 from scenematch.cli.app import run
 from tests.support.commands import COMMANDS
-from tests.support.paths import ROOT
+from tests.support.interpreters import done_by
 
 HEAVY = ("torch", "numba", "numpy", "cv2", "rasterio", "pyproj", "matplotlib", "kornia", "PIL", "rich")
 MATCHING = ("torch", "kornia", "matplotlib")
@@ -23,8 +21,7 @@ def loaded_after(lines):
         f"codes = [run(line) for line in {lines}]; assert not any(codes), codes; "
         "print('LOADED', json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True)
-    printed, _, loaded = done.stdout.partition("LOADED ")
+    printed, _, loaded = done_by(program).stdout.partition("LOADED ")
     return printed, set(json.loads(loaded))
 
 
@@ -53,12 +50,9 @@ def test_completion_loads_nothing_that_only_work_needs():
         "sys.argv[0] = 'scenematch'; from scenematch.cli import main; main()"
     )
     asked = {"_SCENEMATCH_COMPLETE": "complete_bash", "COMP_WORDS": "scenematch bridge mavl", "COMP_CWORD": "2"}
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True, text=True, cwd=ROOT, check=True, env=os.environ | asked,
-    )  # fmt: skip
-    assert done.stdout.split("HEAVY")[0].split() == ["mavlink"]
-    assert done.stdout.endswith("HEAVY []\n")
+    printed = done_by(program, env=os.environ | asked).stdout
+    assert printed.split("HEAVY")[0].split() == ["mavlink"]
+    assert printed.endswith("HEAVY []\n")
 
 
 @pytest.mark.slow

@@ -455,5 +455,6 @@ def test_a_flight_is_followed_by_its_log_and_scored_by_it(flight_in, tmp_path, c
     before = [(out / name).read_bytes() for name in ("report.html", "summary.json")]
     assert b"No frames are shown" not in before[0]
     assert all(word in before[0] for word in (str(stamps).encode(), b"<td>log offset (s)</td>", b"map sigma (m)"))
-    assert run(["evaluate", str(out)]) == 0
+    assert run(["evaluate", str(out), "--json"]) == 0
+    assert json.loads(capfd.readouterr().out) == summary
     assert [(out / name).read_bytes() for name in ("report.html", "summary.json")] == before

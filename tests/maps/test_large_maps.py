@@ -263,9 +263,7 @@ def opened(picture, tmp_path):
     return open_picture
 
 
-@pytest.mark.parametrize(("picture", "copies"), [("metric", False), ("in degrees", True)], indirect=["picture"])
-def test_a_small_map_is_copied_only_where_it_is_resampled(opened, copies):
-    assert bool(opened()[1]) == copies
+def test_a_small_map_in_metres_is_not_copied(opened):
     assert opened()[1] == []
 
 

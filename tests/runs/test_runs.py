@@ -1,6 +1,5 @@
 """Runs as a library: a flight tracked in three lines of Python, what it reports, and errors by argument."""
 
-import subprocess
 import sys
 from functools import partial
 
@@ -19,6 +18,7 @@ from scenematch.files.track import read_track
 from scenematch.files.truth import read_truth
 from scenematch.runs.inputs import FOLDER_LAYOUT
 from tests.support.dark_flight import dark_flight
+from tests.support.interpreters import done_by
 from tests.support.refusals import refusal
 
 FRAMES = 3
@@ -139,8 +139,7 @@ def test_the_library_imports_nothing_optional_and_no_command_line():
         "import sys; from scenematch import *; wanted = "
         "{'rerun', 'pymavlink', 'serial', 'rospy', 'rclpy', 'rosbags', 'pyulog', 'rich', 'typer'}; "
     )
-    done = subprocess.run([sys.executable, "-c", script + loaded], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == ""
+    assert done_by(script + loaded).stdout.strip() == ""
 
 
 # ------------------------------------------------------------------------------------- extras that are missing

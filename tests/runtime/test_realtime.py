@@ -3,7 +3,6 @@
 import json
 import logging
 import os
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -14,7 +13,7 @@ from engine import BackendError, Live, LiveOptions, OptionError
 from engine.runtime import realtime as module
 from engine.runtime.realtime import LoadWatch, Realtime, check_realtime, limited_share, set_realtime, start_thread
 from scenematch.runs.mavlink_bridge import BridgeSettings
-from tests.support.paths import ROOT
+from tests.support.interpreters import done_by
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="real time is Linux's")
 PLAIN = Realtime(lock_memory=False)
@@ -28,32 +27,24 @@ def permitted(realtime: Realtime) -> bool:
     return True
 
 
-def run(code: str) -> str:
-    """What a process of its own prints: memory that is locked stays so."""
-    command = [sys.executable, "-c", code]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True).stdout
-
-
 @linux
 @pytest.mark.skipif(not permitted(Realtime()), reason="real time is not permitted here")
 def test_policy_cores_and_memory_are_set_and_not_inherited():
     core = min(os.sched_getaffinity(0))
-    seen = json.loads(
-        run(
-            "import json, os, subprocess, sys, threading\n"
-            "from engine import Realtime, set_realtime\n"
-            f"set_realtime(Realtime(priority=7, cores=({core},)))\n"
-            "own = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority, list(os.sched_getaffinity(0))\n"
-            "other = []\n"
-            "thread = threading.Thread(target=lambda: other.append(os.sched_getscheduler(0)))\n"
-            "thread.start(); thread.join()\n"
-            "asks = [sys.executable, '-c', 'import os; print(os.sched_getscheduler(0))']\n"
-            "child = subprocess.run(asks, capture_output=True, text=True)\n"
-            "locked = open('/proc/self/status').read().split('VmLck:')[1].split()[0]\n"
-            "print(json.dumps([own, other, int(child.stdout), int(locked)]))"
-        )
+    done = done_by(  # memory that is locked stays so
+        "import json, os, subprocess, sys, threading\n"
+        "from engine import Realtime, set_realtime\n"
+        f"set_realtime(Realtime(priority=7, cores=({core},)))\n"
+        "own = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority, list(os.sched_getaffinity(0))\n"
+        "other = []\n"
+        "thread = threading.Thread(target=lambda: other.append(os.sched_getscheduler(0)))\n"
+        "thread.start(); thread.join()\n"
+        "asks = [sys.executable, '-c', 'import os; print(os.sched_getscheduler(0))']\n"
+        "child = subprocess.run(asks, capture_output=True, text=True)\n"
+        "locked = open('/proc/self/status').read().split('VmLck:')[1].split()[0]\n"
+        "print(json.dumps([own, other, int(child.stdout), int(locked)]))"
     )
-    (policy, priority, cores), (thread,), child, locked_kib = seen
+    (policy, priority, cores), (thread,), child, locked_kib = json.loads(done.stdout)
     assert policy == os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
     assert (priority, cores) == (7, [core])
     assert (thread, child) == (os.SCHED_OTHER, os.SCHED_OTHER)

@@ -1,13 +1,12 @@
 """A flight on the CPU loads no torch: the rule that keeps it so, and flights that show it."""
 
 import ast
-import subprocess
-import sys
 from collections.abc import Iterator
 
 import pytest
 
 from tests.support.commands import file_options
+from tests.support.interpreters import done_by
 from tests.support.paths import ROOT
 
 ENGINE = ROOT / "engine"
@@ -35,9 +34,7 @@ for method in sys.argv[1:]:
 
 
 def run(program, *words):
-    command = [sys.executable, "-c", program + SAY, *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
-    return done.stdout.split()
+    return done_by(program + SAY, *words).stdout.split()
 
 
 def imported(node: ast.AST) -> Iterator[str]:
