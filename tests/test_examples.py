@@ -11,7 +11,6 @@ import time
 import types
 from contextlib import suppress
 from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -186,30 +185,25 @@ def test_a_camera_is_followed(name, flight, monkeypatch):
 @pytest.mark.slow
 def test_in_ros_the_topics_are_heard_and_every_picture_is_answered(flight, monkeypatch, capsys):
     """A node without ROS plays one picture and keeps what is published."""
-    typesys = pytest.importorskip("rosbags.typesys", reason="rosbags is not installed")
-    from bench.inputs.bags import BagMessages
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    from tests.support.ros import NOW_NS, StandInNode, maker_of
 
-    types_of = typesys.get_typestore(typesys.Stores.ROS1_NOETIC).types
-    node = SimpleNamespace(messages=BagMessages(types_of.__getitem__, True), published=[], topics={})
+    node, topics = StandInNode(maker_of("ros1")), {}
 
     def spin(handlers, beat, seconds):
-        node.topics.update({topic: kind for topic, (kind, _) in handlers.items()})
-        picture = node.messages.image(1_000_000_000, "camera", np.zeros((300, 300), np.uint8))
-        handlers["/down/image_raw"][1](picture)
-        end = time.monotonic() + 60.0
-        while not node.published and time.monotonic() < end:
-            time.sleep(0.01)
+        topics.update({topic: kind for topic, (kind, _) in handlers.items()})
+        handlers["/down/image_raw"][1](node.messages.image(NOW_NS, "camera", np.zeros((300, 300), np.uint8)))
+        node.wait_for("diagnostics", 1)
         beat()
 
-    node.now_ns, node.spin = lambda: 1_000_000_000, spin
-    node.publish = lambda output, message: node.published.append(output)
+    node.spin = spin
     module = types.ModuleType("scenematch.bridges.ros1")
     module.Node = lambda name, arguments=(): node
     monkeypatch.setitem(sys.modules, "scenematch.bridges.ros1", module)
     monkeypatch.setattr(sys, "argv", ["in_ros.py", "1"])
     monkeypatch.chdir(flight)
     runpy.run_path(str(EXAMPLES / "in_ros.py"))
-    assert node.topics["/down/image_raw"] == "sensor_msgs/msg/Image"
-    assert "/mavros/global_position/compass_hdg" not in node.topics
-    assert node.published == ["diagnostics"]  # a black picture has no pose
+    assert topics["/down/image_raw"] == "sensor_msgs/msg/Image"
+    assert "/mavros/global_position/compass_hdg" not in topics
+    assert [output for output, _ in node.published] == ["diagnostics"]  # a black picture has no pose
     assert re.search(r"answered=1\b", capsys.readouterr().out)

@@ -9,7 +9,6 @@ from PIL import Image
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
-from rosbags.rosbag2 import Writer as Writer2
 from rosbags.serde import utils as serde_utils
 
 from bench.inputs.bags import BAG_KINDS, write_bag
@@ -21,7 +20,7 @@ from scenematch.files.ros.bags import CAMERA_INFO, IMAGE, BagFrames, is_bag, rea
 from scenematch.runs.inputs import FlightFiles
 from tests.support.odometries import odometry_message
 from tests.support.refusals import refusal
-from tests.support.ros import STORES, maker_of
+from tests.support.ros import maker_of, written
 
 STEP_NS = 100_000_000
 compiled = cache(partial(compile, filename="<message>", mode="exec"))
@@ -126,22 +125,6 @@ def test_others_read_what_is_written(bag):
     assert (first.header.stamp.sec, first.header.stamp.nanosec) == (1_700_000_000, 123_456_789)
     compass = [message.data for _, message in found["/mavros/global_position/compass_hdg"]]
     assert compass == [frame.heading_deg for frame in frames]
-
-
-def written(path, topics, set_up=lambda writer: None):
-    """A bag with messages by topic, (time_ns, message): of ROS 1 where its name is one, else a folder of ROS 2."""
-    ros1 = path.suffix == ".bag"
-    types = STORES["ros1" if ros1 else "ros2"]
-    serialize = types.serialize_ros1 if ros1 else types.serialize_cdr
-    writer = Writer1(path) if ros1 else Writer2(path, version=9)
-    set_up(writer)
-    with writer:
-        for topic, messages in topics.items():
-            name = messages[0][1].__msgtype__
-            connection = writer.add_connection(topic, name, typestore=types)
-            for time_ns, message in messages:
-                writer.write(connection, time_ns, serialize(message, name))
-    return path
 
 
 @pytest.fixture

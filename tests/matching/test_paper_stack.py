@@ -11,11 +11,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import yaml
-from rosbags.rosbag1 import Writer
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from bench.inputs.bags import BagMessages
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import LocalFrame
@@ -25,6 +22,7 @@ from scenematch.bridges.vehicle import NedOrigin, north_east_m
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.quaternions import quaternion_xyzw
 from tests.support.paths import ROOT
+from tests.support.ros import maker_of, written
 
 STACK, ROS2 = ROOT / "examples" / "paper-stack", ROOT / "examples" / "ros2"
 SUFFIXES = (".launch", ".world", ".sdf", ".xml", ".config")
@@ -221,21 +219,15 @@ def test_the_truths_attitude_is_turned_from_north_west_to_east_north(truth_scrip
 
 
 def test_positions_in_a_bag_are_compared_with_its_truth(tmp_path, capsys, monkeypatch):
-    types = get_typestore(Stores.ROS1_NOETIC)
-    maker = BagMessages(types.types.__getitem__, True)
-    frame, connections = LocalFrame(48.0, 15.0), {}
+    maker, frame, stamps_ns = maker_of("ros1"), LocalFrame(48.0, 15.0), [10**9 + k * 10**8 for k in range(20)]
     off_m = {"/truth/fix": 0.0, "/scenematch/fix": 1.5, "/mavros/global_position/global": 6.0}
-    with Writer(tmp_path / "flight.bag") as writer:
-        for k in range(20):
-            time_ns = 10**9 + k * 10**8
-            messages = {"/truth/height_agl": maker.float64(100.0)}
-            for topic, north_m in off_m.items():
-                place = map(float, frame.geodetic_from_enu(7.0 * k, north_m))
-                messages[topic] = maker.position(time_ns, "", *place, np.eye(3))
-            for topic, message in messages.items():
-                if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=types)
-                writer.write(connections[topic], time_ns, types.serialize_ros1(message, message.__msgtype__))
+    topics = {"/truth/height_agl": [(time_ns, maker.float64(100.0)) for time_ns in stamps_ns]}
+    for topic, north_m in off_m.items():
+        places = [map(float, frame.geodetic_from_enu(7.0 * k, north_m)) for k in range(20)]
+        topics[topic] = [
+            (t, maker.position(t, "", *at, np.eye(3))) for t, at in zip(stamps_ns, places, strict=True)
+        ]
+    written(tmp_path / "flight.bag", topics)
     monkeypatch.setattr(sys, "argv", ["compare", str(tmp_path / "flight.bag")])
     loaded(STACK / "scripts/compare").main()
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[1:]]

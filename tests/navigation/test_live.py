@@ -14,6 +14,7 @@ from engine.navigation.live import Live, LiveOptions
 from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason
 from tests.support.fixes import a_fix
+from tests.support.waiting import wait_until
 
 IMAGE = np.zeros((4, 4), np.uint8)
 OPTIONS = NavigatorOptions(max_speed_mps=16.0)
@@ -92,13 +93,6 @@ def reasons(answers):
 
 def no_threads():
     return not [thread for thread in threading.enumerate() if thread.name.startswith("scenematch-_")]
-
-
-def wait_until(condition, timeout_s: float = 60.0):
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end, "it did not come to that"
-        time.sleep(0.005)
 
 
 def wait_for(answers, count: int):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from bench.inputs.bags import BagMessages
@@ -15,6 +17,22 @@ NOW_NS = 1_700_000_000_123_456_789
 def maker_of(ros):
     """What makes the messages of a ROS."""
     return BagMessages(STORES[ros].types.__getitem__, ros == "ros1")
+
+
+def written(path, topics, set_up=lambda writer: None):
+    """A bag with messages by topic, (time_ns, message): of ROS 1 where its name is one, else a folder of ROS 2."""
+    ros1 = path.suffix == ".bag"
+    types = STORES["ros1" if ros1 else "ros2"]
+    serialize = types.serialize_ros1 if ros1 else types.serialize_cdr
+    writer = Writer1(path) if ros1 else Writer2(path, version=9)
+    set_up(writer)
+    with writer:
+        for topic, messages in topics.items():
+            name = messages[0][1].__msgtype__
+            connection = writer.add_connection(topic, name, typestore=types)
+            for time_ns, message in messages:
+                writer.write(connection, time_ns, serialize(message, name))
+    return path
 
 
 class StandInNode:
