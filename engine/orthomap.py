@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from engine.errors import MapError
 from engine.maps.colour import read_colour
 from engine.maps.georeference import Georeference
-from engine.maps.grids import Array, Grid, metric_grid, warp_between
+from engine.maps.grids import Array, Grid, metric_grid, pixels_between
 from engine.maps.metric_copy import ProgressCallback, open_readable
 from engine.maps.pyramid import ArrayReader, Pyramid, Reader, check_arrays
 from engine.maps.rasters import (
@@ -167,13 +167,14 @@ class OrthoMap(Georeference):
         site.georeference_sigma_m = stated_sigma(georeference_sigma_m, None, GEOREFERENCE_TAG)
         site.slope_sigma_deg = stated_sigma(slope_sigma_deg, None, SLOPE_TAG)
         if heights is not None:
-            site._attach(SurfaceModel(heights, warp_between(grid, grid)), grid)
+            site._attach(SurfaceModel(heights, pixels_between(grid, grid)), grid)
         return site
 
     def _attach(self, surface: SurfaceModel, surface_grid: Grid) -> None:
         known = self._known_heights(surface, self._grid.lattice(257))
         if known.size < _MIN_KNOWN:  # a surface of a small part of the map, or a map of small parts
-            known = self._known_heights(surface, warp_between(surface_grid, self._grid)(surface_grid.lattice(257)))
+            to_map = pixels_between(surface_grid, self._grid)
+            known = self._known_heights(surface, to_map(surface_grid.lattice(257)))
         if known.size == 0:
             raise MapError("surface: expected known heights under the valid part of the map, got none")
         self._surface, self.has_surface = surface, True
