@@ -22,12 +22,13 @@ from engine.maps.colour import read_colour
 from engine.maps.georeference import Georeference
 from engine.maps.grids import Array, Grid, metric_grid, pixels_between
 from engine.maps.metric_copy import ProgressCallback, open_readable
-from engine.maps.pyramid import ArrayReader, Pyramid, Reader, check_arrays
+from engine.maps.pyramid import Pyramid, check_arrays
 from engine.maps.rasters import (
     GEOREFERENCE_TAG,
     SLOPE_TAG,
     Bounds,
     Gray,
+    GrayReader,
     Mask,
     Source,
     open_source,
@@ -67,7 +68,12 @@ class OrthoMap(Georeference):
     """
 
     def __init__(
-        self, name: str, grid: Grid, reader: Reader, source_crs: CRS, facts: dict[str, Any] | None = None
+        self,
+        name: str,
+        grid: Grid,
+        pixels: GrayReader | tuple[Gray, Mask],
+        source_crs: CRS,
+        facts: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(grid)
         self.name, self.source_crs, self._facts = name, source_crs, facts or {}
@@ -77,7 +83,7 @@ class OrthoMap(Georeference):
         self.surface_datum: str | None = None
         self.georeference_sigma_m: float | None = None
         self.slope_sigma_deg: float | None = None
-        self._pyramid = Pyramid(grid.width_px, grid.height_px, reader)
+        self._pyramid = Pyramid(grid.width_px, grid.height_px, pixels)
         self.levels = self._pyramid.levels
 
     @classmethod
@@ -163,7 +169,7 @@ class OrthoMap(Georeference):
         heights = None if surface_m is None else np.asarray(surface_m, np.float32)
         check_arrays(gray, mask, heights)
         grid = metric_grid(gray.shape, np.asarray(pixel_to_crs, np.float64), crs)
-        site = cls("arrays", grid, ArrayReader(gray, mask), grid.crs)
+        site = cls("arrays", grid, (gray, mask), grid.crs)
         site.georeference_sigma_m = stated_sigma(georeference_sigma_m, None, GEOREFERENCE_TAG)
         site.slope_sigma_deg = stated_sigma(slope_sigma_deg, None, SLOPE_TAG)
         if heights is not None:

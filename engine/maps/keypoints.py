@@ -7,7 +7,6 @@ as DISK, still describes a tile slightly differently from the whole level.
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,12 +39,12 @@ class KeypointMap:
         matcher: its extractor describes the map.
 
     Attributes:
-        tiles: described so far, by level and window; the least recently used are evicted.
+        tiles: described so far, by window and level; the least recently used are evicted.
     """
 
     def __init__(self, site: OrthoMap, matcher: KeypointMatcher) -> None:
         self._site, self._matcher = site, matcher
-        self.tiles: RecentlyUsed[tuple[int, Window], Keypoints] = RecentlyUsed()
+        self.tiles = RecentlyUsed(self._describe, lambda _, tile: len(tile), MAX_KEYPOINTS)
 
     def find(self, window: Window, level: int, count: int) -> Keypoints:
         """The strongest keypoints of a window.
@@ -62,16 +61,15 @@ class KeypointMap:
         size = np.array([window.width_px, window.height_px], np.float32)
         windows = tiles_under(window, TILE_PX, self._site.level_shape(level))
         parts = []
-        for tile in [self.tiles.get((level, own), partial(self._describe, level, own)) for own in windows]:
+        for tile in self.tiles.get(*((own, level) for own in windows)):
             xy = tile.xy_px - tile.xy_px.new_tensor(corner)
             inside = ((xy >= 0.0) & (xy <= xy.new_tensor(size) - 1.0)).all(dim=1)
             parts.append(Keypoints(xy, tile.strength, tile.descriptors).only(inside))
-        self.tiles.evict(lambda _, tile: len(tile), MAX_KEYPOINTS, keep=len(windows))
         share = min(1.0, count / max(1, sum(map(len, parts))))
         parts = [part.only(torch.arange(int(share * len(part)), device=part.xy_px.device)) for part in parts]
         return Keypoints(*(torch.cat(v) for v in zip(*map(_fields, parts), strict=True)))
 
-    def _describe(self, level: int, tile: Window) -> Keypoints:
+    def _describe(self, tile: Window, level: int) -> Keypoints:
         """The keypoints of a tile, in pixels of the level."""
         wide = widened(tile, HALO_PX, self._site.level_shape(level))
         picture = as_tensor(as_picture(self._site.gray(wide, level), CPU))

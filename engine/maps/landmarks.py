@@ -85,8 +85,7 @@ class LandmarkMap:
     def __init__(self, site: OrthoMap, device: Device, backend: str = "auto") -> None:
         self._site, self.device = site, device
         self._backend = chosen_backend(backend, device)
-        self.tiles: RecentlyUsed[_Key, NamedArrays] = RecentlyUsed()
-        self._max_landmarks = MAX_LANDMARKS
+        self.tiles = RecentlyUsed(self._described, lambda _, tile: _count(tile), MAX_LANDMARKS)
 
     def find(self, window: Window, level: int, *, upright: bool, per_px: float = math.inf) -> Landmarks:
         """The landmarks of a window.
@@ -100,11 +99,12 @@ class LandmarkMap:
         Returns:
             Landmarks: those whose keypoint is inside the window.
         """
-        keys = self._keys(window, level, upright)
-        tiles = [self._tile(key) for key in keys]
-        self.tiles.evict(lambda _, tile: _count(tile), self._max_landmarks, keep=len(keys))
+        tiles = self.tiles.get(*self._keys(window, level, upright))
         max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
-        return self._to_landmarks(_gathered(tiles, [_inside(tile, window, max_rank) for tile in tiles]))
+        parts = [(tile, _inside(tile, window, max_rank)) for tile in tiles]
+        return self._to_landmarks(
+            {name: np.concatenate([part[name][i] for part, i in parts]) for name in tiles[0]}
+        )
 
     def prepare(self, levels: Iterable[int] | None = None) -> None:
         """Describe whole levels, upright and not, and cache them in a file if the map comes from one.
@@ -112,7 +112,8 @@ class LandmarkMap:
         Args:
             levels: in order of preference, up to :data:`PREPARED_PX` in all; None takes all, the coarsest first.
         """
-        pixels = 0
+        pixels, usual = 0, self.tiles.limit
+        self.tiles.limit = math.inf
         for level in reversed(range(self._site.levels)) if levels is None else levels:
             pixels += math.prod(self._site.level_shape(level))
             if pixels > PREPARED_PX:
@@ -120,7 +121,7 @@ class LandmarkMap:
             for upright in (True, False):
                 self._prepare(level, upright)
         # No more than is prepared now: a large map with few prepared levels keeps the usual limit.
-        self._max_landmarks = max(self._max_landmarks, sum(map(_count, self.tiles.values())))
+        self.tiles.limit = max(usual, sum(map(_count, self.tiles.values())))
 
     def _prepare(self, level: int, upright: bool) -> None:
         rows, columns = self._site.level_shape(level)
@@ -129,14 +130,13 @@ class LandmarkMap:
         if all(key in self.tiles for key in keys):
             return
         if not self._site.from_file:
-            for key in keys:
-                self._tile(key)
+            self.tiles.get(*keys)
             return
         settings = (self._backend, DETECTOR_VERSION, TILE_PX, HALO_PX, CELL_PX, MAX_PER_CELL, upright)
         name = cache_key(settings, (self._site.gray(whole, level), self._site.valid(whole, level)))
         stored = load_arrays(name, _STORED)
         if stored is None:
-            tiles = [self._tile(key) for key in keys]
+            tiles = self.tiles.get(*keys)
             save_arrays(name, {field: np.concatenate([tile[field] for tile in tiles]) for field in _STORED})
             return
         corner = np.rint(stored["xy_px"]).astype(np.int64) // TILE_PX * TILE_PX  # of each one's tile
@@ -147,10 +147,8 @@ class LandmarkMap:
     def _keys(self, window: Window, level: int, upright: bool) -> list[_Key]:
         return [(level, upright, tile) for tile in tiles_under(window, TILE_PX, self._site.level_shape(level))]
 
-    def _tile(self, key: _Key) -> NamedArrays:
-        """Get a tile, which becomes the most recently used."""
-        level = key[0]
-        return self.tiles.get(key, lambda: self._with_points(self._detect(*key), level))
+    def _described(self, level: int, upright: bool, own: Window) -> NamedArrays:
+        return self._with_points(self._detect(level, upright, own), level)
 
     def _detect(self, level: int, upright: bool, own: Window) -> NamedArrays:
         """Every keypoint on a tile, as detected in the whole level."""
@@ -215,17 +213,6 @@ def _inside(tile: NamedArrays, window: Window, max_rank: int) -> NDArray[np.intp
     left, top = window.x0 - 0.5, window.y0 - 0.5
     inside = (x >= left) & (x < left + window.width_px) & (y >= top) & (y < top + window.height_px)
     return np.flatnonzero(inside & (tile["rank"] < max_rank))
-
-
-def _gathered(parts: list[NamedArrays], indices: list[NDArray[np.intp]]) -> NamedArrays:
-    """Chosen rows of all parts one after the other, copied once."""
-    ends = np.cumsum([len(index) for index in indices])
-    found = {name: np.empty((ends[-1], *like.shape[1:]), like.dtype) for name, like in parts[0].items()}
-    for part, index, end in zip(parts, indices, ends, strict=True):
-        for name, values in part.items():
-            out = found[name][end - len(index) : end]
-            values.take(index, axis=0, out=out, mode="clip")  # "raise" would copy twice
-    return found
 
 
 def _rank_in_cells(xy_px: NDArray[np.float32]) -> NDArray[np.int64]:

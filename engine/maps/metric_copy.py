@@ -22,7 +22,7 @@ import numpy as np
 
 from engine.errors import MapError
 from engine.maps.grids import Grid, by_corner, pixels_between, transformed_window, wgs84, window_about
-from engine.maps.rasters import Gray, GrayReader, Source, is_large, map_errors, open_source, stored_levels
+from engine.maps.rasters import BLOCK_PX, Gray, GrayReader, Source, is_large, map_errors, open_source
 from engine.maps.tiles import tiles_under
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
@@ -33,8 +33,6 @@ FACTORS = [2, 4, 8, 16, 32]
 """Of the overviews of a large copy. The file is padded to a multiple, so that their pixels lie on the levels'."""
 MAX_SIDE_PX = 1_000_000
 """Largest side of a copy."""
-BLOCK_PX = 1024
-"""Side of the blocks in which a copy is read, resampled and written."""
 ProgressCallback = Callable[[int, int], None]
 """Called while a copy is created, with the number of pixels done and in all."""
 _Block = tuple[Window, Gray]
@@ -63,7 +61,9 @@ def _metric_grid(source: Grid) -> Grid:
 
 def _needs_copy(source: Source) -> bool:
     """Whether a map needs a copy: its grid is not metric, or even its smallest overview is large."""
-    return not source.grid.is_metric or is_large(source.grid.area_px >> 2 * stored_levels(source)[-1])
+    return not source.grid.is_metric or is_large(
+        source.grid.area_px // max([1, *source.dataset.overviews(1)]) ** 2
+    )
 
 
 def _copied(reader: GrayReader, source: Grid, grid: Grid) -> Iterator[_Block]:

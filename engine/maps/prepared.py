@@ -7,7 +7,6 @@ The least recently used regions are evicted.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,12 +57,12 @@ class PreparedMap:
         score: see :func:`engine.kernels.scores.enhance`.
 
     Attributes:
-        regions: prepared so far, by level and window; the least recently used are evicted.
+        regions: prepared so far, by window and level; the least recently used are evicted.
     """
 
     def __init__(self, site: OrthoMap, device: Device, radius_px: int, score: str = "local") -> None:
         self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
-        self.regions: RecentlyUsed[tuple[int, Window], Region] = RecentlyUsed()
+        self.regions = RecentlyUsed(self._prepare, self._evictable_px, MAX_REGION_PX)
 
     def cut(self, window: Window, level: int) -> Region:
         """The prepared part of a level that contains a window, cropped to it.
@@ -102,21 +101,25 @@ class PreparedMap:
 
     def _region(self, window: Window, level: int) -> Region:
         """The most recently used region that contains a window, or a new one."""
-        held = (key for key in reversed(list(self.regions)) if key[0] == level and _contains(key[1], window))
-        found = next(held, None)
-        if found is not None:
-            return self.regions.get(found, partial(self._prepare, found[1], level))
-        rows, columns = shape = self._site.level_shape(level)
-        is_whole = rows * columns <= WHOLE_LEVEL_PX
-        target = Window(0, 0, columns, rows) if is_whole else _on_grid(window, shape)
-        region = self.regions.get((level, target), partial(self._prepare, target, level))
-        self.regions.evict(self._evictable_px, MAX_REGION_PX, keep=1)
-        return region
+        held = (key for key in reversed(list(self.regions)) if key[1] == level and _contains(key[0], window))
+        key = next(held, None) or (self._to_prepare(window, self._site.level_shape(level)), level)
+        return self.regions.get(key)[0]
 
-    def _evictable_px(self, key: tuple[int, Window], region: Region) -> int:
+    @staticmethod
+    def _to_prepare(window: Window, shape: tuple[int, int]) -> Window:
+        """What to prepare for a window: all of a small level, else whole tiles with half a tile to each side."""
+        rows, columns = shape
+        if rows * columns <= WHOLE_LEVEL_PX:
+            return Window(0, 0, columns, rows)
+        ahead_px = TILE_PX // 2  # the next windows of a flight fall in the same region
+        tiles = tiles_under(widened(window, ahead_px, shape), TILE_PX, shape)
+        first, last = tiles[0], tiles[-1]
+        return Window(first.x0, first.y0, last.x1 - first.x0, last.y1 - first.y0)
+
+    def _evictable_px(self, key: tuple[Window, int], _: Region) -> int:
         """Pixels of a region; 0 of a whole level, which stays."""
-        window = region.window
-        return 0 if (window.height_px, window.width_px) == self._site.level_shape(key[0]) else window.area_px
+        window, level = key
+        return 0 if (window.height_px, window.width_px) == self._site.level_shape(level) else window.area_px
 
     def _prepare(self, window: Window, level: int) -> Region:
         picture, mask = enhanced_part(self._site, self._radius_px, self._score, window, level)
@@ -156,11 +159,3 @@ def enhanced_part(
 def _contains(region: Window, window: Window) -> bool:
     across = region.x0 <= window.x0 and window.x1 <= region.x1
     return across and region.y0 <= window.y0 and window.y1 <= region.y1
-
-
-def _on_grid(window: Window, shape: tuple[int, int]) -> Window:
-    """The window extended by half a tile to each side, then to whole tiles, and clipped at the level's edge."""
-    ahead_px = TILE_PX // 2  # the next windows of a flight fall in the same region
-    tiles = tiles_under(widened(window, ahead_px, shape), TILE_PX, shape)
-    first, last = tiles[0], tiles[-1]
-    return Window(first.x0, first.y0, last.x1 - first.x0, last.y1 - first.y0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -11,37 +10,10 @@ from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.maps.grids import Array
-from engine.maps.rasters import COARSE_LIMIT_PX, Gray, GrayReader, Mask, is_large, scaled_window
+from engine.maps.rasters import BLOCK_PX, COARSE_LIMIT_PX, Gray, GrayReader, Mask, is_large
 from engine.values import Window
 
 MIN_LEVEL_PX = 16
-
-
-@dataclass(frozen=True)
-class ArrayReader:
-    """A reader of arrays in memory.
-
-    Attributes:
-        gray: (H, W) uint8.
-        valid: (H, W) bool, in which nodata is looked up.
-    """
-
-    gray: Gray
-    valid: Mask
-    levels = (0,)
-    all_valid = False
-
-    def read(self, window: Window, level: int = 0) -> tuple[Gray, Mask]:
-        """Read a window.
-
-        Args:
-            window: inside the arrays.
-            level: 0.
-
-        Returns:
-            (h, w) uint8 grey and (h, w) bool validity, without a copy.
-        """
-        return self.gray[window.slices], self.valid[window.slices]
 
 
 def check_arrays(gray: Gray, valid: Mask, heights: NDArray[np.float32] | None) -> None:
@@ -65,31 +37,31 @@ def check_arrays(gray: Gray, valid: Mask, heights: NDArray[np.float32] | None) -
             raise ShapeError(f"{name}: expected the shape of gray {gray.shape}, got {array.shape}")
 
 
-Reader = ArrayReader | GrayReader
-"""Source of pixels: arrays, or a file."""
-
-
 class Pyramid:
     """Grey and validity at every level; a large map's fine levels are read from the file, all others in memory.
 
     Args:
         width_px: of level 0.
         height_px: of level 0.
-        reader: reads the pixels. Missing levels are averaged from the next finer one.
+        pixels: reads the file, or grey and validity of level 0 in memory.
     """
 
-    def __init__(self, width_px: int, height_px: int, reader: Reader) -> None:
-        self._size, self._reader = (height_px, width_px), reader
+    def __init__(self, width_px: int, height_px: int, pixels: GrayReader | tuple[Gray, Mask]) -> None:
+        self._size, self._cached = (height_px, width_px), dict[int, tuple[Gray, Mask]]()
         self.levels = max(1, int(math.log2(max(1.0, min(self._size) / MIN_LEVEL_PX))) + 1)
-        self.is_large = is_large(width_px * height_px)
+        self._file: GrayReader | None = None
+        if isinstance(pixels, tuple):
+            self._cached[0] = pixels
+        else:
+            self._file = pixels
+        self.is_large = self._file is not None and is_large(width_px * height_px)
         """Whether it is too large for memory."""
         areas_px = [math.prod(self.shape(level)) for level in range(self.levels - 1)]
         # The finest level in memory: 0, or that after all which are too large.
         self._base = sum(area_px > COARSE_LIMIT_PX for area_px in areas_px) if self.is_large else 0
-        self._cached: dict[int, tuple[Gray, Mask]] = {}
         self._last: tuple[tuple[Window, int], tuple[Gray, Mask]] | None = None
         if self._base == 0:
-            self._cached[0] = self._streamed(0)
+            self._level(0)
 
     def shape(self, level: int) -> tuple[int, int]:
         """Rows and columns of a level."""
@@ -97,32 +69,24 @@ class Pyramid:
             raise OptionError(f"level: expected 0 to {self.levels - 1}, got {level}")
         return self._size[0] >> level, self._size[1] >> level
 
-    def _streamed(self, level: int) -> tuple[Gray, Mask]:
-        """A whole level, read in strips to keep the file's colour and masks out of memory."""
-        height, width = self.shape(level)
-        gray, valid = np.empty((height, width), np.uint8), np.empty((height, width), np.bool_)
-        rows = max(1, 1024 >> (level - self._stored(level)))
-        for y0 in range(0, height, rows):
-            strip = Window(0, y0, width, min(rows, height - y0))
-            gray[y0 : y0 + rows], valid[y0 : y0 + rows] = self._from_file(strip, level)
-        return gray, valid
-
-    def _stored(self, level: int) -> int:
-        """The level to read in order to compute another."""
-        return max(stored for stored in self._reader.levels if stored <= level)
-
-    def _from_file(self, window: Window, level: int) -> tuple[Gray, Mask]:
-        finer = level - self._stored(level)
-        both = self._reader.read(scaled_window(window, finer), level - finer)
-        for _ in range(finer):
-            both = _halved(*both)
-        return both
-
     def _level(self, level: int) -> tuple[Gray, Mask]:
         if level not in self._cached:
             at_base = level == self._base
             self._cached[level] = self._streamed(level) if at_base else _halved(*self._level(level - 1))
         return self._cached[level]
+
+    def _streamed(self, level: int) -> tuple[Gray, Mask]:
+        """A whole level, read in strips to keep the file's colour and masks out of memory."""
+        height, width = self.shape(level)
+        gray, valid = np.empty((height, width), np.uint8), np.empty((height, width), np.bool_)
+        for y0 in range(0, height, BLOCK_PX):
+            strip = Window(0, y0, width, min(BLOCK_PX, height - y0))
+            gray[strip.slices], valid[strip.slices] = self._from_file(strip, level)
+        return gray, valid
+
+    def _from_file(self, window: Window, level: int) -> tuple[Gray, Mask]:
+        assert self._file is not None  # all of a map without a file is in memory
+        return self._file.read(window, level)
 
     def crop(self, window: Window, level: int) -> tuple[Gray, Mask]:
         """Grey and validity of a window.
@@ -151,7 +115,9 @@ class Pyramid:
     @property
     def fully_valid(self) -> bool:
         """Whether no pixel is nodata; true for a large map only if its file format cannot mark nodata."""
-        return self._reader.all_valid if self.is_large else self.nodata_share == 0.0
+        if self._file is not None and self.is_large:
+            return self._file.all_valid
+        return self.nodata_share == 0.0
 
     @cached_property
     def nodata_share(self) -> float:

@@ -48,6 +48,8 @@ MEMORY_LIMIT_PX = 256 * 2**20
 """Grey maps of up to this many pixels are held in memory; larger ones are read window by window."""
 COARSE_LIMIT_PX = 16 * 2**20
 """Of those the first level of up to this many pixels, and the coarser ones, are held in memory."""
+BLOCK_PX = 1024
+"""A whole file is read in strips of so many rows, and copied in blocks with this side."""
 OVERVIEW_PX = math.isqrt(COARSE_LIMIT_PX)
 """Stretch and collar are found on a copy of at most this many pixels a side."""
 
@@ -244,9 +246,6 @@ class GrayReader:
     Colour becomes ITU-R BT.601 luma of the first three bands; a colour table is expanded first. Element types
     other than uint8 are stretched linearly between two percentiles of the valid pixels.
 
-    Attributes:
-        levels: of the map's pyramid that the file holds: 0, and those of its overviews.
-
     Raises:
         MapError: an unsupported element type, pixels that cannot be read, or none that is valid.
     """
@@ -257,7 +256,6 @@ class GrayReader:
         self.dtype = dataset.dtypes[0]
         if self.dtype not in DTYPES:
             raise MapError(f"map: expected pixels of {', '.join(DTYPES)}, got {self.dtype} in {source.path}")
-        self.levels = stored_levels(source)
         self._bands = [1, 2, 3] if dataset.count >= 3 else [1]
         self._palette = palette_of(dataset)
         shrink = max(1.0, max(grid.width_px, grid.height_px) / OVERVIEW_PX)
@@ -300,7 +298,7 @@ class GrayReader:
 
         Args:
             window: in pixels of the level, inside it.
-            level: one of :attr:`levels`.
+            level: of the map's pyramid, averaged by GDAL from the file's nearest overview.
 
         Returns:
             (h, w) uint8 grey and (h, w) bool validity.
@@ -308,7 +306,7 @@ class GrayReader:
         Raises:
             MapError: the file cannot be read.
         """
-        full = scaled_window(window, level)
+        full = Window(*(v << level for v in (window.x0, window.y0, window.width_px, window.height_px)))
         data, valid = self._read(full, (window.height_px, window.width_px), smooth=level > 0)
         for value, area in self._collars.items():
             height, width = area.shape
@@ -320,17 +318,6 @@ class GrayReader:
         if self._limits is None:
             return luma, valid
         return stretched(luma, self._limits), valid
-
-
-def scaled_window(window: Window, levels: int) -> Window:
-    """The same window in pixels of a level ``levels`` finer."""
-    return Window(*(v << levels for v in (window.x0, window.y0, window.width_px, window.height_px)))
-
-
-def stored_levels(source: Source) -> tuple[int, ...]:
-    """Levels of the pyramid that a file holds: 0, and its overviews by powers of two."""
-    factors = source.dataset.overviews(1)
-    return (0, *sorted(factor.bit_length() - 1 for factor in factors if factor > 1 and factor & (factor - 1) == 0))
 
 
 def palette_of(dataset: Any) -> Gray | None:

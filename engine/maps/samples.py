@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
@@ -39,12 +38,12 @@ class SampleMap:
             :func:`engine.maps.prepared.enhanced_part`.
 
     Attributes:
-        cells: sampled so far, by level and window; the least recently used are evicted.
+        cells: sampled so far, by window and level; the least recently used are evicted.
     """
 
     def __init__(self, site: OrthoMap, enhanced: Enhanced) -> None:
         self._site, self._enhanced = site, enhanced
-        self.cells: RecentlyUsed[tuple[int, Window], tuple[Samples, tuple[int, int]]] = RecentlyUsed()
+        self.cells = RecentlyUsed(self._sampled, lambda key, _: int(key[0].area_px), COARSE_LIMIT_PX)
 
     def find(self, window: Window, level: int, max_samples: int = MAX_SAMPLES) -> Samples:
         """Samples of a window.
@@ -60,8 +59,9 @@ class SampleMap:
         from engine.kernels.map_points import every_nth  # numba takes a while to import
 
         step, parts = math.ceil(window.area_px / BLOCK_PX**2 / max_samples), []
-        for cell in self._cells_under(window, level):
-            samples, (rows, columns) = self._cell(cell, level)
+        cells = self._cells_under(window, level)
+        found = self.cells.get(*((cell, level) for cell in cells))
+        for cell, (samples, (rows, columns)) in zip(cells, found, strict=True):
             x, y = window.x0 - cell.x0, window.y0 - cell.y0
             last = (
                 min(rows, -(-(y + window.height_px) // BLOCK_PX)),
@@ -82,13 +82,8 @@ class SampleMap:
         # The remainder beyond a level's last whole cell may be narrower than a block: it gives no sample.
         return [cell for cell in cells if min(cell.width_px, cell.height_px) >= BLOCK_PX]
 
-    def _cell(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
-        """Samples of a cell, row by row, and the number of their rows and columns."""
-        found = self.cells.get((level, cell), partial(self._sampled, cell, level))
-        self.cells.evict(lambda key, _: key[1].area_px, COARSE_LIMIT_PX, keep=1)
-        return found
-
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
+        """Samples of a cell, row by row, and the number of their rows and columns."""
         picture, mask = self._enhanced(cell, level)
         across, down = (cv2.Sobel(picture, cv2.CV_32F, i, 1 - i, ksize=1, scale=0.5) for i in (1, 0))
         shape = (picture.shape[0] // BLOCK_PX, picture.shape[1] // BLOCK_PX)

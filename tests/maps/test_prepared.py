@@ -113,10 +113,10 @@ def test_memory_stays_within_its_bound_and_what_was_given_up_comes_back_the_same
         for x in range(0, 450, 50):
             window = Window(x, y, 64, 64)
             assert maps.cut(window, 0).window.width_px >= 64
-            kept = [key[1] for key in maps.regions]
+            kept = [part for part, _ in maps.regions]
             newest = kept[-1].area_px
             assert sum(part.area_px for part in kept) <= max(3 * 128 * 128, newest)
-    assert (0, Window(0, 0, 128, 128)) not in maps.regions
+    assert (Window(0, 0, 128, 128), 0) not in maps.regions
     np.testing.assert_array_equal(maps.cut(Window(10, 10, 60, 60), 0).search.image, first.search.image)
 
 
@@ -126,7 +126,7 @@ def test_a_level_that_is_small_is_prepared_once_and_kept(gray, monkeypatch):
     for _ in range(2):
         for level in (0, 1, 2):
             maps.cut(Window(8, 8, 40, 40), level)
-    assert sorted(level for level, _ in maps.regions) == [0, 1, 2]
+    assert sorted(level for _, level in maps.regions) == [0, 1, 2]
     parts = [maps.cut(Window(0, 0, side, side), 0).search.image for side in (9, 8)]
     assert np.shares_memory(*parts)
 
@@ -134,9 +134,9 @@ def test_a_level_that_is_small_is_prepared_once_and_kept(gray, monkeypatch):
 def test_several_threads_may_cut_at_once(gray, monkeypatch, by_cells):
     """The worker that a live flight left behind may still be at work beside the one that replaced it."""
     monkeypatch.setattr(prepared, "MAX_REGION_PX", 128 * 128)
-    maps = PreparedMap(site_of(gray), CPU, RADIUS_PX)
     search = prepare(torch.zeros(400, 550))
-    monkeypatch.setattr(maps, "_prepare", lambda window, level: Region(window, search, None))
+    monkeypatch.setattr(PreparedMap, "_prepare", lambda _, window, level: Region(window, search, None))
+    maps = PreparedMap(site_of(gray), CPU, RADIUS_PX)
     places = np.random.default_rng(0).integers(0, 400 - 64, (4000, 2)).tolist()
     cuts = called_at_once(lambda place: maps.cut(Window(*place, 64, 64), 0), places)
     assert all(cut.window.x0 == x & -8 for cut, (x, _) in zip(cuts, places, strict=True))
