@@ -15,10 +15,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from engine.errors import MapError
-from engine.maps.colour import read_colour
 from engine.maps.georeference import Georeference
 from engine.maps.grids import Array, Grid, metric_grid, pixels_between
 from engine.maps.metric_copy import ProgressCallback, open_readable
@@ -77,7 +76,7 @@ class OrthoMap(Georeference):
     ) -> None:
         super().__init__(grid)
         self.name, self.source_crs, self._facts = name, source_crs, facts or {}
-        self._source: Callable[[], Source] | None = None
+        self._open: Callable[[], Source] | None = None
         self._surface: SurfaceModel | None = None
         self.has_surface, self.ground_m = False, 0.0
         self.surface_datum: str | None = None
@@ -125,11 +124,11 @@ class OrthoMap(Georeference):
         facts["surface_path"] = None if surface is None else os.fspath(surface)
         site = cls(original.path.name, used.grid, reader, original.grid.crs, facts)
         heights_file = None if surface is None else open_source(surface, "surface")
-        site._source = opened
+        site._open = opened
         site.georeference_sigma_m = stated_sigma(georeference_sigma_m, original, GEOREFERENCE_TAG)
         site.slope_sigma_deg = stated_sigma(slope_sigma_deg, heights_file, SLOPE_TAG)
         if heights_file is not None:
-            site._attach(*open_surface(heights_file, site._grid))
+            site._attach(*open_surface(heights_file, site.grid))
             site.surface_datum = vertical_datum(heights_file.dataset)
         return site
 
@@ -177,9 +176,9 @@ class OrthoMap(Georeference):
         return site
 
     def _attach(self, surface: SurfaceModel, surface_grid: Grid) -> None:
-        known = self._known_heights(surface, self._grid.lattice(257))
+        known = self._known_heights(surface, self.grid.lattice(257))
         if known.size < _MIN_KNOWN:  # a surface of a small part of the map, or a map of small parts
-            to_map = pixels_between(surface_grid, self._grid)
+            to_map = pixels_between(surface_grid, self.grid)
             known = self._known_heights(surface, to_map(surface_grid.lattice(257)))
         if known.size == 0:
             raise MapError("surface: expected known heights under the valid part of the map, got none")
@@ -217,7 +216,7 @@ class OrthoMap(Georeference):
     @property
     def inner_px(self) -> Array:
         """(2,) the middle pixel if it is valid, else the valid pixel farthest from any nodata."""
-        middle = self._grid.centre_px
+        middle = self.grid.centre_px
         return middle if bool(self._pyramid.valid_at(middle)) else self._pyramid.innermost_px()
 
     @property
@@ -255,17 +254,9 @@ class OrthoMap(Georeference):
         """
         return self._pyramid.crop(window, level)[1].copy()
 
-    def rgb(self, window: Window, shape: tuple[int, int]) -> NDArray[np.uint8] | None:
-        """Colours of a window as the map's file has them, for pictures.
-
-        Args:
-            window: in full-resolution pixels, inside the map.
-            shape: rows and columns of the result.
-
-        Returns:
-            (h, w, 3) RGB, undefined on nodata; None if the map has no colours, or no file.
-        """
-        return None if self._source is None else read_colour(self._source(), self._grid, window, shape)
+    def open_file(self) -> Source | None:
+        """The map's file opened again, such as for its colours; None if the map has none."""
+        return None if self._open is None else self._open()
 
     def level_shape(self, level: int) -> tuple[int, int]:
         """Rows and columns of a level."""
@@ -362,11 +353,11 @@ class OrthoMap(Georeference):
     @property
     def from_file(self) -> bool:
         """Whether the map was opened from a file; one of arrays in memory was not."""
-        return "path" in self._facts
+        return self._open is not None
 
     def info(self) -> dict[str, Any]:
         """Facts about the map as JSON; ``convergence_deg`` is the true heading of the map's upward direction."""
-        east, north = -self.enu_jacobian(self._grid.centre_px)[:, 1]
+        east, north = -self.enu_jacobian(self.grid.centre_px)[:, 1]
         surface = self._surface
         return {
             "name": self.name,

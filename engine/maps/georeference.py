@@ -21,10 +21,8 @@ GSD_RANGE_M = (1e-3, 1e3)
 class Georeference:
     """Coordinates of the pixels of a metric grid.
 
-    Args:
-        grid: in use.
-
     Attributes:
+        grid: in use.
         width_px, height_px: columns and rows.
         crs: of the grid.
         frame: local east-north-up; its origin is the centre of the map.
@@ -36,7 +34,7 @@ class Georeference:
     """
 
     def __init__(self, grid: Grid) -> None:
-        self.width_px, self.height_px, self.crs, self._grid = grid.width_px, grid.height_px, grid.crs, grid
+        self.width_px, self.height_px, self.crs, self.grid = grid.width_px, grid.height_px, grid.crs, grid
         self._to_geodetic, self._from_geodetic = grid.pixels_of(wgs84())
         lon_deg, lat_deg = self._to_geodetic(grid.centre_px)
         self.frame = LocalFrame(float(lat_deg), float(lon_deg))

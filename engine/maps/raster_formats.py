@@ -37,8 +37,6 @@ OWN_TAGS = "SCENEMATCH_"
 OFF_GRID_PX = 0.05
 """Largest offset of a tile from whole pixels of the first tile's grid; a larger one would need resampling."""
 _VRT_HEAD = b"<VRTDataset"
-DTYPES = {"uint8": "Byte", "uint16": "UInt16", "int16": "Int16", "float32": "Float32", "float64": "Float64"}
-"""Element types of a map, with GDAL's names."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class _Tile:
     size: tuple[int, int]
     transform: Any
     crs: Any
-    kind: tuple[int, str, str, float, float]  # bands in use, element type, nodata, scale and offset
+    kind: tuple[int, str, str, float, float]  # bands in use, element type by GDAL, nodata, scale and offset
     block: tuple[int, int]
     overviews: tuple[int, ...]
     own_tags: frozenset[tuple[str, str]]  # metadata items of this project
@@ -146,8 +144,7 @@ def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
         if dataset.transform.is_identity:
             raise MapError(f"{argument}: expected a georeference in every tile of a folder, got none in {file}")
         bands, dtype = 3 if dataset.count >= 3 else 1, dataset.dtypes[0]
-        if dtype not in DTYPES:
-            raise MapError(f"{argument}: expected tiles of {', '.join(DTYPES)}, got {dtype} in {file}")
+        gdal_type = "Byte" if dtype == "uint8" else dtype  # GDAL takes the others in small letters too
         if dataset.colorinterp[0].name == "palette":
             raise MapError(f"{argument}: expected tiles without a colour table, got one in {file}")
         return _Tile(
@@ -155,7 +152,7 @@ def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
             size=(dataset.width, dataset.height),
             transform=dataset.transform,
             crs=dataset.crs,
-            kind=(bands, dtype, str(dataset.nodata), dataset.scales[0], dataset.offsets[0]),
+            kind=(bands, gdal_type, str(dataset.nodata), dataset.scales[0], dataset.offsets[0]),
             block=dataset.block_shapes[0],
             overviews=tuple(dataset.overviews(1)),
             own_tags=frozenset((k, v) for k, v in dataset.tags().items() if k.startswith(OWN_TAGS)),
@@ -207,7 +204,7 @@ def _vrt_text(
     if factors:  # those that a smaller tile lacks GDAL computes while reading
         Xml.SubElement(root, "OverviewList", resampling="average").text = " ".join(map(str, factors))
     for band in range(1, bands + 1):
-        element = Xml.SubElement(root, "VRTRasterBand", dataType=DTYPES[dtype], band=str(band))
+        element = Xml.SubElement(root, "VRTRasterBand", dataType=dtype, band=str(band))
         Xml.SubElement(element, "ColorInterp").text = ("Red", "Green", "Blue")[band - 1] if bands == 3 else "Gray"
         Xml.SubElement(element, "Scale").text, Xml.SubElement(element, "Offset").text = repr(scale), repr(offset)
         if nodata != "None":
@@ -231,7 +228,7 @@ def _add_sources(
         if "mask" not in band:  # so that a tile is opened only when it is read
             rows, columns = (str(n) for n in tile.block)
             of = {"RasterXSize": width, "RasterYSize": height, "BlockXSize": columns, "BlockYSize": rows}
-            Xml.SubElement(source, "SourceProperties", of | {"DataType": DTYPES[tile.kind[1]]})
+            Xml.SubElement(source, "SourceProperties", of | {"DataType": tile.kind[1]})
         Xml.SubElement(source, "SrcRect", xOff="0", yOff="0", xSize=width, ySize=height)
         Xml.SubElement(source, "DstRect", xOff=str(x), yOff=str(y), xSize=width, ySize=height)
         if nodata is not None:  # so that one tile's nodata does not hide another's pixels

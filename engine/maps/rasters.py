@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
 from engine.maps.grids import Array, Grid, earth_crs, wgs84
-from engine.maps.raster_formats import DTYPES, OWN_TAGS, local_path, openable
+from engine.maps.raster_formats import OWN_TAGS, local_path, openable
 from engine.values import MAX_SIGMA_M, Window
 
 if TYPE_CHECKING:
@@ -37,6 +37,8 @@ Mask = NDArray[np.bool_]
 Bounds = tuple[float, float, float, float]
 """West, south, east, north."""
 
+DTYPES = "uint8", "uint16", "int16", "float32", "float64"
+"""Element types of a map."""
 COLLAR_SHARE = 0.005
 STRETCH_PERCENT = (2.0, 98.0)
 GEOREFERENCE_TAG = "SCENEMATCH_GEOREFERENCE_SIGMA_M"
@@ -236,8 +238,7 @@ def _from_degrees(bounds_deg: Bounds, crs: CRS, width: int, height: int) -> Boun
 def _from_edges(bounds: Bounds, width: int, height: int) -> Array:
     """The affine of pixel centres from the outer edges."""
     west, south, east, north = bounds
-    step_x, step_y = (east - west) / width, (south - north) / height
-    return np.array([[step_x, 0.0, west + step_x / 2.0], [0.0, step_y, north + step_y / 2.0]])
+    return _centred(((east - west) / width, 0.0, west, 0.0, (south - north) / height, north))
 
 
 class GrayReader:

@@ -23,10 +23,8 @@ HEIGHT_RANGE_M = (-1000.0, 20000.0)
 """Surface heights outside are nodata, whether tagged or not (-9999, -32768, 3e38)."""
 GROUND_PERCENT = 20.0
 """Percentile of the surface used as the ground level."""
-MAX_SPAN = 6
-"""Lookups that span fewer tiles than this per side are read as one patch."""
-MAX_PATCHES = 16
-"""Number of patches that are cached, of at most 9 MiB each."""
+MAX_TILES = 512
+"""Number of tiles that are cached, of 258 KiB each."""
 _LATTICE = square_lattice(np.linspace(-1.0, 1.0, 15))
 """Sample positions of a plane fit, relative to half the side of the square."""
 _ROUNDS = 8
@@ -43,7 +41,7 @@ class HeightTiles:
 
     def __init__(self, source: Source, part: Window) -> None:
         self._source, self._part, self._lock = source, part, threading.Lock()
-        self._patch = lru_cache(MAX_PATCHES)(self._read)
+        self._tile = lru_cache(MAX_TILES)(self._read)
         self.shape = (part.height_px, part.width_px)
 
     def sample(self, at: Array) -> Array:
@@ -57,23 +55,16 @@ class HeightTiles:
         """
         out, last = np.full(len(at), np.nan), np.array(self.shape[::-1]) - 1
         inside = np.flatnonzero(((at >= -0.5) & (at <= last + 0.5)).all(axis=1))
-        if len(inside) == 0:
-            return out
-        pixels = np.clip(at[inside], 0, last).astype(np.intp)
-        low, high = pixels.min(axis=0) // TILE_PX, np.minimum(pixels.max(axis=0) + 1, last) // TILE_PX
-        if (high - low).max() < MAX_SPAN:
-            out[inside] = _bilinear(self._patch(*low.tolist(), *high.tolist()), at[inside] - low * TILE_PX)
-            return out
-        tiles = pixels // TILE_PX
-        for tile in np.unique(tiles, axis=0):
-            here = inside[(tiles == tile).all(axis=1)]
-            out[here] = self.sample(at[here])
+        column, row = (np.clip(at[inside], 0, last) // TILE_PX).astype(np.intp).T
+        for x, y in {*zip(column.tolist(), row.tolist(), strict=True)}:
+            here = inside[(column == x) & (row == y)]
+            out[here] = _bilinear(self._tile(x, y), at[here] - [x * TILE_PX, y * TILE_PX])
         return out
 
-    def _read(self, left: int, top: int, right: int, bottom: int) -> Heights:
-        """The heights from one column and row of tiles to another."""
-        x, y = left * TILE_PX, top * TILE_PX
-        size = min((bottom + 1) * TILE_PX, self.shape[0]) - y, min((right + 1) * TILE_PX, self.shape[1]) - x
+    def _read(self, column: int, row: int) -> Heights:
+        """The heights of a tile, with the first column and row of those behind it."""
+        x, y = column * TILE_PX, row * TILE_PX
+        size = min(TILE_PX + 1, self.shape[0] - y), min(TILE_PX + 1, self.shape[1] - x)
         window = Window(self._part.x0 + x, self._part.y0 + y, size[1], size[0])
         with self._lock:  # a GDAL dataset serves one thread at a time
             return read_heights(self._source, window, size)

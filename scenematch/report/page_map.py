@@ -18,6 +18,7 @@ from scenematch.report.charts import crosses, dots, line, ticks
 from scenematch.report.explain import jpeg_data_uri, level_within
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.loop_record import LoopRecord
+from scenematch.report.map_colours import map_colours
 from scenematch.report.metrics import TrackErrors
 
 _MAX_MAP_PX = 1500  # longer side as drawn
@@ -140,7 +141,8 @@ def _ground(track_map: TrackMap) -> NDArray[np.uint8]:
     crop = level_crop(track_map.site, track_map.window, track_map.level)
     valid = track_map.site.valid(crop, track_map.level)
     _, _, width, height = track_map.box
-    colour = track_map.site.rgb(track_map.window, (max(1, round(height)), max(1, round(width))))
+    shape = max(1, round(height)), max(1, round(width))
+    colour = map_colours(track_map.site, track_map.window, shape)
     picture = track_map.site.gray(crop, track_map.level) if colour is None else colour
     if valid.shape != picture.shape[:2]:
         valid = cv2.resize(valid.astype(np.uint8), picture.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0

@@ -120,6 +120,19 @@ def test_a_surface_may_be_tiles_too(tmp_path, plain, kind, most_m):
     assert found.ground_m == pytest.approx(wanted.ground_m, abs=most_m)
 
 
+@pytest.mark.parametrize("dtype", ["int32", "uint32", "int8", "int16", "float64"])
+def test_tiles_are_of_the_element_types_that_one_file_may_be_of(tmp_path, plain, dtype):
+    """Heights are any real numbers; pixels of a map are not, in a file or in tiles."""
+    heights = (np.add.outer(np.arange(SIDE), 2 * np.arange(SIDE)) // 8).astype(dtype)[None]
+    whole, tiles = write(tmp_path / "dsm.tif", heights), tiles_of(tmp_path / "dsm", heights, gap=None)
+    xy = np.random.default_rng(0).uniform(0, SIDE - 1, (500, 2))
+    one, other = (OrthoMap.open(plain, surface).surface_at(xy) for surface in (whole, tiles))
+    np.testing.assert_array_equal(one, other)
+    if dtype not in ("int16", "float64"):
+        for path in (whole, tiles):
+            assert f"got {dtype} in {path}" in refusal(OrthoMap.open, path, error=MapError)
+
+
 # ------------------------------------------------------------------------------------------------- refusals
 
 
@@ -130,7 +143,7 @@ def test_a_surface_may_be_tiles_too(tmp_path, plain, kind, most_m):
         ({"transform": transform_at(0, 400, 0.25)}, "tiles of one size of a pixel"),
         ({"transform": transform_at(0.4, 400)}, r"tiles of one grid, got .*9-9.tif \+0.40, \+0.00 px off"),
         ({"dtype": np.uint16}, "tiles of one bands, element type, nodata, scale and offset"),
-        ({"dtype": np.int32}, "expected tiles of uint8, .* got int32"),
+        ({"dtype": np.int32}, "element type.* and .3, 'int32'"),
     ],
 )
 def test_tiles_that_do_not_fit_together_are_refused(tmp_path, picture, changed, words):

@@ -1,24 +1,24 @@
-"""Colours of a map window for display, read from the file in any grid."""
+"""Colours of a map window for pictures, read from the map's file in any grid."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.maps.grids import Grid, by_corner, part_grid
-from engine.maps.rasters import STRETCH_PERCENT, Source, map_errors, palette_of, stretched
+from engine.maps.grids import by_corner, part_grid
+from engine.maps.rasters import STRETCH_PERCENT, map_errors, palette_of, stretched
+from engine.orthomap import OrthoMap
 from engine.values import Window
 
 Rgb = NDArray[np.uint8]
 
 
-def read_colour(source: Source, grid: Grid, window: Window, shape: tuple[int, int]) -> Rgb | None:
-    """Colours of a window; None if the file has fewer than three bands and no colour table.
+def map_colours(site: OrthoMap, window: Window, shape: tuple[int, int]) -> Rgb | None:
+    """Colours of a window; None if the map has no file, or that no three bands and no colour table.
 
     Args:
-        source: the map's file.
-        grid: of the map in use; the window is in its pixels.
-        window: in full-resolution pixels of ``grid``.
+        site: the map.
+        window: in full-resolution pixels, inside the map.
         shape: rows and columns of the result.
 
     Returns:
@@ -31,10 +31,13 @@ def read_colour(source: Source, grid: Grid, window: Window, shape: tuple[int, in
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT
 
+    source = site.open_file()
+    if source is None:
+        return None
     palette = palette_of(source.dataset)
     if source.dataset.count < 3 and palette is None:
         return None
-    given, wanted = source.grid, part_grid(grid, window, shape)
+    given, wanted = source.grid, part_grid(site.grid, window, shape)
     view = {
         "src_crs": given.crs.to_wkt(), "src_transform": Affine(*by_corner(given)),
         "crs": wanted.crs.to_wkt(), "transform": Affine(*by_corner(wanted)),
