@@ -18,18 +18,10 @@ import numpy as np
 
 from engine.errors import MapError
 
-SIGNATURES = (
-    ("GTiff", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
-    ("PNG", (b"\x89PNG",)),
-    ("JPEG", (b"\xff\xd8\xff",)),
-    ("JP2OpenJPEG", (b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51")),
-    ("BMP", (b"BM",)),
-    ("WEBP", (b"RIFF",)),
-    ("MBTiles", (b"SQLite format 3\0",)),
-)
-"""GDAL drivers and the signatures of their files; file name extensions are ignored."""
-_GEOPACKAGE = slice(68, 72), (b"GPKG", b"GP10", b"GP11")
-"""Offset and value of the mark of a GeoPackage in an SQLite file."""
+DRIVERS = ["GTiff", "PNG", "JPEG", "JP2OpenJPEG", "BMP", "WEBP"]
+"""GDAL's drivers of a file; it tells them by a file's first bytes, whatever its extension."""
+DATABASES = ["MBTiles", "GPKG"]
+"""Those of files that hold tiles."""
 NO_TILES = (".ovr", ".msk", ".aux", ".part")
 """Extensions of side files and partial files, which are not tiles of a folder."""
 OWN_TAGS = "SCENEMATCH_"
@@ -37,6 +29,10 @@ OWN_TAGS = "SCENEMATCH_"
 OFF_GRID_PX = 0.05
 """Largest offset of a tile from whole pixels of the first tile's grid; a larger one would need resampling."""
 _VRT_HEAD = b"<VRTDataset"
+
+
+class NoRasterError(MapError):
+    """A licence, a world file, an index: not every file of a folder is a tile."""
 
 
 @dataclass(frozen=True)
@@ -69,34 +65,40 @@ def local_path(path: str | os.PathLike[str], argument: str) -> Path:
     return found
 
 
-def driver_of(file: Path, argument: str) -> str:
-    """GDAL's driver for a file.
+def open_raster(path: Path, argument: str) -> Any:
+    """Open a file, or a folder of tiles as one picture.
 
-    Raises:
-        MapError: its format is not supported.
-    """
-    with file.open("rb") as stream:
-        head = stream.read(1024)
-    for driver, starts in SIGNATURES:
-        if head.startswith(starts):
-            return "GPKG" if driver == "MBTiles" and head[_GEOPACKAGE[0]] in _GEOPACKAGE[1] else driver
-    if _VRT_HEAD in head:
-        raise MapError(
-            f"{argument}: expected no VRT, got {file}; give its folder of tiles, or a GeoTIFF by gdal_translate"
-        )
-    formats = ", ".join([*(driver for driver, _ in SIGNATURES), "GPKG"])
-    raise MapError(f"{argument}: expected a raster file ({formats}), got {file}, which is none of these")
-
-
-def openable(path: Path, argument: str) -> tuple[str | Path, str]:
-    """What to give GDAL for a file or folder, the file itself or the text of a VRT; and the driver.
+    Returns:
+        rasterio's dataset.
 
     Raises:
         MapError: it is not a raster, or its tiles do not fit together.
     """
+    import rasterio
+
     if path.is_dir():
-        return vrt_of_folder(path, argument), "VRT"
-    return path, driver_of(path, argument)
+        return rasterio.open(vrt_of_folder(path, argument), driver="VRT")
+    return _open_file(path, DRIVERS + DATABASES, argument)
+
+
+def _open_file(file: Path, drivers: list[str], argument: str) -> Any:
+    from rasterio import DatasetReader
+    from rasterio.errors import RasterioIOError
+
+    try:
+        return DatasetReader(file, driver=drivers)  # rasterio.open takes one driver or all
+    except RasterioIOError as error:
+        if "not recognized" not in str(error):
+            raise
+    with file.open("rb") as stream:
+        if _VRT_HEAD in stream.read(1024):
+            raise NoRasterError(
+                f"{argument}: expected no VRT, got {file}; "
+                "give its folder of tiles, or a GeoTIFF by gdal_translate"
+            )
+    raise NoRasterError(
+        f"{argument}: expected a raster file ({', '.join(drivers)}), got {file}, which is none of these"
+    )
 
 
 def vrt_of_folder(folder: Path, argument: str) -> str:
@@ -105,7 +107,7 @@ def vrt_of_folder(folder: Path, argument: str) -> str:
     Raises:
         MapError: there are none, or they differ in CRS, pixel size, bands or element type, or are not on one grid.
     """
-    tiles = [_read_tile(file, driver, argument) for file, driver in _rasters_in(folder)]
+    tiles = _tiles_in(folder, argument)
     if not tiles:
         raise MapError(
             f"{argument}: expected georeferenced raster files in the folder {folder}, found none; "
@@ -127,36 +129,33 @@ def _moved(transform: Any, x: int, y: int) -> list[float]:
     return [c + a * x + b * y, a, b, f + d * x + e * y, d, e]
 
 
-def _rasters_in(folder: Path) -> list[tuple[Path, str]]:
-    """The raster files of a folder with their drivers, by name."""
-    found = []
+def _tiles_in(folder: Path, argument: str) -> list[_Tile]:
+    """The tiles of a folder, by name."""
+    tiles = []
     for file in sorted(folder.iterdir()):
         if file.is_file() and file.suffix.lower() not in NO_TILES and not file.name.startswith("."):
-            with contextlib.suppress(MapError):  # a licence, a world file, an index: not every file is a tile
-                found.append((file, driver_of(file, "")))
-    return [(file, driver) for file, driver in found if driver not in ("MBTiles", "GPKG")]
+            with contextlib.suppress(NoRasterError), _open_file(file, DRIVERS, argument) as dataset:
+                tiles.append(_tile_of(dataset, file, argument))
+    return tiles
 
 
-def _read_tile(file: Path, driver: str, argument: str) -> _Tile:
-    import rasterio
-
-    with rasterio.open(file, driver=driver) as dataset:
-        if dataset.transform.is_identity:
-            raise MapError(f"{argument}: expected a georeference in every tile of a folder, got none in {file}")
-        bands, dtype = 3 if dataset.count >= 3 else 1, dataset.dtypes[0]
-        gdal_type = "Byte" if dtype == "uint8" else dtype  # GDAL takes the others in small letters too
-        if dataset.colorinterp[0].name == "palette":
-            raise MapError(f"{argument}: expected tiles without a colour table, got one in {file}")
-        return _Tile(
-            path=file,
-            size=(dataset.width, dataset.height),
-            transform=dataset.transform,
-            crs=dataset.crs,
-            kind=(bands, gdal_type, str(dataset.nodata), dataset.scales[0], dataset.offsets[0]),
-            block=dataset.block_shapes[0],
-            overviews=tuple(dataset.overviews(1)),
-            own_tags=frozenset((k, v) for k, v in dataset.tags().items() if k.startswith(OWN_TAGS)),
-        )
+def _tile_of(dataset: Any, file: Path, argument: str) -> _Tile:
+    if dataset.transform.is_identity:
+        raise MapError(f"{argument}: expected a georeference in every tile of a folder, got none in {file}")
+    if dataset.colorinterp[0].name == "palette":
+        raise MapError(f"{argument}: expected tiles without a colour table, got one in {file}")
+    bands, dtype = 3 if dataset.count >= 3 else 1, dataset.dtypes[0]
+    gdal_type = "Byte" if dtype == "uint8" else dtype  # GDAL takes the others in small letters too
+    return _Tile(
+        path=file,
+        size=(dataset.width, dataset.height),
+        transform=dataset.transform,
+        crs=dataset.crs,
+        kind=(bands, gdal_type, str(dataset.nodata), dataset.scales[0], dataset.offsets[0]),
+        block=dataset.block_shapes[0],
+        overviews=tuple(dataset.overviews(1)),
+        own_tags=frozenset((k, v) for k, v in dataset.tags().items() if k.startswith(OWN_TAGS)),
+    )
 
 
 def _check_beside(first: _Tile, tile: _Tile, argument: str) -> None:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from engine.errors import MapError, OptionError
 from engine.maps.grids import Array, Grid, earth_crs, wgs84
-from engine.maps.raster_formats import OWN_TAGS, local_path, openable
+from engine.maps.raster_formats import OWN_TAGS, local_path, open_raster
 from engine.values import MAX_SIGMA_M, Window
 
 if TYPE_CHECKING:
@@ -139,12 +139,9 @@ def open_source(
     Raises:
         MapError: the file is missing, is not a supported raster, or cannot be placed on the Earth.
     """
-    import rasterio
-
     file = local_path(path, argument)
     with map_errors(argument, file):
-        what, driver = openable(file, argument)
-        dataset = rasterio.open(what, driver=driver)
+        dataset = open_raster(file, argument)
         transform, own_crs = dataset.transform, dataset.crs
     if dataset.count == 0:
         names = ", ".join(name.rpartition(":")[2] for name in dataset.subdatasets)

@@ -202,7 +202,7 @@ def test_a_geopackage_of_several_rasters_or_none_is_refused(tmp_path, plain):
     with closing(sqlite3.connect(path)) as base:
         base.execute("UPDATE gpkg_contents SET data_type = 'features'")
         base.commit()
-    with pytest.raises(MapError, match=r"map: cannot read .*map\.gpkg"):
+    with pytest.raises(MapError, match=r"map: expected a raster file .*map\.gpkg"):
         OrthoMap.open(path)
 
 
@@ -210,7 +210,7 @@ def test_a_geopackage_of_several_rasters_or_none_is_refused(tmp_path, plain):
     ("name", "content", "words"),
     [
         ("a.mbtiles", b"hello", "expected a raster file"),
-        ("b.mbtiles", b"SQLite format 3\0 and nothing more", "cannot read"),
+        ("b.mbtiles", b"SQLite format 3\0 and nothing more", "expected a raster file"),
         ("c.gpkg", b"SQLite format 3\0".ljust(68, b"\0") + b"GPKG" + bytes(100), "cannot read"),
     ],
 )
