@@ -17,7 +17,7 @@ from engine.kernels.search_levels import MAX_HALVINGS
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, tiles_under, widened, within
 from engine.ncc_fft import MapRegion, prepare
-from engine.runtime.device import Device, Picture, on_host, to_device
+from engine.runtime.device import Device, Picture, to_device
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -84,20 +84,6 @@ class PreparedMap:
         if region.valid is None or region.mask is None or region.mask[part].all():
             return Region(aligned, replace(search, counts=None), None)
         return Region(aligned, search, region.valid[part], region.mask[part])
-
-    def enhanced(self, window: Window, level: int) -> tuple[FloatImage, NDArray[np.bool_] | None]:
-        """The enhanced picture of a window, from prepared regions; equals :func:`enhanced_part`.
-
-        Args:
-            window: in pixels of the level, inside it.
-            level: of the map's pyramid.
-
-        Returns:
-            (H, W) float32, and (H, W) bool, False on nodata; None if all pixels are valid.
-        """
-        region = self.cut(window, level)
-        inner = within(window, region.window)
-        return on_host(region.search.image)[inner], None if region.mask is None else region.mask[inner]
 
     def _region(self, window: Window, level: int) -> Region:
         """The most recently used region that contains a window, or a new one."""

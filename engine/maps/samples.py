@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import cv2
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.dense import Samples
-from engine.maps.prepared import FloatImage
+from engine.maps.prepared import enhanced_part
 from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, tiles_under
@@ -19,8 +18,6 @@ from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
     from engine.orthomap import OrthoMap
-
-Enhanced = Callable[[Window, int], tuple[FloatImage, NDArray[np.bool_] | None]]
 
 BLOCK_PX = 4
 """Every block with this side gives one sample: the pixel with the steepest gradient."""
@@ -34,15 +31,15 @@ class SampleMap:
 
     Args:
         site: the map.
-        enhanced: a window of a level of the same map, enhanced, and its mask; see
-            :func:`engine.maps.prepared.enhanced_part`.
+        radius_px: of the local normalisation, see :func:`engine.kernels.scores.enhance`.
+        score: see :func:`engine.kernels.scores.enhance`.
 
     Attributes:
         cells: sampled so far, by window and level; the least recently used are evicted.
     """
 
-    def __init__(self, site: OrthoMap, enhanced: Enhanced) -> None:
-        self._site, self._enhanced = site, enhanced
+    def __init__(self, site: OrthoMap, radius_px: int, score: str = "local") -> None:
+        self._site, self._radius_px, self._score = site, radius_px, score
         self.cells = RecentlyUsed(self._sampled, lambda key, _: int(key[0].area_px), COARSE_LIMIT_PX)
 
     def find(self, window: Window, level: int, max_samples: int = MAX_SAMPLES) -> Samples:
@@ -84,7 +81,7 @@ class SampleMap:
 
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
         """Samples of a cell, row by row, and the number of their rows and columns."""
-        picture, mask = self._enhanced(cell, level)
+        picture, mask = enhanced_part(self._site, self._radius_px, self._score, cell, level)
         across, down = (cv2.Sobel(picture, cv2.CV_32F, i, 1 - i, ksize=1, scale=0.5) for i in (1, 0))
         shape = (picture.shape[0] // BLOCK_PX, picture.shape[1] // BLOCK_PX)
         rows, columns = _steepest(cv2.magnitude(across, down), shape)

@@ -59,8 +59,9 @@ class Ncc(Method):
 
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         self.options = options.ncc
-        self.prepared = PreparedMap(site, device, self.options.enhance_radius_px, self.options.score)
-        self.samples = SampleMap(site, self.prepared.enhanced)
+        enhancement = self.options.enhance_radius_px, self.options.score
+        self.prepared = PreparedMap(site, device, *enhancement)
+        self.samples = SampleMap(site, *enhancement)
 
     @property
     def cache_counters(self) -> dict[str, int]:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import replace
-from functools import partial
 from typing import TypeGuard
 
 from engine.features import chosen_backend, prepare_plans
 from engine.maps.landmarks import LandmarkMap
-from engine.maps.prepared import enhanced_part
 from engine.maps.samples import SampleMap
 from engine.matching.align import SIDE_STEP_PX
 from engine.matching.evidence import Candidate
@@ -68,8 +66,7 @@ class Sift(Method):
         )
         self._enhancement = replace(options.ncc, errors=options.sift.errors)
         if samples is None:
-            radius_px, score = options.ncc.enhance_radius_px, options.ncc.score
-            samples = SampleMap(site, partial(enhanced_part, site, radius_px, score))
+            samples = SampleMap(site, options.ncc.enhance_radius_px, options.ncc.score)
         self.samples = samples
 
     @property

@@ -1,17 +1,12 @@
-"""Samples of the map: where large levels end, and without a prepared map."""
+"""Samples of the map: where large levels end."""
 
 import itertools
-from dataclasses import fields
-from functools import partial
 
 import numpy as np
 import pytest
-import torch
 
 from engine import OrthoMap
-from engine.kernels.dense import Samples
-from engine.maps import prepared, samples
-from engine.maps.prepared import PreparedMap
+from engine.maps import samples
 from engine.maps.samples import BLOCK_PX, SampleMap
 from engine.maps.tiles import TILE_PX
 from engine.values import Window
@@ -23,14 +18,13 @@ def make_map(height_px, width_px):
     """Samples of a rough map whose levels all count as large, and the map."""
     gray = np.random.default_rng(1).integers(0, 256, (height_px, width_px), dtype=np.uint8)
     site = OrthoMap.from_arrays(gray, AFFINE, "EPSG:32633", surface_m=np.zeros(gray.shape, np.float32))
-    return SampleMap(site, PreparedMap(site, torch.device("cpu"), 8).enhanced), site
+    return SampleMap(site, 8), site
 
 
 @pytest.fixture
 def by_cells(monkeypatch):
     """No level is small enough to be taken as a whole."""
     monkeypatch.setattr(samples, "WHOLE_LEVEL_PX", 0)
-    monkeypatch.setattr(prepared, "WHOLE_LEVEL_PX", 0)
 
 
 @pytest.mark.parametrize("more_px", [0, 1, 2, 3, 4, 5])
@@ -44,13 +38,3 @@ def test_a_level_may_end_anywhere_beyond_a_cell(more_px, by_cells):
     columns = range((width_px - 40) // BLOCK_PX, width_px // BLOCK_PX)
     rows = range((height_px - 30) // BLOCK_PX, height_px // BLOCK_PX)
     assert sorted(map(tuple, blocks.tolist())) == list(itertools.product(columns, rows))
-
-
-def test_samples_are_the_same_with_and_without_a_prepared_map(by_cells):
-    """A method that does not correlate enhances the map for its samples alone."""
-    sampled, site = make_map(2 * TILE_PX, 2 * TILE_PX)
-    alone = SampleMap(site, partial(prepared.enhanced_part, site, 8, "local"))
-    for window, level in ((Window(100, 90, 300, 280), 0), (Window(20, 30, 120, 100), 1)):
-        for field in fields(Samples):
-            expected, actual = (getattr(one.find(window, level), field.name) for one in (sampled, alone))
-            np.testing.assert_array_equal(actual, expected)
