@@ -156,13 +156,16 @@ class Camera:
 
     @classmethod
     def _from_camera_info(cls, info: dict[str, Any]) -> Camera:
-        def numbers(name: str) -> Array:
+        def numbers(name: str, count: int | None = None) -> Array:
             block = info[name]
             data = block.get("data") if isinstance(block, dict) else block
             try:
-                return np.asarray(data, dtype=np.float64).ravel()
+                values = np.asarray(data, dtype=np.float64).ravel()
             except (TypeError, ValueError):
                 raise CalibrationError(f"{name}: expected numbers, got {str(data)[:60]!r}") from None
+            if count not in (None, values.size):
+                raise CalibrationError(f"{name}: expected {count} numbers, got {values.size}")
+            return values
 
         def pixels(name: str) -> int:
             value = info[name]
@@ -170,13 +173,7 @@ class Camera:
                 raise CalibrationError(f"{name}: expected a whole number of pixels, got {value!r}")
             return value
 
-        def matrix(name: str) -> Array:
-            values = numbers(name)
-            if values.size != 9:
-                raise CalibrationError(f"{name}: expected 9 numbers, got {values.size}")
-            return values.reshape(3, 3)
-
-        pinhole, model = matrix("camera_matrix"), str(info.get("distortion_model", "plumb_bob"))
+        pinhole, model = numbers("camera_matrix", 9), str(info.get("distortion_model", "plumb_bob"))
         distortion = numbers("distortion_coefficients") if "distortion_coefficients" in info else np.zeros(0)
         if not distortion.any():  # ROS writes an ideal camera as none, four or five zeros
             distortion = np.zeros(DISTORTION_MODELS.get(model, (5,))[-1])
@@ -186,8 +183,9 @@ class Camera:
         if isinstance(named, str):
             mount = mount_rotation(named, None if pitch_deg is None else float(pitch_deg))
         else:
-            mount = matrix("mount")
-        return cls(pixels("image_width"), pixels("image_height"), pinhole, model, distortion, mount)
+            mount = numbers("mount", 9).reshape(3, 3)
+        size = pixels("image_width"), pixels("image_height")
+        return cls(*size, pinhole.reshape(3, 3), model, distortion, mount)
 
     def scaled_to(self, width_px: int, height_px: int) -> Camera:
         """The same camera with its pictures resized as a whole, without cropping.
