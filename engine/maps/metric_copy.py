@@ -27,7 +27,7 @@ from engine.maps.tiles import tiles_under
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
 
-GRID_VERSION = 2
+GRID_VERSION = 3
 """Part of the key of cached copies; raise it with every change in how they are created."""
 FACTORS = [2, 4, 8, 16, 32]
 """Of the overviews of a large copy. The file is padded to a multiple, so that their pixels lie on the levels'."""
