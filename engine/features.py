@@ -18,9 +18,7 @@ References:
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,14 +36,13 @@ from engine.runtime.device import (
 )
 from engine.sift import BACKENDS
 from engine.sift.matching import match
-from engine.sift.scale_space import octaves_of
 from engine.sift.values import Features, Matches, SiftChoice, fields_of
 
 if TYPE_CHECKING:
     from engine.runtime.tensors import torch
 
 _MAX_MAGNITUDE = 1e6  # of a pixel's value
-__all__ = ["Features", "Matches", "chosen_backend", "match", "plans_created", "prepare_plans", "sift"]
+__all__ = ["Features", "Matches", "chosen_backend", "match", "sift"]
 
 
 def sift(
@@ -123,26 +120,6 @@ def chosen_backend(backend: str, device: Device | torch.device) -> str:
     if backend == "compiled" and device.type != "cpu":
         raise OptionError(f"backend: expected auto or kornia for images on {device}, got 'compiled'")
     return backend
-
-
-def prepare_plans(sides_px: Iterable[int]) -> None:
-    """Compute the compiled backend's filters for pictures with these sides, so that none is computed in flight.
-
-    Args:
-        sides_px: of the pictures.
-    """
-    from engine.sift import loops  # numba takes a while to import
-
-    for side_px, upsample in itertools.product(sides_px, (1, 2)):
-        for octave in octaves_of(side_px, side_px, upsample):
-            loops.filters(octave.source[0], octave.sigmas, octave.up)
-
-
-def plans_created() -> int:
-    """Number of filters computed so far, by length of a picture's side; a flight of one camera needs a few."""
-    from engine.sift import loops  # numba takes a while to import
-
-    return loops.filters.cache_info().misses
 
 
 def _check_images(images: Picture, mask: Picture | None) -> None:

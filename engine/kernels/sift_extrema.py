@@ -16,18 +16,15 @@ TAPS = 4
 _STRIP = np.dtype(np.uint64).itemsize  # rows of the octave written at a time: as many as a word has flags
 
 
-@compiled(
-    "(f4[:, ::1], Tuple((f4[:, :, ::1], i8[::1], f4[:, :, ::1])), Tuple((f4[:, :, ::1], i8[::1], f4[:, :, ::1])), "
-    "f4[::1], UniTuple(i8, 5), UniTuple(i8, 2), i8, f4)"
-)
-def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
+@compiled("(f4[:, ::1], Tuple((f4[:, :, ::1], i8[::1])), f4[::1], UniTuple(i8, 5), UniTuple(i8, 2), i8, f4)")
+def find_extrema(padded, filters, buffer, layout, rows, border, threshold):
     """Write the Gaussian levels of one picture's octave, and find the extrema of their differences.
 
     Args:
-        source: (H, W) float32.
-        across: filters of the rows from :func:`engine.sift.loops.filters`: output ``up m + p`` of level l is its
-            gain times the sum over k of ``weights[l, p, k] source[m + k - reach[l]]``, zero beyond the edges.
-        down: filters of the columns.
+        padded: (H, W) float32, the picture extended beyond all its edges by a margin of :data:`TAPS` more than the
+            longest reach.
+        filters: of both axes, from :func:`engine.sift.loops.filters`: output ``up m + p`` of level l is the sum
+            over k of ``weights[l, p, k] source[m + k - reach[l]]``.
         buffer: (N,) float32 that the levels are written to.
         layout: (height, width, offset, stride of a level, stride of a row) of the octave.
         rows: (first, end) of the rows that are searched; their neighbours are written too.
@@ -38,12 +35,10 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
         (M, 3) int64 level, y, x of the voxels where |DoG| is the maximum of its 3 x 3 x 3.
     """
     height, width, _, _, _ = layout
-    up, dogs = across[0].shape[1], len(down[1]) - 1
-    margin = _padding(down[1])  # both axes have the same filters
+    up, dogs = filters[0].shape[1], len(filters[1]) - 1
     low, high = max(rows[0] - 1, 0) // up, min(rows[1], height - 1) // up + 1  # rows of the source
     searched = max(rows[0], border), min(rows[1], height - border)
-    tall, start = _between_zeros(source, margin, low, high), low - margin
-    wide = source.shape[1] + 2 * margin
+    wide, flat, margin = padded.shape[1], padded.reshape(padded.size), filters[1].max() + TAPS
     lines = np.empty((up, _STRIP // up * wide), np.float32)
     filtered = np.empty((2, _STRIP // up * wide), np.float32)
     sizes = np.zeros((dogs, (_STRIP + 2) * width), np.float32)  # |DoG| of a strip and of the two rows before it
@@ -53,32 +48,12 @@ def find_extrema(source, across, down, buffer, layout, rows, border, threshold):
         held = min(_STRIP // up, high - row)
         strip = up * row, min(up * (row + held), height)
         for level in range(dogs + 1):
-            _filter_down(lines, held * wide, tall, (row - start) * wide, wide, level, down)
-            _filter_across(buffer, lines, held * wide, filtered, wide, strip, level, across, down, layout)
+            _filter_down(lines, held * wide, flat, (margin + row) * wide, wide, level, filters)
+            _filter_across(buffer, lines, held * wide, filtered, wide, strip, level, filters, layout, margin)
         _differ(sizes, buffer, strip, layout)
         if width > 2 * border:
             found, count = _extrema_of_strip(sizes, width, strip, searched, border, threshold, work, found, count)
     return found[:count]
-
-
-@inlined
-def _padding(reach):
-    """Samples beyond the ends of an axis that some filter of any level reads."""
-    return reach.max() + TAPS
-
-
-@inlined
-def _between_zeros(source, margin, low, high):
-    """Rows that the filters of rows ``low`` to ``high`` read, flat, zeros beyond the picture and in a margin."""
-    height, width = source.shape
-    start, wide = low - margin, width + 2 * margin
-    tall = np.zeros((high + margin - start) * wide, np.float32)
-    for y in range(max(start, 0), min(high + margin, height)):
-        at = (y - start) * wide + margin
-        row = tall[at : at + width]
-        for x in range(width):  # an assignment of slices would compile its message of unequal shapes
-            row[x] = source[y, x]
-    return tall
 
 
 @inlined
@@ -88,28 +63,26 @@ def _taps(reach, up):
 
 
 @inlined
-def _filter_down(lines, size, tall, at, wide, level, down):
+def _filter_down(lines, size, flat, at, wide, level, filters):
     """Filter the columns about a strip of the source that begins at ``at``: its rows once for each phase."""
-    weights, reach, _ = down
+    weights, reach = filters
     start, taps = at - reach[level] * wide, _taps(reach[level], len(lines))
-    _slide_phases(lines, size, tall, start, wide, weights[level], taps)
+    _slide_phases(lines, size, flat, start, wide, weights[level], taps)
 
 
 @inlined
-def _filter_across(buffer, lines, size, filtered, wide, strip, level, across, down, layout):
-    """Filter a strip along its rows, and write it with the gains that make up for the edges."""
-    height, width, offset, per_level, per_row = layout
-    weights, reach, gains = across
+def _filter_across(buffer, lines, size, filtered, wide, strip, level, filters, layout, margin):
+    """Filter a strip along its rows, and write it."""
+    _, width, offset, per_level, per_row = layout
+    weights, reach = filters
     up, along = len(lines), np.int64(1)
-    start, taps = _padding(reach) - reach[level], _taps(reach[level], up)
-    size -= 2 * _padding(reach)  # the last row's margin is only read
+    start, taps = margin - reach[level], _taps(reach[level], up)
+    size -= 2 * margin  # the last row's margin is only read
     for phase in range(up):
         _slide_phases(filtered, size, lines[phase], start, along, weights[level], taps)
         for y in range(strip[0] + phase, strip[1], up):
             at, begin = offset + level * per_level + y * per_row, (y - strip[0]) // up * wide
-            out = buffer[at : at + width]
-            _interleave(out, filtered, begin, up)
-            _apply_gains(out, gains[:, level], _gain_of(down[2], level, y, height))
+            _interleave(buffer[at : at + width], filtered, begin, up)
 
 
 @inlined
@@ -125,28 +98,6 @@ def _interleave(out, filtered, begin, up):
         out[2 * x + 1] = odd[x]
     if out.size % 2:  # an upsampled row ends with an even place
         out[out.size - 1] = even[out.size // 2]
-
-
-@inlined
-def _apply_gains(out, gains, gain):
-    """Apply the gains of the first and of the last columns, and that of the row."""
-    edge, width = gains.shape[1], out.size
-    for x in range(edge):
-        out[x] *= gains[0, x]
-    for x in range(max(edge, width - edge), width):
-        out[x] *= gains[1, x - width + edge]
-    if gain != 1:
-        for x in range(width):
-            out[x] *= gain
-
-
-@inlined
-def _gain_of(gains, level, y, height):
-    """The gain of one output along an axis; gains are stored for its first and last outputs."""
-    edge = gains.shape[2]
-    if y < edge:
-        return gains[0, level, y]
-    return gains[1, level, y - height + edge] if y >= height - edge else np.float32(1)
 
 
 @inlined

@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # a map is built on what lies here
 
 Array = NDArray[np.float64]
 
-DETECTOR_VERSION = 3
+DETECTOR_VERSION = 4
 """Part of the key of cached landmarks; raise it with every change of detector or descriptor."""
 MIN_CONTRAST = 0.005
 """Lowe's contrast threshold: bare ground has little; elsewhere the strongest are taken."""

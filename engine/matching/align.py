@@ -210,7 +210,7 @@ def _inscribed_size(view: GroundView, shape: tuple[int, ...]) -> tuple[int, int]
 MAX_FIELD_DEG = 70.0
 """Ground farther off the vertical than this angle is ignored: it is far away and foreshortened."""
 SIDE_STEP_PX = 16
-"""Least side of an orthorectified frame, and its step: a flight uses few sizes, and plans none in the air."""
+"""Least side of an orthorectified frame, and its step: a flight uses few sizes, and lays out none in the air."""
 MAX_PICTURE_PX = WHOLE_LEVEL_PX
 """Most pixels of one; if it would need more, the height is out of proportion to the map."""
 RIM_PX = 5

@@ -36,12 +36,6 @@ _WARMUP_SHARES = (0.25, 0.12)  # of the map's shorter side that a synthetic fram
 _WARMUP_SIDE_PX = 4096  # of a larger map only a part with this side is used
 
 
-def _plans_created() -> int:
-    """Number of filters that SIFT computed so far; 0, without importing its module, if it is unused."""
-    features = sys.modules.get("engine.features")
-    return 0 if features is None else int(features.plans_created())
-
-
 def _give_back_memory() -> None:
     """Return the warm-up's memory to the system: glibc keeps it otherwise."""
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
@@ -146,8 +140,7 @@ class SceneMatcher:
     @property
     def cache_counters(self) -> dict[str, int]:
         """How many entries of each cache were created so far; after :meth:`warmup` none rises on a small map."""
-        shared = {"feature plans": _plans_created(), "compiled loops": loops_compiled()}
-        return self._method.cache_counters | shared
+        return self._method.cache_counters | {"compiled loops": loops_compiled()}
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """The camera's position when the frame was taken.

@@ -6,10 +6,8 @@ from collections.abc import Callable, Hashable
 from dataclasses import replace
 from typing import TypeGuard
 
-from engine.features import chosen_backend, prepare_plans
 from engine.maps.landmarks import LandmarkMap
 from engine.maps.samples import SampleMap
-from engine.matching.align import SIDE_STEP_PX
 from engine.matching.evidence import Candidate
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher
@@ -81,10 +79,6 @@ class Sift(Method):
 
     def warmup(self, query: Query) -> None:
         """Run every variant of every step, so that it is compiled and its cost known."""
-        # An orthophoto's side has at most twice the frame's pixels; half as many more if turned by 45 degrees.
-        longest_px = 3 * max(query.gray.shape)
-        if chosen_backend(self.options.backend, self.landmarks.device) == "compiled":
-            prepare_plans(range(SIDE_STEP_PX, longest_px + 1, SIDE_STEP_PX))
         efforts = Efforts(self, query)
         rehearse(query, efforts.few, None)
         for answer in rehearse(query, efforts.all, None):

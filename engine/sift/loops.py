@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels import sift_descriptors
 from engine.kernels.sift_extrema import TAPS, find_extrema
-from engine.kernels.sift_refinement import refine_extrema, spread_out
+from engine.kernels.sift_refinement import refine_extrema
 from engine.runtime import threads
 from engine.sift.descriptors import ORIENT_STEP, orientation_weights, tents
 from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, TRUNCATE, Octave, octaves_of
@@ -22,7 +23,7 @@ from engine.sift.values import Features, SiftChoice
 
 AnyArray = NDArray[Any]
 Floats = NDArray[np.float32]
-Filters = tuple[Floats, NDArray[np.int64], Floats]
+Filters = tuple[Floats, NDArray[np.int64]]
 
 _BORDER = 4  # octave pixels along the edge without keypoints
 _EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
@@ -36,12 +37,12 @@ class LoopPlan:
     """What the loops need to know of pictures of one shape.
 
     Attributes:
-        octaves: layout in the buffer of Gaussian levels, the filters along x and along y.
+        octaves: layout in the buffer of Gaussian levels.
         table: (octaves, 5) int64, the octaves' layouts.
         upsample: samples per image pixel of the first octave.
     """
 
-    octaves: tuple[tuple[Octave, Filters, Filters], ...]
+    octaves: tuple[Octave, ...]
     table: NDArray[np.int64]
     upsample: int
 
@@ -53,7 +54,7 @@ class LoopPlan:
 
 @lru_cache(maxsize=256)
 def plan_loops(height: int, width: int, upsample: int) -> LoopPlan:
-    """Lay out the octaves of a picture; the filters of its sides are shared with others.
+    """Lay out the octaves of a picture.
 
     Args:
         height: of the picture.
@@ -61,40 +62,20 @@ def plan_loops(height: int, width: int, upsample: int) -> LoopPlan:
         upsample: 1 or 2.
     """
     octaves = octaves_of(height, width, upsample)
-    filtered = []
-    for octave in octaves:
-        down, across = (filters(length, octave.sigmas, octave.up) for length in octave.source)
-        filtered.append((octave, across, down))
-    return LoopPlan(tuple(filtered), np.array([octave.layout for octave in octaves]), upsample)
+    return LoopPlan(octaves, np.array([octave.layout for octave in octaves]), upsample)
 
 
-@lru_cache(maxsize=4096)  # two kilobytes each; a camera of 1280 px has 1,400
-def filters(inputs: int, sigmas: tuple[float, ...], up: int) -> Filters:
+@lru_cache(maxsize=16)
+def filters(sigmas: tuple[float, ...], up: int) -> Filters:
     """Gaussian filters of all levels along one axis.
 
     Args:
-        inputs: pixels along the axis; ``up (inputs - 1) + 1`` come out.
         sigmas: of the levels, in pixels of the input; 0 copies.
         up: outputs per input, 1 or 2.
 
     Returns:
-        Weights (levels, up, taps); reach (levels,) to either side, in pixels of the input; and the gains
-        (2, levels, E) of the first and of the last E outputs, which compensate for what a filter misses beyond an
-        edge; all others have 1.
+        Weights (levels, up, taps), and reach (levels,) to either side in pixels of the input.
     """
-    weights, reach, below = _weights(sigmas, up)
-    outputs = up * (inputs - 1) + 1
-    edge = min(outputs, up * (int(reach.max()) + 1))
-    index = np.array([np.arange(edge), np.arange(outputs - edge, outputs)])[:, None]  # (2, 1, E)
-    taps, level = below.shape[2] - 1, np.arange(len(reach))[:, None]
-    first, end = (np.clip(limit + reach[:, None] - index // up, 0, taps) for limit in (0, inputs))
-    gains = 1.0 / (below[level, index % up, end] - below[level, index % up, first])
-    return weights, reach, gains.astype(np.float32)
-
-
-@lru_cache(maxsize=16)
-def _weights(sigmas: tuple[float, ...], up: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.float64]]:
-    """Weights (levels, up, taps), reach (levels,), and the sums (levels, up, taps + 1) of those before a tap."""
     reach = np.ceil(TRUNCATE * np.array(sigmas)).astype(np.int64)
     taps = -(-(2 * reach.max() + up) // TAPS) * TAPS
     offsets = np.arange(taps) - reach[:, None, None]  # (levels, 1, taps)
@@ -102,8 +83,7 @@ def _weights(sigmas: tuple[float, ...], up: int) -> tuple[Floats, NDArray[np.int
     weights = np.exp(-0.5 * ((offsets - phase) / np.maximum(np.array(sigmas), 1e-3).reshape(-1, 1, 1)) ** 2)
     weights *= offsets < reach[:, None, None] + up
     weights /= weights.sum(-1, keepdims=True)
-    below = np.concatenate([np.zeros_like(weights[..., :1]), weights.cumsum(-1)], axis=-1)
-    return weights.astype(np.float32), reach, below
+    return weights.astype(np.float32), reach
 
 
 def find_features(pictures: Floats, allowed: NDArray[np.bool_] | None, choice: SiftChoice) -> Features:
@@ -156,22 +136,23 @@ def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Fl
     Returns:
         The Gaussian levels (N,), which the thread's next call overwrites; and keypoints (K, 6).
     """
-    buffer = threads.own_array("scale space", (plan.octaves[-1][0].end,), np.float32)
+    buffer = threads.own_array("scale space", (plan.octaves[-1].end,), np.float32)
     found, source = [], image
     threshold = contrast_threshold / SCALES
     limits = (SCALES, _MOVES, threshold, _MAX_SHIFT, EDGE_RATIO)
-    for number, (octave, across, down) in enumerate(plan.octaves):
-        layout = octave.layout
-        early = np.float32(_EARLY * threshold)
+    for number, octave in enumerate(plan.octaves):
+        layout, of_octave = octave.layout, filters(octave.sigmas, octave.up)
+        early, margin = np.float32(_EARLY * threshold), int(of_octave[1].max()) + TAPS
+        padded = cv2.copyMakeBorder(source, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
         # Each part filters again what its neighbours' filters reach, and has at least as many rows of its own.
         voxels = _in_parts(
-            lambda part: find_extrema(source, across, down, buffer, layout, part, _BORDER, early),  # noqa: B023
-            threads.parts(octave.height, octave.height // (2 * octave.up * int(down[1].max()))),
+            lambda part: find_extrema(padded, of_octave, buffer, layout, part, _BORDER, early),  # noqa: B023
+            threads.parts(octave.height, octave.height // (2 * octave.up * margin)),
         )
         found.append(refine_extrema(buffer, layout, voxels, limits, number))
         start = octave.offset + SCALES * octave.per_level
         level = buffer[start : start + octave.per_level].reshape(octave.height, octave.width)
-        source = np.ascontiguousarray(level[::2, ::2])
+        source = level[::2, ::2]
     return buffer, np.concatenate(found)
 
 
@@ -201,12 +182,20 @@ def strongest(
         allowed = mask[row, column]
         keypoints, x, y = keypoints[allowed], x[allowed], y[allowed]
     order = np.argsort(-keypoints[:, _CONTRAST] * np.sqrt(scale_px(keypoints)), kind="stable")
-    octave = plan.octaves[0][0]
+    octave = plan.octaves[0]
     column = np.clip((x * (plan.upsample * spread / octave.width)).astype(np.int64), 0, spread - 1)
     row = np.clip((y * (plan.upsample * spread / octave.height)).astype(np.int64), 0, spread - 1)
-    share = 2 * max_keypoints / spread**2
-    kept = spread_out((row * spread + column)[order], spread**2, share, max_keypoints)
+    is_crowded = _rank((row * spread + column)[order]) >= 2 * max_keypoints / spread**2
+    kept = np.argsort(is_crowded, kind="stable")[:max_keypoints]
     return np.asarray(keypoints[order[kept]], np.float32)
+
+
+def _rank(group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many before each element (N,) are of the same group."""
+    order = np.argsort(group, kind="stable")
+    rank, ordered = np.empty_like(order), group[order]
+    rank[order] = np.arange(len(group)) - np.searchsorted(ordered, ordered)
+    return rank
 
 
 def dominant_angle(gaussians: Floats, keypoints: Floats, plan: LoopPlan) -> Floats:

@@ -11,8 +11,7 @@ from bench.accuracy.quality import ViewPair, judge, mean
 from bench.inputs.views import by_homography
 from bench.speed.detectors import detectors
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.features import Features, chosen_backend, match, plans_created, prepare_plans, sift
-from engine.sift import loops
+from engine.features import Features, chosen_backend, match, sift
 from tests.support.matches import pairs_of
 from tests.support.tensors import assert_close
 
@@ -277,13 +276,3 @@ def test_a_picture_that_requires_a_gradient_has_the_same_features(backend):
     image = torch.rand(1, 1, 60, 70, generator=torch.Generator().manual_seed(4))
     expected, found = (sift(i, backend=backend) for i in (image, image.clone().requires_grad_()))
     assert torch.equal(found.descriptors, expected.descriptors)
-
-
-def test_after_preparation_no_rectangle_lacks_a_filter():
-    """Of a camera of 1280 px: the sides of an orthophoto reach three times as far."""
-    prepare_plans(range(16, 3 * 1280 + 1, 16))
-    before = plans_created()
-    for height, width in np.random.default_rng(6).integers(1, 241, (300, 2)) * 16:
-        for upsample in (1, 2):
-            loops.plan_loops(int(height), int(width), upsample)
-    assert plans_created() == before

@@ -37,7 +37,7 @@ def plan(request):
 
 
 def octaves(plan):
-    return tuple(octave for octave, _, _ in plan.octaves)
+    return plan.octaves
 
 
 def shaped(buffer, plan):

@@ -17,12 +17,16 @@ BORDER, EARLY, MOVES, MAX_SHIFT, EDGE_RATIO = 4, 0.8, 2, 0.7, 10.0
 
 
 def gaussian_matrix(inputs: int, sigma: float, up: int) -> Array:
-    """(outputs, inputs): G[i, j] ~ exp(-(i / up - j)^2 / (2 sigma^2)) within 3 sigma, rows of sum 1."""
-    out, source = np.arange(up * (inputs - 1) + 1)[:, None], np.arange(inputs)
+    """(outputs, inputs): G[i, j] ~ exp(-(i / up - j)^2 / (2 sigma^2)) within 3 sigma, mirrored at the ends."""
     near = math.ceil(3.0 * sigma)
+    out, source = np.arange(up * (inputs - 1) + 1)[:, None], np.arange(-near, inputs + near + up)
     weights = np.exp(-0.5 * ((out / up - source) / max(sigma, 1e-3)) ** 2)
     weights *= (source - out // up >= -near) & (source - out // up < near + up)
-    return weights / weights.sum(axis=1, keepdims=True)
+    weights /= weights.sum(axis=1, keepdims=True)
+    folded = np.zeros((len(out), inputs))
+    for column, j in enumerate(np.pad(np.arange(inputs), (near, near + up), mode="reflect")):
+        folded[:, j] += weights[:, column]
+    return folded
 
 
 def levels_of(image: Array, octaves: tuple[Octave, ...]) -> list[Array]:
