@@ -124,8 +124,8 @@ def _normalised(picture: NDArray[np.uint8] | FloatImage, radius_px: int, weight:
         from engine.kernels import local_normalisation  # numba takes a while to import
 
         if radius_px <= local_normalisation.MAX_RADIUS_PX:
-            found = local_normalisation.normalised(np.ascontiguousarray(picture), radius_px, _NOISE_VARIANCE)
-            return np.asarray(found, np.float32)
+            padded = cv2.copyMakeBorder(picture, *(radius_px,) * 4, cv2.BORDER_REFLECT_101)
+            return np.asarray(local_normalisation.normalised(padded, radius_px, _NOISE_VARIANCE), np.float32)
     box = (2 * radius_px + 1, 2 * radius_px + 1)
     if weight is None:
         mean = cv2.boxFilter(picture, cv2.CV_32F, box)

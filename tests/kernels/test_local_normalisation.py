@@ -6,7 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine.kernels.local_normalisation import MAX_RADIUS_PX, normalised
+from engine.kernels import local_normalisation
+from engine.kernels.local_normalisation import MAX_RADIUS_PX
+
+
+def normalised(picture: np.ndarray, radius_px: int, noise_variance: float) -> np.ndarray:
+    padded = cv2.copyMakeBorder(picture, *(radius_px,) * 4, cv2.BORDER_REFLECT_101)
+    return local_normalisation.normalised(padded, radius_px, noise_variance)
 
 
 def by_definition(picture: np.ndarray, radius_px: int, noise_variance: float) -> np.ndarray:
