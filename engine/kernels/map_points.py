@@ -32,31 +32,3 @@ def bilinear_heights(grid, at, out):
         top = grid[row, column] * (1.0 - u) + grid[row, right] * u
         bottom = grid[below, column] * (1.0 - u) + grid[below, right] * u
         out[n] = top * (1.0 - v) + bottom * v
-
-
-@compiled("(Tuple((f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])), UniTuple(i8, 2), UniTuple(i8, 2), i8, i8)")
-def every_nth(arrays, first, last, columns, step):
-    """Every so manieth sample of a part of a grid of samples.
-
-    Args:
-        arrays: of (N, 3), (N,), (N, 2) and (N,) float64, row by row of the grid.
-        first: (row, column) where the part begins.
-        last: (row, column) behind its last ones.
-        columns: of the whole grid.
-        step: from one sample to the next, counted along the rows of the part.
-
-    Returns:
-        The same four arrays of these samples.
-    """
-    points, values, gradients, weights = arrays
-    width = last[1] - first[1]
-    count = ((last[0] - first[0]) * width + step - 1) // step  # 0 of an empty part
-    some_points, some_values = np.empty((count, 3)), np.empty(count)
-    some_gradients, some_weights = np.empty((count, 2)), np.empty(count)
-    for n in range(count):
-        at = (first[0] + n * step // width) * columns + first[1] + n * step % width
-        some_values[n], some_weights[n] = values[at], weights[at]
-        for k in range(3):
-            some_points[n, k] = points[at, k]
-        some_gradients[n, 0], some_gradients[n, 1] = gradients[at, 0], gradients[at, 1]
-    return some_points, some_values, some_gradients, some_weights

@@ -1,4 +1,4 @@
-"""Rotations and linear equations of a few unknowns for the compiled pose fits.
+"""Rotations and linear equations of a few unknowns for the compiled fits.
 
 Scalars and loops only: an expression of whole arrays takes numba longer to compile than all of these together.
 """

@@ -53,8 +53,6 @@ class SampleMap:
         Returns:
             Samples: in metres east, north and up.
         """
-        from engine.kernels.map_points import every_nth  # numba takes a while to import
-
         step, parts = math.ceil(window.area_px / BLOCK_PX**2 / max_samples), []
         cells = self._cells_under(window, level)
         found = self.cells.get(*((cell, level) for cell in cells))
@@ -65,8 +63,12 @@ class SampleMap:
                 min(columns, -(-(x + window.width_px) // BLOCK_PX)),
             )  # blocks; the remainder beyond a cell's last block has none
             first = (min(max(0, y // BLOCK_PX), last[0]), min(max(0, x // BLOCK_PX), last[1]))
-            arrays = (samples.points_m, samples.values, samples.gradients, samples.weights)
-            parts.append(every_nth(arrays, first, last, columns, step))
+            width = last[1] - first[1]
+            n = np.arange(0, (last[0] - first[0]) * width, step)
+            row, column = np.divmod(n, max(width, 1))
+            at = (first[0] + row) * columns + first[1] + column
+            fields = (samples.points_m, samples.values, samples.gradients, samples.weights)
+            parts.append([field.take(at, axis=0) for field in fields])
         if len(parts) == 1:
             return Samples(*parts[0])
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
