@@ -6,15 +6,18 @@ of products is one dot product of contiguous memory, and the next position is th
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels.sums import FLAT_SHARE, box_sum
+from engine.kernels.sums import FLAT_SHARE, box_sum, integrals, masked_scores
 
 FloatImage = NDArray[np.float32]
 Sums = NDArray[np.float64]
 Index = NDArray[np.int64]
 Counts = NDArray[np.int32]
+Flat = NDArray[np.float32]
 
 
 class LocalScores:
@@ -38,7 +41,7 @@ class LocalScores:
         counts: Counts | None = None,
         min_overlap: float = 0.0,
     ) -> None:
-        from engine.kernels import surface_loops
+        from engine.kernels import blocks  # numba takes a while to import
 
         h, w = template.shape
         self.limits = (image.shape[0] - h, image.shape[1] - w)
@@ -47,29 +50,19 @@ class LocalScores:
         y1, x1 = min(self.limits[0], middle[0] + self.REACH), min(self.limits[1], middle[1] + self.REACH)
         self._row = w + x1 - x0
         patch = np.ascontiguousarray(image[y0 : y1 + h, x0 : x1 + w])
-        self._patch = patch.ravel()
         padded = np.zeros((h, self._row), np.float32)
         padded[:, :w] = template
-        self._template = padded.ravel()[: (h - 1) * self._row + w]
-        # The patches' sums of squares about their means, at every position within reach.
-        self._total, square = surface_loops.box_sums(patch, h, w)
-        self._energy = float(np.dot(self._template, self._template))
-        energy = np.maximum(square - self._total * self._total / (h * w), 0.0) * self._energy
-        self._inverse_norm = np.divide(1.0, np.sqrt(energy), out=np.zeros_like(energy), where=energy > 0)
-        self._count: NDArray[np.float64] | None = None
+        self._patch, self._template = patch.ravel(), padded.ravel()[: (h - 1) * self._row + w]
+        self._energy, self._valid = float(np.dot(self._template, self._template)), None
         if counts is not None:
             counts = counts[y0 : y1 + h + 1, x0 : x1 + w + 1]
-            count = box_sum(counts, h, w)
-            if (count < h * w).any():
-                self._mask(counts, count.astype(np.float64), square, max(min_overlap * (h * w), 1.0))
-
-    def _mask(self, counts: Counts, count: Sums, square: Sums, least: float) -> None:
-        """Prepare the sums of positions that reach over the mask's edge."""
-        valid = box_sum(counts, 1, 1).astype(np.float32)
-        self._valid, self._squares = valid.ravel(), self._template * self._template
-        self._count, self._least = count, least
-        self._spread = square - self._total * self._total / np.maximum(count, 1.0)
-        self._floor = FLAT_SHARE * float(square.max(initial=0.0))
+            self._count, self._least = box_sum(counts, h, w), max(min_overlap * (h * w), 1.0)
+            if (self._count < h * w).any():
+                self._valid = box_sum(counts, 1, 1).astype(np.float32).ravel()
+                self._squares, self._sums = self._template**2, box_sum(integrals(patch), h, w)
+        if self._valid is None:
+            scale = 1.0 / math.sqrt(self._energy) if self._energy > 0.0 else 0.0
+            self._inverse_norm = blocks.inverse_norm(patch, h, w) * scale
 
     def at(self, y: Index, x: Index) -> Sums:
         """Scores at positions at which the template fits.
@@ -82,22 +75,16 @@ class LocalScores:
             (N,) float64 in [-1, 1].
         """
         j, i = y - self._corner[0], x - self._corner[1]
-        template, patch, size = self._template, self._patch, self._template.size
-        products = [np.dot(patch[k : k + size], template) for k in (j * self._row + i).tolist()]
-        if self._count is not None:
-            return self._masked(np.array(products, np.float64), j, i)
-        scores: Sums = products * self._inverse_norm[j, i]
-        return scores.clip(-1.0, 1.0)
+        places = (j * self._row + i).tolist()
+        products = self._products(self._patch, self._template, places)
+        if self._valid is None:
+            return (products * self._inverse_norm[j, i]).clip(-1.0, 1.0)
+        of_model, of_squares = (self._products(self._valid, m, places) for m in (self._template, self._squares))
+        total, square, count = *self._sums[:, j, i], self._count[j, i]
+        floors = FLAT_SHARE * float(self._sums[1].max(initial=0.0)), FLAT_SHARE * self._energy
+        scores = masked_scores(products, of_model, of_squares, total, square, count, floors)
+        return np.asarray(np.where(count < self._least, -1.0, scores))
 
-    def _masked(self, products: Sums, j: Index, i: Index) -> Sums:
-        """Scores over only the valid pixels, from products of the picture (0 elsewhere) with the template."""
-        assert self._count is not None
-        size, places = self._template.size, (j * self._row + i).tolist()
-        sums = np.array([np.dot(self._valid[k : k + size], self._template) for k in places], np.float64)
-        squares = np.array([np.dot(self._valid[k : k + size], self._squares) for k in places], np.float64)
-        count = np.maximum(self._count[j, i], 1.0)
-        spread, model_spread = self._spread[j, i], squares - sums * sums / count
-        textured = (spread > self._floor) & (model_spread > FLAT_SHARE * self._energy)
-        norm = np.sqrt(spread * model_spread, out=np.ones_like(spread), where=textured)
-        scores = np.where(textured, (products - self._total[j, i] * sums / count) / norm, 0.0).clip(-1.0, 1.0)
-        return np.asarray(np.where(self._count[j, i] < self._least, -1.0, scores))
+    def _products(self, patch: Flat, model: Flat, places: list[int]) -> Sums:
+        """Sums of products of a model with a patch from each place on."""
+        return np.array([np.dot(patch[k : k + model.size], model) for k in places], np.float64)

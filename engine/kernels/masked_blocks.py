@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels import surface_loops
 from engine.kernels.blocks import MAX_BLOCKS, Mask, fast_side, spectrum_of, transform, write_surfaces
-from engine.kernels.sums import FLAT_SHARE, box_sum, check_finite, counts, integrals
+from engine.kernels.sums import FLAT_SHARE, box_sum, check_finite, counts, integrals, masked_scores
 
 Array = NDArray[np.float64]
 
@@ -101,7 +100,9 @@ def _score_partial(
         inner = np.s_[y : y + rows + h - 1, x : x + columns + w - 1]
         mask = valid[inner].astype(np.float32)
         values = np.where(valid[inner], window[inner] - np.float64(mean), 0.0)
-        boxes = integrals(values), counts(valid[inner])
+        at = asked[part]
+        total, square = (sums[at] for sums in box_sum(integrals(values), h, w))
+        count = box_sum(counts(valid[inner]), h, w)[at]
         spectrum_of(values, spectra[0])
         spectrum_of(mask, spectra[1])
         for t, model in enumerate(models):
@@ -109,8 +110,8 @@ def _score_partial(
             for product, (one, other) in zip(products, pairs, strict=True):
                 cv2.mulSpectrums(one, other, 0, product, True)
                 transform(product, cv2.DFT_INVERSE, rows)
-            floors = floor, FLAT_SHARE * model.energy
-            surface_loops.masked_scores(out[t][part], asked[part], products, boxes, (h, w), floors)
+            sums = [product[: at.shape[0], : at.shape[1]][at] / product.size for product in products]
+            out[t][part][at] = masked_scores(*sums, total, square, count, (floor, FLAT_SHARE * model.energy))
 
 
 def _blocks(asked: Mask, h: int, w: int) -> tuple[tuple[int, int], list[tuple[int, int]]]:

@@ -7,7 +7,7 @@ differences cancel, so all of it is in float64.
 
 from __future__ import annotations
 
-from engine.kernels.sums import FLAT_SHARE, box_sum
+from engine.kernels.sums import FLAT_SHARE, box_sum, masked_scores
 from engine.kernels.tensors import check_all_finite, correlate, integrals
 from engine.runtime.tensors import Tensor, torch
 
@@ -33,18 +33,15 @@ def ncc_surface(search: Tensor, search_valid: Tensor, templates: Tensor, *, min_
     window = (search.double() - mean[:, None, None]) * mask
     model = templates.double()
     model = model - model.mean(dim=(-2, -1), keepdim=True)
-    common, _ = box_sum(integrals(mask), h, w)[:, :, None]
-    sums = integrals(window)
-    sum_i, energy_i = box_sum(sums, h, w)[:, :, None]
-    sum_t, energy_t = correlate(mask, model), correlate(mask, model.square())
-    safe = common.clamp_min(1.0)
-    numerator = correlate(window, model) - sum_i * sum_t / safe
-    spread_i, spread_t = energy_i - sum_i.square() / safe, energy_t - sum_t.square() / safe
-    floor_i = FLAT_SHARE * sums[1, :, None, -1:, -1:]
-    floor_t = FLAT_SHARE * model.square().sum(dim=(-2, -1), keepdim=True)
-    textured = (spread_i > floor_i) & (spread_t > floor_t)
-    scores = numerator / (spread_i.clamp_min(0.0) * spread_t.clamp_min(0.0)).sqrt().clamp_min(1e-300)
-    scores = torch.where(textured, scores, 0.0).clamp_(-1.0, 1.0)
+    (common, _), sums = box_sum(integrals(mask), h, w)[:, :, None], integrals(window)
+    total, square = box_sum(sums, h, w)[:, :, None]
+    floors = FLAT_SHARE * sums[1, :, None, -1:, -1:], FLAT_SHARE * model.square().sum(dim=(-2, -1), keepdim=True)
+    products, of_model, of_squares = (
+        correlate(window, model),
+        correlate(mask, model),
+        correlate(mask, model.square()),
+    )
+    scores = masked_scores(products, of_model, of_squares, total, square, common, floors)
     scores = torch.where(common >= max(min_overlap * (h * w), 1.0), scores, -1.0)
     check_all_finite(search=search, templates=templates)  # last: the host waits for it
     return scores

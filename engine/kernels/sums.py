@@ -1,4 +1,4 @@
-"""Sums and 2 x 2 means of a picture, computed once on the CPU by OpenCV."""
+"""Sums and 2 x 2 means of a picture, computed once on the CPU by OpenCV, and scores from sums."""
 
 from __future__ import annotations
 
@@ -78,3 +78,33 @@ def box_sum(running: Picture, h: int, w: int) -> Picture:
     sums -= running[..., h:, :-w]
     sums += running[..., :-h, :-w]
     return sums
+
+
+def masked_scores(
+    products: Picture,
+    of_model: Picture,
+    of_squares: Picture,
+    total: Picture,
+    square: Picture,
+    count: Picture,
+    floors: tuple[Picture, Picture],
+) -> Picture:
+    """Correlation coefficients over valid pixels, from sums over them.
+
+    Args:
+        products: (...) float64 sums of the picture's products with the template, both about some mean.
+        of_model: of the template.
+        of_squares: of its squares.
+        total: of the picture.
+        square: of its squares.
+        count: number of valid pixels.
+        floors: sums of squares of picture and template that are rounding.
+
+    Returns:
+        (...) float64 in [-1, 1]; 0 where picture or template is flat.
+    """
+    count = count.clip(1)
+    spread, model_spread = square - total * total / count, of_squares - of_model * of_model / count
+    textured = (spread > floors[0]) & (model_spread > floors[1])
+    norm = (spread * model_spread * textured + ~textured) ** 0.5
+    return ((products - total * of_model / count) / norm * textured).clip(-1.0, 1.0)

@@ -88,31 +88,6 @@ def inverse_norms(window, mean, energy, h, w, zero_mean):
     return out
 
 
-@compiled("(f4[:, ::1], i8, i8)")
-def box_sums(picture, h, w):
-    """Sums of the pixels of every patch, and of their squares.
-
-    Args:
-        picture: (H, W) float32, its mean small against its standard deviation.
-        h: rows of a patch.
-        w: columns of a patch.
-
-    Returns:
-        (2, H-h+1, W-w+1) float64.
-    """
-    columns, height, width = picture.shape[1], picture.shape[0] - h + 1, picture.shape[1] - w + 1
-    out = np.empty((2, height, width))
-    down, down_squares = np.zeros(columns), np.zeros(columns)
-    along, along_squares = np.zeros(columns + 1), np.zeros(columns + 1)
-    for y in range(height):
-        _sum_rows(down, down_squares, picture, y, h, 0.0)
-        _sum_along(along, along_squares, down, down_squares)
-        for x in range(width):
-            out[0, y, x] = along[x + w] - along[x]
-            out[1, y, x] = along_squares[x + w] - along_squares[x]
-    return out
-
-
 @inlined
 def _sum_rows(down, down_squares, picture, y, h, mean):
     """Sums over h rows of every column, the first of them y, from those of y - 1; both are 0 before y = 0."""
@@ -164,42 +139,3 @@ def normalise(out, products, inverse, factor):
         for x in range(out.shape[1]):
             score = numerators[x] * (norms[x] * factor)
             to[x] = min(max(score, np.float32(-1.0)), np.float32(1.0))
-
-
-@compiled(
-    "(f4[:, ::1], b1[:, ::1], f8[:, :, ::1], Tuple((f8[:, :, ::1], i4[:, ::1])), UniTuple(i8, 2), UniTuple(f8, 2))"
-)
-def masked_scores(out, asked, sums, boxes, model, floors):
-    """Write the scores of a whole template at the requested places of a block.
-
-    Args:
-        out: (H', W') float32 or float64, written to.
-        asked: (H', W') bool.
-        sums: (3, rows, columns) float64, at least (H', W'), not divided by their size: correlations of the picture
-            with the template about its mean, of the mask with it, and of the mask with its square.
-        boxes: integral images of the picture, 0 where invalid, with that of its square, (2, H+1, W+1) float64, and
-            of the mask, (H+1, W+1) int32.
-        model: rows and columns of the template.
-        floors: sums of squares of picture and template that are rounding.
-    """
-    products, of_mask, of_squares = sums[0], sums[1], sums[2]
-    (integrals, counts), (h, w) = boxes, model
-    scale = 1.0 / products.size
-    for y in range(out.shape[0]):
-        for x in range(out.shape[1]):
-            if not asked[y, x]:
-                continue
-            count = _box(counts, y, x, h, w)
-            total, square = _box(integrals[0], y, x, h, w), _box(integrals[1], y, x, h, w)
-            of_model = of_mask[y, x] * scale
-            spread = square - total * total / count
-            model_spread = of_squares[y, x] * scale - of_model * of_model / count
-            score = 0.0
-            if spread > floors[0] and model_spread > floors[1]:
-                score = (products[y, x] * scale - total * of_model / count) / math.sqrt(spread * model_spread)
-            out[y, x] = min(max(score, -1.0), 1.0)
-
-
-@inlined
-def _box(sums, y, x, h, w):
-    return sums[y + h, x + w] - sums[y, x + w] - sums[y + h, x] + sums[y, x]
