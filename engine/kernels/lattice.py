@@ -1,58 +1,39 @@
-"""Places in a frame between the nodes of a lattice, compiled by numba: one pass, no temporary planes."""
+"""Places in a frame between the nodes of a lattice, bilinear: two products with sparse weights."""
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
+from numpy.typing import NDArray
 
-from engine.runtime.jit import compiled, inlined
+FloatImage = NDArray[np.float32]
 
 
-@compiled("(f4[:, :, ::1], f4, f4, f4[:, ::1], f4[:, ::1], u1[:, ::1])")
-def places_between_nodes(nodes, last_x, last_y, x_px, y_px, inside):
-    """Interpolate a lattice at every pixel of a picture, bilinear from corner to corner.
+def places_between_nodes(
+    nodes: FloatImage, frame: tuple[int, ...], size: tuple[int, int]
+) -> tuple[FloatImage, FloatImage, NDArray[np.bool_]]:
+    """Interpolate a lattice at every pixel of a picture, from corner to corner.
 
     Args:
         nodes: (n, n, 3) float32 place x and y in the frame, and 1 where the frame can show it, else 0.
-        last_x: of the frame's columns.
-        last_y: of its rows.
-        x_px: (h, w) float32 takes the places.
-        y_px: (h, w) float32 likewise.
-        inside: (h, w) uint8 takes 1 where the place is in the frame and all nodes around can be shown, else 0.
+        frame: its rows and columns.
+        size: rows and columns (h, w) of the picture.
+
+    Returns:
+        Places x and y (h, w), and whether each is in the frame and all nodes around can be shown.
     """
-    height, width = x_px.shape
-    across, down = _steps(len(nodes), width), _steps(len(nodes), height)
-    line, zero = np.empty((2, len(nodes)), np.float32), np.float32(0)
-    ahead = np.empty(len(nodes) - 1, np.bool_)  # between a node and the next
-    for row in range(height):
-        top, share = down[0][row], down[1][row]
-        for k in range(2):
-            for n in range(len(nodes)):
-                line[k, n] = nodes[top, n, k] + share * (nodes[top + 1, n, k] - nodes[top, n, k])
-        for n in range(len(nodes) - 1):
-            above = min(nodes[top, n, 2], nodes[top, n + 1, 2])
-            ahead[n] = min(above, min(nodes[top + 1, n, 2], nodes[top + 1, n + 1, 2])) > zero
-        x, y, shown = x_px[row], y_px[row], inside[row]
-        _along(line[0], across, x)
-        _along(line[1], across, y)
-        for c in range(width):
-            in_frame = (x[c] >= zero) & (x[c] <= last_x) & (y[c] >= zero) & (y[c] <= last_y)
-            shown[c] = in_frame & ahead[across[0][c]]
+    down, across = (_weights(len(nodes), count) for count in size)
+    x, y, shown = down @ nodes.transpose(2, 0, 1) @ across.T
+    inside = (x >= 0) & (x <= frame[1] - 1) & (y >= 0) & (y <= frame[0] - 1)
+    return x, y, inside & (shown > 0.999)  # of weights that sum to 1 up to rounding
 
 
-@inlined
-def _steps(nodes, count):
-    """For each of ``count`` pixels from end to end the node before it, and its share of the way to the next."""
-    first, share = np.empty(count, np.int64), np.empty(count, np.float32)
-    for n in range(count):
-        at = n * (nodes - 1) / max(count - 1, 1)
-        first[n] = min(int(at), nodes - 2)
-        share[n] = at - first[n]
-    return first, share
-
-
-@inlined
-def _along(line, steps, out):
-    first, share = steps
-    for c in range(out.size):
-        low = line[first[c]]
-        out[c] = low + share[c] * (line[first[c] + 1] - low)
+@lru_cache(maxsize=256)
+def _weights(nodes: int, count: int) -> FloatImage:
+    """(count, nodes): the shares of the two nodes about each of ``count`` pixels from end to end."""
+    at = np.linspace(0.0, nodes - 1.0, count)
+    first = np.minimum(at.astype(np.intp), nodes - 2)
+    weights, pixel, share = np.zeros((count, nodes), np.float32), np.arange(count), at - first
+    weights[pixel, first], weights[pixel, first + 1] = 1.0 - share, share
+    return weights

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from engine.camera import SIDE_STEPS, Camera
 from engine.geo import inverse_2x2
+from engine.kernels.lattice import places_between_nodes
 from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.values import Attitude, Frame
 
@@ -312,10 +313,10 @@ def orthorectify(
     up_m = np.full(nodes.shape[:2], -height_m) if relief is None else relief(nodes) - height_m
     ground_m = np.concatenate([nodes @ enu_jacobian.T, up_m[..., None]], axis=-1)
     size = (int(sides[1]), int(sides[0]))
-    x_px, y_px, inside = _between_nodes(_projected(ground_m, camera, enu_from_camera), gray.shape, size)
+    x_px, y_px, inside = places_between_nodes(_projected(ground_m, camera, enu_from_camera), gray.shape, size)
     slant_m = height_m / max(-enu_from_camera[2, 2], 1e-3)
     scale = slant_m / camera.focal_px / math.sqrt(abs(float(np.linalg.det(enu_jacobian))))
-    valid = cv2.erode(inside, _RIM, borderType=cv2.BORDER_CONSTANT, borderValue=0).view(np.bool_)
+    valid = cv2.erode(inside.view(np.uint8), _RIM, borderType=cv2.BORDER_CONSTANT, borderValue=0).view(np.bool_)
     return Orthophoto(_drawn(gray, scale, x_px, y_px), valid, corner, (x_px, y_px))
 
 
@@ -338,15 +339,3 @@ def _drawn(
         (sx, _, left), (_, sy, top) = picture_from_image[:2].astype(np.float32)
         x_px, y_px = x_px * sx + left, y_px * sy + top
     return np.asarray(cv2.remap(picture, x_px, y_px, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-
-
-def _between_nodes(
-    nodes: NDArray[np.float32], shape: tuple[int, ...], size: tuple[int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Places x and y (h, w) in a frame, interpolated from a grid (n, n, 3); and 1 where the frame shows them."""
-    from engine.kernels.lattice import places_between_nodes  # numba takes a while to import
-
-    x_px, y_px, inside = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.uint8)
-    last_x, last_y = np.float32(shape[1] - 1), np.float32(shape[0] - 1)
-    places_between_nodes(nodes, last_x, last_y, x_px, y_px, inside)
-    return x_px, y_px, inside

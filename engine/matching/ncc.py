@@ -52,7 +52,6 @@ class Ncc(Method):
         "gauss_newton",
         "surface_loops",
         "local_normalisation",
-        "lattice",
         "lower_plane",
         "dense_loops",
     )

@@ -39,7 +39,6 @@ class Sift(Method):
         "map_points",
         "gauss_newton",
         "local_normalisation",
-        "lattice",
         "dense_loops",
         "pose_fit",
         "clusters",
