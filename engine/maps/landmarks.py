@@ -20,7 +20,7 @@ from engine.maps.landmark_cache import Kinds, NamedArrays, cache_key, load_array
 from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import HALO_PX, TILE_PX, tiles_under, widened, within
-from engine.runtime.device import Device, Picture, all_on_host, all_to_device, as_float, to_device
+from engine.runtime.device import Device, Picture, as_float, on_host, to_device
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -168,7 +168,7 @@ class LandmarkMap:
             spread=1,  # by strength alone; the level's cells spread landmarks
         )
         fields = (found.valid, found.xy_px, found.scale_px, found.angle_deg, found.descriptors)
-        valid, *all_slots = all_on_host([values[0] for values in fields])
+        valid, *all_slots = (on_host(values[0]) for values in fields)
         positions, scale, angle, descriptors = (values[valid] for values in all_slots)
         xy = positions + np.array([wide.x0, wide.y0], np.float32)
         rank = _rank_in_cells(xy)
@@ -184,7 +184,7 @@ class LandmarkMap:
 
     def _to_landmarks(self, found: NamedArrays) -> Landmarks:
         columns = [found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors")]
-        xy, scale, angle, descriptors = (column[None] for column in all_to_device(columns, self.device))
+        xy, scale, angle, descriptors = (to_device(column[None], self.device) for column in columns)
         valid = scale > 0.0  # of every landmark
         features = Features(xy, scale, angle, as_float(descriptors, "float32"), valid)
         return Landmarks(features, found["xy_px"], found["points_m"])

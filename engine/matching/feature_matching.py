@@ -26,7 +26,7 @@ from engine.matching.views import MapView, TelemetryHypothesis, map_px_per_pixel
 from engine.matching.votes import Vote, similarity, vote
 from engine.options import PAPER_SCALE, SiftOptions
 from engine.orthomap import OrthoMap
-from engine.runtime.device import Device, Picture, all_on_host, all_to_device, as_float, on_host, to_device
+from engine.runtime.device import Device, Picture, as_float, on_host, to_device
 from engine.values import Attitude
 
 if TYPE_CHECKING:  # it loads torch
@@ -139,7 +139,7 @@ def _feature_pairs(
     with query.scheduler.stage("frame features"):
         shown_px = int(np.count_nonzero(photo.valid))
         keypoints = max(options.max_keypoints, min(round(shown_px * options.keypoints_per_px), MAX_KEYPOINTS))
-        gray, valid = all_to_device([photo.gray, photo.valid], landmarks.device)
+        gray, valid = (to_device(picture, landmarks.device) for picture in (photo.gray, photo.valid))
         features = sift(
             as_float(gray, "float32")[None, None] / 255.0,
             max_keypoints=keypoints,
@@ -159,9 +159,9 @@ def _feature_pairs(
 
 
 def _matched(features: Features, found: Matches) -> tuple[NDArray[np.float32], Array, NDArray[np.int64]]:
-    """Accepted pairs, in one copy: (M, 2) feature pixels, (M,) their scales, (M,) indices on the map."""
+    """Accepted pairs: (M, 2) feature pixels, (M,) their scales, (M,) indices on the map."""
     columns = (features.xy_px[0], features.scale_px[0], found.valid[0], found.train_index[0])
-    xy_px, scale_px, valid, index = all_on_host(columns)
+    xy_px, scale_px, valid, index = map(on_host, columns)
     return xy_px[valid], scale_px[valid].astype(np.float64), index[valid]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import re
 import sys
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -106,39 +105,6 @@ def to_device(array: AnyArray, device: Device | torch.device) -> Picture:
     from engine.runtime.tensors import torch
 
     return torch.from_numpy(array).to(device)
-
-
-def all_to_device(arrays: Sequence[AnyArray], device: Device | torch.device) -> Sequence[Picture]:
-    """Several arrays on the device, sent in one copy; see :func:`to_device`.
-
-    Args:
-        arrays: of any shapes.
-        device: the device.
-
-    Returns:
-        As many, of the same shapes and types.
-    """
-    if device.type == "cpu":
-        return arrays
-    from engine.runtime.tensors import upload
-
-    return upload(arrays, device)
-
-
-def all_on_host(pictures: Sequence[Picture]) -> Sequence[AnyArray]:
-    """Several pictures of one device as arrays, fetched in one copy; see :func:`on_host`.
-
-    Args:
-        pictures: of any shapes.
-
-    Returns:
-        As many, of the same shapes and types.
-    """
-    if all(isinstance(picture, np.ndarray) for picture in pictures):
-        return pictures
-    from engine.runtime.tensors import download
-
-    return download(pictures)
 
 
 def on_host(picture: Picture) -> AnyArray:
