@@ -80,7 +80,7 @@ class LocalScores:
         if self._valid is None:
             return (products * self._inverse_norm[j, i]).clip(-1.0, 1.0)
         of_model, of_squares = (self._products(self._valid, m, places) for m in (self._template, self._squares))
-        total, square, count = *self._sums[:, j, i], self._count[j, i]
+        (total, square), count = self._sums[:, j, i], self._count[j, i]
         floors = FLAT_SHARE * float(self._sums[1].max(initial=0.0)), FLAT_SHARE * self._energy
         scores = masked_scores(products, of_model, of_squares, total, square, count, floors)
         return np.asarray(np.where(count < self._least, -1.0, scores))

@@ -111,7 +111,8 @@ def _score_partial(
                 cv2.mulSpectrums(one, other, 0, product, True)
                 transform(product, cv2.DFT_INVERSE, rows)
             sums = [product[: at.shape[0], : at.shape[1]][at] / product.size for product in products]
-            out[t][part][at] = masked_scores(*sums, total, square, count, (floor, FLAT_SHARE * model.energy))
+            floors = floor, FLAT_SHARE * model.energy
+            out[t][part][at] = masked_scores(sums[0], sums[1], sums[2], total, square, count, floors)
 
 
 def _blocks(asked: Mask, h: int, w: int) -> tuple[tuple[int, int], list[tuple[int, int]]]:
