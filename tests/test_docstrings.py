@@ -16,7 +16,7 @@ FOLDERS = (
     "scenematch/simulator",
 )  # fmt: skip
 CALLED = {  # by others; the steps of a method state shapes in a line
-    "engine/matching": "acceptance align covariance evidence matcher pnp pose",
+    "engine/matching": "agreement align covariance evidence matcher pnp pose",
     "scenematch/check": "availability plan self_match",
 }
 MODULES = sorted(

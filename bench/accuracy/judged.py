@@ -13,9 +13,8 @@ import numpy as np
 from bench.accuracy.trials import Ground, Trial, prior_about, trial
 from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.budget import Budget, Deadline
-from engine.matching.evidence import Candidate
+from engine.matching.candidates import PeakCandidate
 from engine.matching.ncc import Ncc
-from engine.matching.peak_evidence import PeakCandidate
 from engine.matching.query import Query
 from engine.matching.sift import Sift
 from engine.ncc_fft import surface
@@ -116,13 +115,11 @@ class Bench:
         query, ncc, found = self.peak(made)
         if isinstance(found, NoFix):
             return self.row(made, "NCC", None, False, [], [])
-        result = ncc.judge(query, found)
-        again = None if isinstance(result, Fix) else ncc.match_structure(query, found, found.fix.window)
-        if again is not None:
-            found, result = again, ncc.judge(query, again)
+        if not found.suffices(query.risk):
+            found = ncc.match_structure(query, found, found.fix.window) or found
         ratio = math.sqrt(found.evidence.rival / max(found.evidence.surprise, 1e-6))
         scores = [found.fix.confidence or 0.0, found.peak.score, _psr(query, ncc, found), -ratio]
-        return self.row(made, "NCC", found.fix, isinstance(result, Fix), scores, [found.evidence.nats])
+        return self.row(made, "NCC", found.fix, found.suffices(query.risk), scores, [found.evidence.nats])
 
     def looked(self, made: Trial, method: str) -> Row:
         """The match by one look of NCC alone."""
@@ -132,11 +129,8 @@ class Bench:
             found = ncc.match_structure(query, found, found.fix.window)
         if found is None:
             return self.row(made, method, None, False, [], [])
-        accepted, scores = (
-            isinstance(ncc.judge(query, found), Fix),
-            [found.fix.confidence or 0.0, found.peak.score],
-        )
-        return self.row(made, method, found.fix, accepted, scores, [found.evidence.nats])
+        scores = [found.fix.confidence or 0.0, found.peak.score]
+        return self.row(made, method, found.fix, found.suffices(query.risk), scores, [found.evidence.nats])
 
     def posed(self, made: Trial, frame: Frame, prior: Prior | None, options: SiftOptions) -> Row:
         """The match by SIFT; where it finds nothing, poses that chance may have made are there to be scored."""
@@ -144,7 +138,7 @@ class Bench:
         query = _query(matcher, frame, prior)
         sift = _part(matcher, "sift", Sift)
         found = sift.find(query, options)
-        fixed = isinstance(found, Candidate) and isinstance(sift.judge(query, found), Fix)
+        fixed = not isinstance(found, NoFix) and found.suffices(query.risk)
         if isinstance(found, NoFix):
             found = sift.find(replace(query, risk=1.0 - 1e-9), replace(options, pose=LOOSE))
         if isinstance(found, NoFix):

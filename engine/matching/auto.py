@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.matching.acceptance import agree_in_height, agree_in_place, offset_between_m
+from engine.matching.agreement import agree_in_height, agree_in_place, offset_between_m
 from engine.matching.explanation import Explanation
 from engine.matching.ladder import is_late
 from engine.matching.method import Method

@@ -10,8 +10,7 @@ measured once for all.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,28 +82,6 @@ class Evidence:
     def suffices(self, risk: float) -> bool:
         """Whether a fix may be handed out: it is wrong with at most this probability."""
         return self.is_tested and self.nats >= needed_nats(risk)
-
-
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A fix that has not been accepted yet.
-
-    Attributes:
-        fix: that it gives if accepted, with its probability.
-        evidence: for it.
-    """
-
-    fix: Fix
-    evidence: Evidence
-
-    def weighed(self, evidence: Evidence) -> Self:
-        """The candidate by other evidence."""
-        return replace(self, evidence=evidence, fix=replace(self.fix, confidence=probability(evidence.nats)))
-
-    def untested(self, risk: float) -> Self:
-        """The candidate without a test of the null hypothesis, which counts only if it is beyond doubt."""
-        is_tested = is_beyond_doubt(self.evidence.nats, risk)
-        return replace(self, evidence=replace(self.evidence, is_tested=is_tested))
 
 
 def independent_places(positions: float) -> float:

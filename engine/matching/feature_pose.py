@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from engine.geo import attitude_from_rotation
 from engine.maps.landmarks import LandmarkMap
-from engine.matching.acceptance import agree_in_place, pose_refusal
+from engine.matching.agreement import agree_in_place
+from engine.matching.candidates import PoseCandidate
 from engine.matching.covariance import tilt_covariance
-from engine.matching.evidence import Candidate, Evidence, is_beyond_doubt, probability
+from engine.matching.evidence import Evidence, is_beyond_doubt, probability
 from engine.matching.feature_matching import Matched, match_views
 from engine.matching.pose import PoseStats, solve_pose
 from engine.matching.query import Query
@@ -54,21 +55,21 @@ class FeatureMatcher:
     finder: PointFinder | None = None
     method: str = METHOD
 
-    def find(self) -> Candidate | NoFix:
+    def find(self) -> PoseCandidate | NoFix:
         """The pose of the frame, or a refusal if there is none."""
         query = self.query
         flat = query.refuse_flat(self.method)
         if flat is not None:
             return flat
-        first: NoFix | Candidate | None = None
-        found: list[tuple[Candidate, FeatureMatcher, TelemetryHypothesis]] = []
+        first: NoFix | PoseCandidate | None = None
+        found: list[tuple[PoseCandidate, FeatureMatcher, TelemetryHypothesis]] = []
         deadline = query.scheduler.deadline
         for matcher, hypothesis in self._attempts():
             if first is not None and deadline.remaining_ms < deadline.elapsed_ms:
                 break
             result = matcher._find_with(hypothesis)
             first = first or result
-            if isinstance(result, Candidate):
+            if isinstance(result, PoseCandidate):
                 found.append((result, matcher, hypothesis))
                 nats, is_own = result.evidence.nats, result is first
                 # What is found after the telemetry failed may be as wrong as that.
@@ -84,21 +85,12 @@ class FeatureMatcher:
             return best
         return matcher._null_tested(_against(best, [each for each, _, _ in found]), hypothesis)
 
-    def find_at_once(self) -> Candidate | NoFix:
+    def find_at_once(self) -> PoseCandidate | NoFix:
         """The pose of a frame by its own telemetry, with no second attempt and no null hypothesis."""
         found = self.query.refuse_flat(self.method) or self._find_with(next(self._attempts())[1])
         return found if isinstance(found, NoFix) else found.untested(self.query.risk)
 
-    def judge(self, found: Candidate | NoFix) -> Fix | NoFix:
-        """The fix if there is a pose with enough evidence, else a refusal."""
-        if isinstance(found, NoFix):
-            return found
-        fix, evidence, risk = found.fix, found.evidence, self.query.risk
-        if evidence.suffices(risk):
-            return fix
-        return self.query.refuse(*pose_refusal(evidence, risk), self.method, score=fix.score, window=fix.window)
-
-    def _null_tested(self, found: Candidate, hypothesis: TelemetryHypothesis) -> Candidate:
+    def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
         """The candidate compared with the mirrored frame under the same telemetry."""
         mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
         null = replace(self, query=mirrored)._find_with(hypothesis)
@@ -133,7 +125,7 @@ class FeatureMatcher:
         found = match_views(self.query, self.landmarks, self.options, views, hypothesis, self.finder)[0]
         return found.points_px, found.points_m, self._pose(found, hypothesis)
 
-    def _find_with(self, hypothesis: TelemetryHypothesis) -> Candidate | NoFix:
+    def _find_with(self, hypothesis: TelemetryHypothesis) -> PoseCandidate | NoFix:
         """Match, lift and solve, under one hypothesis about the telemetry."""
         query, options, scheduler = self.query, self.options, self.query.scheduler
         with scheduler.stage("window"):
@@ -222,7 +214,7 @@ class FeatureMatcher:
 
     def _with_confidence(
         self, fix: Fix, stats: PoseStats, vote: Vote | None, hypothesis: TelemetryHypothesis
-    ) -> Candidate:
+    ) -> PoseCandidate:
         """The candidate of a fix; the height does not count if this hypothesis doubts it."""
         query, height_m = self.query, self.query.telemetry.height_agl_m
         errors = query.errors(self.options.errors)
@@ -240,10 +232,10 @@ class FeatureMatcher:
             rival, tried = 0.0, 10.0**stats.log10_tried
         prior_chi_square = query.prior_chi_square(fix)
         evidence = Evidence(surprise, rival, tried, tried, prior_chi_square, height_chi_square)
-        return Candidate(replace(fix, confidence=probability(evidence.nats)), evidence)
+        return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
 
 
-def _against(best: Candidate, all_found: list[Candidate]) -> Candidate:
+def _against(best: PoseCandidate, all_found: list[PoseCandidate]) -> PoseCandidate:
     """The best candidate, with the evidence for any other place against it."""
     others = [each.evidence.nats for each in all_found if not agree_in_place(each.fix, best.fix)]
     return best.weighed(replace(best.evidence, elsewhere=max([0.0, *others])))

@@ -1,20 +1,26 @@
-"""The ladder: the one loop that makes one effort on a frame after another, cheap ones first, while time allows."""
+"""The ladder: the one loop that makes one effort on a frame after another, cheap ones first, while time allows.
+
+Efforts give candidates. The last one's evidence decides whether its fix is handed out.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import TypeGuard
+from dataclasses import dataclass, replace
+from typing import TypeAlias, TypeGuard
 
+from engine.matching.candidates import Candidate
 from engine.matching.query import Query
 from engine.runtime.scheduler import OutOfTime, Scheduler
-from engine.values import Fix, NoFix, Reason, Result
+from engine.values import NoFix, Reason, Result
 
 SHARES = (1.0, 0.5)
 """Of the scale at which features are matched, a level of the map apart; the smaller if time is short."""
 Works = Mapping[Hashable, float]
 """Steps, as the scheduler knows them, by their work."""
+Answer: TypeAlias = Candidate | NoFix
+"""What is known of a frame's place, accepted or not, or why nothing is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,11 +33,11 @@ class Rung:
         look: gets the answer so far and a variant, and gives the new answer; None leaves the old one.
     """
 
-    offers: Callable[[Result | None], Works]
-    look: Callable[[Result | None, Hashable], Result | None]
+    offers: Callable[[Answer | None], Works]
+    look: Callable[[Answer | None, Hashable], Answer | None]
 
 
-def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Result:
+def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Answer:
     """The answer after every rung that can change it and that time allows.
 
     With a fix, work ends before a deadline that would make it late; no fix is lost to a lack of time.
@@ -41,22 +47,37 @@ def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Result:
         method: named in the refusal of a frame for which there was no time.
         rungs: in their order, cheap ones first.
     """
-    answer: Result | None = None
+    answer: Answer | None = None
     for rung in rungs:
         if not query.scheduler.deadline.met:
             break  # no step is refused for its cost
-        works = rung.offers(answer)
-        with query.scheduler.with_fix(isinstance(answer, Fix)), suppress(OutOfTime):
+        works, has_fix = rung.offers(answer), is_accepted(answer, query)
+        with query.scheduler.with_fix(has_fix), suppress(OutOfTime):
             step = _affordable(query.scheduler, works)
             if step is not None:
                 with query.scheduler.costed(step, works[step]):
                     looked = rung.look(answer, step)
-                if looked is not None and not (isinstance(answer, Fix) and is_late(looked)):
+                if looked is not None and not (has_fix and is_late(looked)):
                     answer = looked
     return answer or query.refuse_late(method)
 
 
-def rehearse(query: Query, rung: Rung, answer: Result | None) -> list[Result | None]:
+def settled(query: Query, answer: Answer) -> Result:
+    """The fix of an accepted candidate, else the refusal that says why it is not accepted."""
+    if isinstance(answer, NoFix):
+        return answer
+    if answer.suffices(query.risk):
+        return answer.fix
+    fix, (reason, detail) = answer.fix, answer.refusal(query.risk)
+    return replace(query.refuse(reason, detail, fix.method, score=fix.score, window=fix.window), match=fix)
+
+
+def is_accepted(answer: Answer | None, query: Query) -> TypeGuard[Candidate]:
+    """Whether the answer is a candidate whose fix may be handed out."""
+    return isinstance(answer, Candidate) and answer.suffices(query.risk)
+
+
+def rehearse(query: Query, rung: Rung, answer: Answer | None) -> list[Answer | None]:
     """What each variant of a rung makes of an answer; the scheduler learns their costs."""
     answers = []
     for step, work in rung.offers(answer).items():
@@ -65,12 +86,7 @@ def rehearse(query: Query, rung: Rung, answer: Result | None) -> list[Result | N
     return answers
 
 
-def is_coarse(answer: Result | None) -> TypeGuard[Fix]:
-    """Whether the answer is a fix at reduced resolution."""
-    return isinstance(answer, Fix) and answer.stage == "coarse"
-
-
-def is_late(answer: Result | None) -> bool:
+def is_late(answer: Answer | Result | None) -> bool:
     """Whether the answer is a refusal for lack of time."""
     return isinstance(answer, NoFix) and answer.reason is Reason.LATE
 

@@ -11,7 +11,7 @@ from engine.learned import KeypointMatcher, load_matcher
 from engine.maps.keypoints import KeypointMap
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import FeatureMatcher
-from engine.matching.ladder import SHARES, Rung, Works, climb
+from engine.matching.ladder import SHARES, Answer, Rung, Works, climb, settled
 from engine.matching.method import Method
 from engine.matching.point_finding import PointFinder
 from engine.matching.query import Query
@@ -19,7 +19,7 @@ from engine.matching.views import map_px_per_pixel
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.values import Fix, Result, Window
+from engine.values import NoFix, Result, Window
 
 METHOD = "learned"
 
@@ -55,13 +55,14 @@ class Learned(Method):
     def locate(self, query: Query) -> Result:
         """A fix on the finest level of the map that time allows."""
         works: Works = {(METHOD, share): query.gray.size * self._scale(query, share) ** 2 for share in SHARES}
-        return climb(query, METHOD, [Rung(lambda _: works, partial(self._match, query))])
+        return settled(query, climb(query, METHOD, [Rung(lambda _: works, partial(self._match, query))]))
 
-    def _match(self, query: Query, answer: Result | None, step: Hashable) -> Result:
+    def _match(self, query: Query, answer: Answer | None, step: Hashable) -> Answer:
         assert isinstance(step, tuple)
-        matcher = self._feature_matcher(query, step[1])
-        result = matcher.judge(matcher.find())
-        return replace(result, stage="coarse") if step[1] < 1.0 and isinstance(result, Fix) else result
+        found = self._feature_matcher(query, step[1]).find()
+        if step[1] == 1.0 or isinstance(found, NoFix):
+            return found
+        return replace(found, fix=replace(found.fix, stage="coarse"))
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import replace
+from typing import TypeGuard
 
 import numpy as np
 
@@ -11,18 +12,13 @@ from engine.maps.prepared import PreparedMap
 from engine.maps.samples import SampleMap
 from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.matching import hypothesis_search
-from engine.matching.acceptance import agree_in_place, edge_refusal, offset_between_m, peak_refusal
+from engine.matching.agreement import agree_in_place, offset_between_m
+from engine.matching.candidates import PeakCandidate
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
 from engine.matching.explanation import Explanation, explain_correlation
-from engine.matching.ladder import Rung, Works, climb, is_coarse, is_late, rehearse
+from engine.matching.ladder import Answer, Rung, Works, climb, is_accepted, rehearse, settled
 from engine.matching.method import Method
-from engine.matching.peak_evidence import (
-    PeakCandidate,
-    candidate_of,
-    early_stop,
-    null_tested,
-    places_in,
-)
+from engine.matching.peak_evidence import candidate_of, early_stop, null_tested, places_in
 from engine.matching.query import Query
 from engine.matching.refinement import Refinement, with_unconfirmed_tilt
 from engine.matching.structure import match_structure
@@ -70,22 +66,26 @@ class Ncc(Method):
     def warmup(self, query: Query) -> None:
         """Run every variant of every step but the searches, so that it is compiled and its cost known."""
         untilted = replace(query, frame=replace(query.frame, roll_deg=None, pitch_deg=None))
-        for efforts in (Efforts(self, query), Efforts(self, untilted)):
-            for answer in rehearse(efforts.query, efforts.levels, None):
-                rehearse(efforts.query, efforts.refinement, answer)
-        efforts = Efforts(self, query)
-        efforts.refuse(self.find(query))  # as if it were refused
-        rehearse(query, efforts.structure, None)
+        for each in (query, untilted):
+            rungs = _Rungs(self, each)
+            for answer in rehearse(each, rungs.levels, None):
+                rehearse(each, rungs.refinement, answer)
+        self._rehearse_refused(query, with_search=False)
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map, or headings and heights about the prior."""
         if query.prior is None:
             self.locate(query)
         else:
-            efforts = Efforts(self, query)
-            efforts.refuse(self.find(query))
-            rehearse(query, efforts.search, None)
-            rehearse(query, efforts.structure, None)
+            self._rehearse_refused(query, with_search=True)
+
+    def _rehearse_refused(self, query: Query, *, with_search: bool) -> None:
+        """Run what follows a peak that is refused."""
+        found, rungs = self.find(query), _Rungs(self, query)
+        if isinstance(found, PeakCandidate):
+            found = found.weighed(replace(found.evidence, surprise=0.0))
+            for rung in [rungs.structure, rungs.search] if with_search else [rungs.structure]:
+                rehearse(query, rung, found)
 
     def locate(self, query: Query, *, widely: bool = True) -> Result:
         """The fix of a coarse peak whose pose the picture confirms, else of the finest level that time allows.
@@ -96,8 +96,7 @@ class Ncc(Method):
         """
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
-        efforts = Efforts(self, query)
-        return efforts.settled(climb(query, METHOD, efforts.rungs(widely=widely)))
+        return settled(query, climb(query, METHOD, _Rungs(self, query).all(widely=widely)))
 
     def works(self, query: Query) -> Works:
         """Correlation on each level, the frame's own first; or the search of the whole map."""
@@ -158,16 +157,6 @@ class Ncc(Method):
             return null_tested(correlator, found)
         return found if searched else found.untested(query.risk)
 
-    def judge(self, query: Query, found: PeakCandidate | NoFix) -> Result:
-        """The fix if there is a peak with enough evidence, else a refusal."""
-        if isinstance(found, NoFix):
-            return found
-        peak, evidence = found.peak, found.evidence
-        if found.is_inside and evidence.suffices(query.risk):
-            return found.fix
-        why = peak_refusal(peak.score, evidence, query.risk) if found.is_inside else edge_refusal(peak.score)
-        return query.refuse(*why, METHOD, score=peak.score, window=found.fix.window)
-
     def match_structure(self, query: Query, found: PeakCandidate, window: Window) -> PeakCandidate | None:
         """The highest peak by structure as well, see :mod:`engine.matching.structure`.
 
@@ -213,183 +202,136 @@ class Ncc(Method):
             return correlator.align(pose, level)
 
 
-class Efforts:
-    """The efforts on one frame: the rungs of NCC's ladder and what they leave to each other.
-
-    Args:
-        ncc: the method.
-        query: the frame.
-    """
+class _Rungs:
+    """The ladder of one frame."""
 
     def __init__(self, ncc: Ncc, query: Query) -> None:
-        self.query, self._ncc = query, ncc
-        self._accepted: PeakCandidate | None = None  # the peak of the answer
-        self._refused: PeakCandidate | None = None  # the newest peak, if it was not accepted
-        self._is_new = False  # whether its structure was not matched yet
-        self._refusal: NoFix | None = None  # of the frame at its own heading and height
-        self._doubtful: PeakCandidate | None = None  # that it refuses, which a refined pose may confirm
-        self._works, frame_px = ncc.works(query), float(query.gray.size)
+        self._ncc, self._query = ncc, query
+        self._works, self._frame_px = ncc.works(query), float(query.gray.size)
         self.coarsest = Rung(self._if_coarse_suffices, self._search_coarsely)
-        self.at_once = Rung(lambda answer: {_AT_ONCE: frame_px} if is_coarse(answer) else {}, self._refine_at_once)
+        self.at_once = Rung(self._if_coarse, self._refine_at_once)
         self.levels = Rung(self._finer, self._correlate)
         self.structure = Rung(self._if_unseen, self._match_structure)
-        self.doubted = Rung(
-            lambda answer: {_REFINEMENT: frame_px} if self._is_doubtful(answer) else {}, self._refine_doubtful
-        )
+        self.refinement = Rung(self._if_refinable, self._refine)
         self.search = Rung(self._if_refused, self._search)
-        self.refinement = Rung(
-            lambda answer: {_REFINEMENT: frame_px} if self._is_refinable(answer) else {}, self._refine
-        )
 
-    def rungs(self, *, widely: bool) -> list[Rung]:
+    def all(self, *, widely: bool) -> list[Rung]:
         """In their order; ``widely`` is that of :meth:`Ncc.locate`."""
-        wide = [self.search, self.structure] if widely else []
-        own = [self.coarsest, self.at_once, self.levels, self.structure, self.doubted]
-        return [*own, *wide, self.refinement]
+        wide = [self.search, self.refinement] if widely else []
+        return [self.coarsest, self.at_once, self.levels, self.structure, self.refinement, *wide]
 
-    def settled(self, answer: Result) -> Result:
-        """The ladder's answer, or the refusal of the finer level if that contradicts a coarse fix."""
-        refusal = self._refusal
-        if not is_coarse(answer) or refusal is None or is_late(refusal):
-            return answer
-        is_same = refusal.match is not None and self._is_same(answer, refusal.match)
-        return answer if is_same else refusal
-
-    def refuse(self, found: PeakCandidate | NoFix) -> None:
-        """Take a peak as refused."""
-        self._refused, self._is_new = (found, True) if isinstance(found, PeakCandidate) else (None, False)
-
-    # ------------------------------------------------------------------------------------------------ rungs
-
-    def _if_coarse_suffices(self, answer: Result | None) -> Works:
+    def _if_coarse_suffices(self, answer: Answer | None) -> Works:
         """The coarsest level, if refinement may start from its peak and there is time for both.
 
         If roll, pitch or the ground's slope is unknown, the pose depends on the peak, which must then be fine.
         """
-        query, (*finer, (coarsest, work)) = self.query, self._works.items()
+        query, (*finer, (coarsest, work)) = self._query, self._works.items()
         is_wide = query.site.is_large and work > MAX_WINDOW_PX
         if is_wide or not (finer and self._can_confirm and query.scheduler.can_afford({coarsest: work})):
             return {}
-        if not query.scheduler.can_afford({coarsest: work, _AT_ONCE: float(query.gray.size)}):
+        if not query.scheduler.can_afford({coarsest: work, _AT_ONCE: self._frame_px}):
             query.scheduler.note_refusal(_AT_ONCE)
             return {}
         return {coarsest: work}
 
-    def _finer(self, answer: Result | None) -> Works:
+    def _search_coarsely(self, answer: Answer | None, step: Hashable) -> Answer | None:
+        """The peak of the coarsest level, if it is accepted; a refusal says nothing, as finer levels show more."""
+        found = self._find(step)
+        return found if is_accepted(found, self._query) else None
+
+    def _if_coarse(self, answer: Answer | None) -> Works:
+        return {_AT_ONCE: self._frame_px} if self._is_coarse(answer) else {}
+
+    def _refine_at_once(self, answer: Answer | None, step: Hashable) -> Answer:
+        """The pose of a coarse peak refined, or the peak with a tilt that nothing confirmed."""
+        assert isinstance(answer, PeakCandidate)  # or it was not offered
+        refined = self._refinement(answer).refine_at_once(answer.fix)
+        return replace(answer, fix=refined or with_unconfirmed_tilt(self._query, answer.fix))
+
+    def _finer(self, answer: Answer | None) -> Works:
         """Every level that is finer than the answer."""
-        if answer is not None and not is_coarse(answer):
-            return {}
         if answer is None:
             return self._works
         # Beside a coarse fix a finer level that does not fit is not missed, so its cost shall not fade.
         *finer, _ = self._works.items()
-        return {step: work for step, work in finer if self.query.scheduler.can_afford({step: work})}
+        affordable = self._query.scheduler.can_afford
+        return {step: work for step, work in finer if self._is_coarse(answer) and affordable({step: work})}
 
-    def _search_coarsely(self, answer: Result | None, step: Hashable) -> Result | None:
-        """The peak of the coarsest level, if it is accepted; a refusal says nothing, as finer levels show more."""
-        result = self._ncc.judge(self.query, self._find(step))
-        return replace(result, stage="coarse") if isinstance(result, Fix) else None
-
-    def _correlate(self, answer: Result | None, step: Hashable) -> Result | None:
-        """The peak of one level."""
+    def _correlate(self, answer: Answer | None, step: Hashable) -> Answer:
+        """The peak of one level; beside a coarser one of the same place it has the evidence for that."""
         found = self._find(step)
-        self.refuse(found)
-        return self._judged(answer, found, found)
+        if not self._is_coarse(answer) or not isinstance(found, PeakCandidate):
+            return found
+        if not found.suffices(self._query.risk) and self._is_same(answer.fix, found.fix):
+            found = found.weighed(answer.evidence)
+        if self._is_coarse(found):
+            return replace(found, fix=with_unconfirmed_tilt(self._query, found.fix))
+        return found
 
     def _find(self, step: Hashable) -> PeakCandidate | NoFix:
         assert isinstance(step, tuple)
-        return self._ncc.find(self.query, coarser=step[1])
+        return self._ncc.find(self._query, coarser=step[1])
 
-    def _match_structure(self, answer: Result | None, step: Hashable) -> Result | None:
-        """Structure where the refused peak lies."""
-        query, first, self._is_new = self.query, self._refused, False
-        assert first is not None  # or it was not offered
-        again = self._ncc.match_structure(query, first, self._ncc.surroundings(query, first))
-        if again is None:
-            return None
-        if not first.searched:
-            return self._judged(answer, again, first)
-        result = self._ncc.judge(query, again)
-        if isinstance(result, NoFix):
-            return None
-        self.query, self._refused, self._accepted = query.at(again.aligned.pose), None, again
-        return result
-
-    def _judged(
-        self, answer: Result | None, found: PeakCandidate | NoFix, first: PeakCandidate | NoFix
-    ) -> Result | None:
-        """The fix of a peak, or its refusal, which names the match by grey levels and leaves a coarse fix."""
-        query = self.query
-        result = self._ncc.judge(query, found)
-        if isinstance(result, NoFix):
-            self._refusal = replace(result, match=None if isinstance(first, NoFix) else first.fix)
-            if isinstance(found, PeakCandidate) and found.evidence.is_tested:
-                self._doubtful = found  # structure's, if it was matched: it sees what grey levels see, and more
-            return None if isinstance(answer, Fix) else self._refusal
-        assert isinstance(found, PeakCandidate)
-        self._refused, self._accepted = None, found
-        if found.aligned.level == query.level_of(query.telemetry.known_height_m):
-            return result
-        result = replace(result, stage="coarse")
-        return with_unconfirmed_tilt(query, result) if is_coarse(answer) else result
-
-    def _if_unseen(self, answer: Result | None) -> Works:
+    def _if_unseen(self, answer: Answer | None) -> Works:
         """Structure about a refused peak, once."""
-        found = self._refused
-        if found is None or not self._is_new:
+        if not self._is_refused(answer) or answer.by_structure:
             return {}
-        return {_STRUCTURE: found.aligned.work_px(self._ncc.surroundings(self.query, found))}
+        return {_STRUCTURE: answer.aligned.work_px(self._ncc.surroundings(self._query, answer))}
 
-    def _if_refused(self, answer: Result | None) -> Works:
+    def _match_structure(self, answer: Answer | None, step: Hashable) -> Answer | None:
+        """Structure where the refused peak lies; it sees what grey levels see, and more."""
+        assert isinstance(answer, PeakCandidate)  # or it was not offered
+        found = self._ncc.match_structure(self._query, answer, self._ncc.surroundings(self._query, answer))
+        return None if answer.searched and not is_accepted(found, self._query) else found
+
+    def _if_refinable(self, answer: Answer | None) -> Works:
+        """The pose of a fine peak, or of a refused one that lacks no more evidence than a refined pose gives."""
+        if not isinstance(answer, PeakCandidate) or answer.evidence.refined is not None:
+            return {}
+        risk = self._query.risk
+        if answer.suffices(risk):
+            offered = answer.fix.stage == "fine" and self._ncc.can_refine(self._query)
+        else:
+            offered = self._can_confirm and answer.weighed(replace(answer.evidence, refined=True)).suffices(risk)
+        return {_REFINEMENT: self._frame_px} if offered else {}
+
+    def _refine(self, answer: Answer | None, step: Hashable) -> Answer:
+        assert isinstance(answer, PeakCandidate)  # or it was not offered
+        return self._refinement(answer).refine(answer)
+
+    def _if_refused(self, answer: Answer | None) -> Works:
         """The search of headings and heights, if a peak is refused."""
-        return {} if self._refused is None else {_HYPOTHESES: max(self._works.values())}
+        return {_HYPOTHESES: max(self._works.values())} if self._is_refused(answer) else {}
 
-    def _search(self, answer: Result | None, step: Hashable) -> None:
-        """The best of all headings and heights within three sigmas; only structure can accept it.
+    def _search(self, answer: Answer | None, step: Hashable) -> Answer | None:
+        """The best of all headings and heights within three sigmas, if structure confirms it.
 
         A compass near motors is often off by more than a patch tolerates.
         """
-        self.refuse(self._ncc.find(self.query, widely=True))
-
-    def _refine_at_once(self, answer: Result | None, step: Hashable) -> Fix:
-        """The pose of a coarse peak refined, or the peak with a tilt that nothing confirmed."""
-        assert isinstance(answer, Fix)
-        return self._refinement.refine_at_once(answer) or with_unconfirmed_tilt(self.query, answer)
-
-    def _refine(self, answer: Result | None, step: Hashable) -> Result:
-        """The pose of a fine peak refined."""
-        assert isinstance(answer, Fix)
-        assert self._accepted is not None  # a fine peak was
-        return self._refinement.refine(replace(self._accepted, fix=answer))
-
-    def _is_refinable(self, answer: Result | None) -> bool:
-        return isinstance(answer, Fix) and answer.stage == "fine" and self._ncc.can_refine(self.query)
-
-    def _is_doubtful(self, answer: Result | None) -> bool:
-        """Whether a refused peak lacks no more evidence than a refined pose over a surface model gives."""
-        found = self._doubtful
-        if isinstance(answer, Fix) or found is None or not found.is_inside or not self._can_confirm:
-            return False
-        return replace(found.evidence, refined=True).suffices(self.query.risk)
-
-    def _refine_doubtful(self, answer: Result | None, step: Hashable) -> Fix | None:
-        """The pose of a refused peak, if it can be refined."""
-        assert self._doubtful is not None  # or it was not offered
-        refined = self._refinement.refine(self._doubtful)
-        if isinstance(refined, NoFix):
+        found = self._ncc.find(self._query, widely=True)
+        if isinstance(found, NoFix):
             return None
-        self._refused = None
-        return refined
+        again = self._ncc.match_structure(self._query, found, self._ncc.surroundings(self._query, found))
+        return again if is_accepted(again, self._query) else None
+
+    def _is_coarse(self, answer: Answer | None) -> TypeGuard[PeakCandidate]:
+        """Whether the answer is a fix at reduced resolution."""
+        is_peak = isinstance(answer, PeakCandidate) and answer.fix.stage == "coarse"
+        return is_peak and is_accepted(answer, self._query)
+
+    def _is_refused(self, answer: Answer | None) -> TypeGuard[PeakCandidate]:
+        return isinstance(answer, PeakCandidate) and not answer.suffices(self._query.risk)
 
     @property
     def _can_confirm(self) -> bool:
         """Whether refinement may confirm a place: with a known attitude over a surface model."""
-        query = self.query
+        query = self._query
         return query.telemetry.has_tilt and query.site.has_surface and self._ncc.can_refine(query)
 
-    @property
-    def _refinement(self) -> Refinement:
-        return Refinement(self.query, self._ncc.samples, self._ncc.options)
+    def _refinement(self, found: PeakCandidate) -> Refinement:
+        """Of the frame, with the heading and height of a candidate that a search fitted."""
+        query = self._query.at(found.aligned.pose) if found.searched else self._query
+        return Refinement(query, self._ncc.samples, self._ncc.options)
 
     def _is_same(self, coarse: Fix, fine: Fix) -> bool:
         """Whether two peaks are of one place, so that neither is the other's rival."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from engine.kernels.coarse_to_fine import EarlyStop
 from engine.kernels.scores import enhance
+from engine.matching.candidates import PeakCandidate
 from engine.matching.correlation import METHOD, Aligned, Correlator
 from engine.matching.covariance import (
     misalignment_covariance_px2,
@@ -14,7 +15,6 @@ from engine.matching.covariance import (
     score_sigma,
 )
 from engine.matching.evidence import (
-    Candidate,
     Evidence,
     independent_places,
     is_beyond_doubt,
@@ -23,26 +23,6 @@ from engine.matching.evidence import (
     surprise_of,
 )
 from engine.values import Fix, Peak, Window
-
-
-@dataclass(frozen=True, slots=True)
-class PeakCandidate(Candidate):
-    """The fix of a correlation peak.
-
-    Attributes:
-        peak: in pixels of the aligned level.
-        aligned: the hypothesis that it belongs to.
-        searched: whether heading and height were fitted to the picture.
-    """
-
-    peak: Peak
-    aligned: Aligned
-    searched: bool
-
-    @property
-    def is_inside(self) -> bool:
-        """Whether it is a summit, and no slope at the window's edge."""
-        return bool(self.peak.curvature.any())
 
 
 def early_stop(correlator: Correlator, aligned: Aligned, window: Window) -> EarlyStop:
@@ -140,6 +120,7 @@ def _null_score(
 def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window, *, searched: bool) -> Fix:
     """The camera's nadir and its covariance; also the heading if it was searched."""
     query, pose = correlator.query, aligned.pose
+    is_coarse = aligned.level > query.level_of(query.telemetry.known_height_m)
     errors = query.errors(correlator.options.errors)
     rows, columns = aligned.template.shape
     peak_px2 = peak_covariance_px(peak, rows * columns)
@@ -153,4 +134,5 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
         window=window,
         grid_attitude=pose.grid_attitude if searched else None,
         map_sigma_m=errors.map_m,
+        stage="coarse" if is_coarse else "fine",
     )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.geo import chi_square_of
-from engine.matching.acceptance import CHANCE
+from engine.matching.agreement import CHANCE
 from engine.matching.pnp import (
     SLACK,
     Fit,

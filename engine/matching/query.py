@@ -195,6 +195,7 @@ class Query:
         grid_attitude: Attitude | None = None,
         turn_covariance_rad2: Array | None = None,
         map_sigma_m: float = 0.0,
+        stage: str = "fine",
     ) -> Fix:
         """A fix of this frame; its heading is from true north at the fix.
 
@@ -209,6 +210,7 @@ class Query:
             grid_attitude: the heading from grid north; None if it is not measured.
             turn_covariance_rad2: (3, 3) of a small turn about the camera's axes, with a measured attitude.
             map_sigma_m: the georeference's part of the covariance.
+            stage: as :attr:`.Fix.stage`.
         """
         east, north = self.site.enu_from_pixel(nadir_px) if east_north_m is None else east_north_m
         lat, lon = map(float, self.site.geodetic_from_pixel(nadir_px))
@@ -231,6 +233,7 @@ class Query:
             timings=self.timings,
             map_xy_px=(float(nadir_px[0]), float(nadir_px[1])),
             map_sigma_m=map_sigma_m,
+            stage=stage,
             attitude_covariance_deg2=angles_deg2,
         )
 

@@ -24,10 +24,10 @@ from engine.kernels.dense import (
 from engine.kernels.scores import enhance
 from engine.maps.grids import window_about
 from engine.maps.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
-from engine.matching.acceptance import CHANCE, agree_in_height, are_consistent
+from engine.matching.agreement import CHANCE, agree_in_height, are_consistent
 from engine.matching.align import shrink
+from engine.matching.candidates import PeakCandidate
 from engine.matching.covariance import tilt_covariance
-from engine.matching.evidence import Candidate, probability
 from engine.matching.oblique import is_oblique
 from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
@@ -76,8 +76,8 @@ class Refinement:
     options: NccOptions
     knows_tilt: bool = True
 
-    def refine(self, found: Candidate) -> Fix | NoFix:
-        """The fix of a candidate with its whole pose refined, or a less certain one, or a refusal.
+    def refine(self, found: PeakCandidate) -> PeakCandidate | NoFix:
+        """The candidate with its whole pose refined, or a less certain one, or a refusal.
 
         If the picture hardly confirms the telemetry's attitude, the pose is refined once more as if roll and pitch
         were hardly known; the result counts if the picture confirms it. An attitude that it does not confirm
@@ -89,15 +89,15 @@ class Refinement:
             return self._over_surface(found)
         refined = self._through_all(fix)
         if _is_confirmed(refined):
-            return refined
+            return replace(found, fix=refined)
         if has_tilt:
-            return self._unconfirmed(refined or fix)
+            return self._unconfirmed(replace(found, fix=refined or fix))
         if not query.site.has_surface:
-            return fix
+            return found
         detail = "roll and pitch are unknown, and the picture does not determine them"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
-    def _over_surface(self, found: Candidate) -> Fix | NoFix:
+    def _over_surface(self, found: PeakCandidate) -> PeakCandidate | NoFix:
         """The same for a known attitude over a surface model, where a pose that can be refined is evidence.
 
         Of an oblique frame it often cannot be at right places as well, so that says nothing.
@@ -112,22 +112,19 @@ class Refinement:
                     raise
         if refined or not is_oblique(query, query.telemetry.known_attitude):
             evidence = replace(evidence, refined=refined is not None)
-        likely = probability(evidence.nats)
-        if not evidence.suffices(query.risk):
-            detail = f"wrong with probability {1.0 - likely:.1g}: the pose cannot be refined there"
-            return fix.refused(Reason.AMBIGUOUS, detail)
-        weighed = replace(refined or fix, confidence=likely)
-        return weighed if _is_confirmed(refined) else self._unconfirmed(weighed)
+        weighed = replace(found, fix=refined or fix).weighed(evidence)
+        is_settled = _is_confirmed(refined) or not weighed.suffices(query.risk)
+        return weighed if is_settled else self._unconfirmed(weighed)
 
-    def _unconfirmed(self, fix: Fix) -> Fix | NoFix:
-        """The fix of a known attitude that the picture does not confirm, refined or not, if the prior agrees."""
-        query = self.query
+    def _unconfirmed(self, found: PeakCandidate) -> PeakCandidate | NoFix:
+        """A known attitude that the picture does not confirm, refined or not, if the prior agrees."""
+        query, fix = self.query, found.fix
         if query.site.has_surface and fix.stage != "refined":
             fix = with_unconfirmed_tilt(query, fix)
         off = query.prior_chi_square(fix)
         agrees = off <= chi_square_of(CHANCE, 2) if off is not None else not query.site.has_surface
         if agrees:
-            return replace(fix, stage="unconfirmed")
+            return replace(found, fix=replace(fix, stage="unconfirmed"))
         against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
         detail = f"the picture does not confirm the attitude, and {against}"
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import replace
-from typing import TypeGuard
 
 from engine.maps.landmarks import LandmarkMap
 from engine.maps.samples import SampleMap
-from engine.matching.evidence import Candidate
+from engine.matching.candidates import PoseCandidate
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher
-from engine.matching.ladder import SHARES, Rung, Works, climb, rehearse
+from engine.matching.ladder import SHARES, Answer, Rung, Works, climb, is_accepted, rehearse, settled
 from engine.matching.method import Method
 from engine.matching.query import Query
 from engine.matching.refinement import CONFIRMING_CORRELATION, Refinement, with_unconfirmed_tilt
@@ -78,12 +77,12 @@ class Sift(Method):
 
     def warmup(self, query: Query) -> None:
         """Run every variant of every step, so that it is compiled and its cost known."""
-        efforts = Efforts(self, query)
-        rehearse(query, efforts.few, None)
-        for answer in rehearse(query, efforts.all, None):
-            rehearse(query, Efforts(self, query).refinement, answer)
-            if isinstance(answer, Fix) and self.can_refine(query):
-                self._refinement(query).refine_from_coarser(answer)
+        rungs = _Rungs(self, query)
+        rehearse(query, rungs.few, None)
+        for answer in rehearse(query, rungs.all, None):
+            rehearse(query, rungs.refinement, answer)
+            if is_accepted(answer, query) and self.can_refine(query):
+                self._refinement(query).refine_from_coarser(answer.fix)
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map."""
@@ -100,8 +99,10 @@ class Sift(Method):
             agrees: whether a fix agrees with another method's. The fix is then for comparison: not refined by the
                 grey levels that the other uses, and by all features if one by few does not agree.
         """
-        efforts = Efforts(self, query, agrees)
-        return efforts.settled(climb(query, METHOD, efforts.rungs))
+        answer = climb(query, METHOD, _Rungs(self, query, agrees).in_order)
+        if isinstance(answer, PoseCandidate) and answer.is_quick:  # it follows the telemetry's attitude
+            answer = replace(answer, fix=replace(with_unconfirmed_tilt(query, answer.fix), stage="coarse"))
+        return settled(query, answer)
 
     def few_options(self, query: Query) -> SiftOptions | None:
         """Of few features, at their scale; None if they are not wanted or the map has no such level."""
@@ -111,9 +112,10 @@ class Sift(Method):
         scale = coarser_scale(query, height_m, self.options.scale)
         return None if scale is None else replace(self._few, scale=scale)
 
-    def find_few(self, query: Query, options: SiftOptions) -> Candidate | NoFix:
+    def find_few(self, query: Query, options: SiftOptions) -> PoseCandidate | NoFix:
         """The pose by half as many keypoints, a level coarser and not upsampled."""
-        return FeatureMatcher(query, self.landmarks, options).find_at_once()
+        found = FeatureMatcher(query, self.landmarks, options).find_at_once()
+        return found if isinstance(found, NoFix) else replace(found, is_quick=True)
 
     def can_refine(self, query: Query) -> bool:
         """Whether poses are refined: only with trusted telemetry over a surface model."""
@@ -135,7 +137,7 @@ class Sift(Method):
         """The matches in a window at the frame's own height and heading."""
         return explain_features(FeatureMatcher(query, self.landmarks, self.options), window)
 
-    def find(self, query: Query, options: SiftOptions | None = None) -> Candidate | NoFix:
+    def find(self, query: Query, options: SiftOptions | None = None) -> PoseCandidate | NoFix:
         """The pose of one frame, or a refusal if there is none.
 
         Args:
@@ -143,10 +145,6 @@ class Sift(Method):
             options: replace the method's own.
         """
         return FeatureMatcher(query, self.landmarks, options or self.options).find()
-
-    def judge(self, query: Query, found: Candidate | NoFix) -> Result:
-        """The fix if there is a pose and it is accepted, else a refusal."""
-        return FeatureMatcher(query, self.landmarks, self.options).judge(found)
 
     def works(self, query: Query) -> Works:
         """Shares of the usual scale, by the pixels of the matched picture, which determine the cost."""
@@ -159,15 +157,17 @@ class Sift(Method):
             return {(step, share): query.gray.size * (scale * share) ** 2 for share in SHARES}
         return {(step, share): drawn_px(query, known.height_agl_m, scale * share) for share in SHARES}
 
-    def at_scale(self, query: Query, share: float) -> Result:
-        """The fix by all features at a share of the usual scale, not refined; or its refusal."""
+    def at_scale(self, query: Query, share: float) -> PoseCandidate | NoFix:
+        """The pose by all features at a share of the usual scale, not refined."""
         options = self.options if share == 1.0 else replace(self.options, scale=self.options.scale * share)
-        result = self.judge(query, self.find(query, options))
-        return replace(result, stage="coarse") if share < 1.0 and isinstance(result, Fix) else result
+        found = self.find(query, options)
+        if share == 1.0 or isinstance(found, NoFix):
+            return found
+        return replace(found, fix=replace(found.fix, stage="coarse"))
 
 
-class Efforts:
-    """The efforts on one frame: the rungs of SIFT's ladder and what they leave to each other.
+class _Rungs:
+    """The ladder of one frame.
 
     Args:
         sift: the method.
@@ -177,36 +177,24 @@ class Efforts:
 
     def __init__(self, sift: Sift, query: Query, agrees: Callable[[Fix], bool] | None = None) -> None:
         self._sift, self._query, self._agrees = sift, query, agrees
-        self._few: Candidate | None = None
         self._few_options = sift.few_options(query)
-        self._is_settled = self._is_unrefinable = False
-        self._works, frame_px = sift.works(query), float(query.gray.size)
+        self._works = sift.works(query)
+        self._refinement: Works = {_REFINEMENT: float(query.gray.size)}
         self.few = Rung(self._if_few_suffice, self._by_few)
         self.few_refined = Rung(
-            lambda answer: {} if self._few is None or agrees else {_REFINEMENT: frame_px}, self._refine_few
+            lambda answer: self._refinement if self._is_quick(answer) and agrees is None else {}, self._refine_few
         )
-        self.all = Rung(lambda answer: {} if self._is_settled else self._works, self._by_all)
-        self.refinement = Rung(
-            lambda answer: {_REFINEMENT: frame_px} if self._is_refinable(answer) else {}, self._refine
+        self.all = Rung(
+            lambda answer: self._works if answer is None or self._is_quick(answer) else {}, self._by_all
         )
+        self.refinement = Rung(lambda answer: self._refinement if self._is_refinable(answer) else {}, self._refine)
 
     @property
-    def rungs(self) -> list[Rung]:
-        """In their order."""
+    def in_order(self) -> list[Rung]:
+        """Cheap ones first."""
         return [self.few, self.few_refined, self.all, self.refinement]
 
-    def settled(self, answer: Result) -> Result:
-        """The ladder's answer; a fix by few features that nothing confirmed has a covariance for a wrong tilt.
-
-        Few features of a coarse picture follow the telemetry's attitude.
-        """
-        if not self._is_by_few(answer) or self._is_settled:
-            return answer
-        return replace(with_unconfirmed_tilt(self._query, answer), stage="coarse")
-
-    # ------------------------------------------------------------------------------------------------ rungs
-
-    def _if_few_suffice(self, answer: Result | None) -> Works:
+    def _if_few_suffice(self, answer: Answer | None) -> Works:
         """Few features, if time allows all of them as well, or only few."""
         if self._few_options is None:
             return {}
@@ -218,47 +206,51 @@ class Efforts:
         scheduler.note_refusal(_FEW)
         return {}
 
-    def _by_few(self, answer: Result | None, step: Hashable) -> Fix | None:
-        """The fix by few features, if it is beyond doubt and agrees; one with less evidence may be refined."""
+    def _by_few(self, answer: Answer | None, step: Hashable) -> Answer | None:
+        """The pose by few features, to be refined; or at once the second opinion, if it agrees."""
         assert self._few_options is not None  # or it was not offered
         found = self._sift.find_few(self._query, self._few_options)
         if isinstance(found, NoFix) or found.evidence.nats < self._query.needed_nats:
             return None
-        self._few = found
-        if not found.evidence.suffices(self._query.risk) or (self._agrees and not self._agrees(found.fix)):
-            return None
-        self._is_settled = self._agrees is not None
-        return found.fix
+        if self._agrees is None:
+            return found
+        is_second = is_accepted(found, self._query) and self._agrees(found.fix)
+        return replace(found, is_quick=False) if is_second else None
 
-    def _refine_few(self, answer: Result | None, step: Hashable) -> Fix | None:
-        """The fix by few features refined, if they suffice or the picture confirms it."""
-        assert self._few is not None  # or it was not offered
-        refined = self._sift.refined(self._query, self._few.fix)
-        self._is_unrefinable = refined is None
-        suffices = self._few.evidence.suffices(self._query.risk)
-        if refined is None or not (suffices or refined.score >= CONFIRMING_CORRELATION):
+    def _refine_few(self, answer: Answer | None, step: Hashable) -> Answer | None:
+        """The pose by few features refined, if they are beyond doubt or the picture confirms it."""
+        assert isinstance(answer, PoseCandidate)  # or it was not offered
+        refined = self._sift.refined(self._query, answer.fix)
+        if refined is None:
+            return replace(answer, is_refinable=False)
+        if not (is_accepted(answer, self._query) or refined.score >= CONFIRMING_CORRELATION):
             return None
-        self._is_settled = True
-        return refined
+        return replace(answer, fix=refined, is_quick=False, evidence=replace(answer.evidence, is_tested=True))
 
-    def _by_all(self, answer: Result | None, step: Hashable) -> Result:
-        """The fix by all features, or their refusal."""
+    def _by_all(self, answer: Answer | None, step: Hashable) -> Answer:
+        """The pose by all features."""
         assert isinstance(step, tuple)
-        return self._sift.at_scale(self._query, step[1])
+        found = self._sift.at_scale(self._query, step[1])
+        if isinstance(found, NoFix) or not isinstance(answer, PoseCandidate):
+            return found
+        return replace(found, is_refinable=answer.is_refinable)
 
-    def _is_refinable(self, answer: Result | None) -> bool:
-        is_done = self._is_settled or self._is_unrefinable or self._agrees is not None
+    def _is_quick(self, answer: Answer | None) -> bool:
+        return isinstance(answer, PoseCandidate) and answer.is_quick
+
+    def _is_refinable(self, answer: Answer | None) -> bool:
         return (
-            isinstance(answer, Fix)
-            and not self._is_by_few(answer)
-            and not is_done
+            self._agrees is None
+            and is_accepted(answer, self._query)
+            and isinstance(answer, PoseCandidate)
+            and answer.is_refinable
+            and answer.fix.stage != "refined"
+            and not answer.is_quick
             and self._sift.can_refine(self._query)
         )
 
-    def _is_by_few(self, answer: Result | None) -> TypeGuard[Fix]:
-        return self._few is not None and answer is self._few.fix
-
-    def _refine(self, answer: Result | None, step: Hashable) -> Fix | None:
-        """The fix by all features refined."""
-        assert isinstance(answer, Fix)
-        return self._sift.refined(self._query, answer)
+    def _refine(self, answer: Answer | None, step: Hashable) -> Answer | None:
+        """The pose by all features refined."""
+        assert isinstance(answer, PoseCandidate)  # or it was not offered
+        refined = self._sift.refined(self._query, answer.fix)
+        return None if refined is None else replace(answer, fix=refined)

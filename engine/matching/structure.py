@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance, orientation
 from engine.kernels.sums import box_sum, counts
+from engine.matching.candidates import PeakCandidate
 from engine.matching.correlation import MIN_VALID_SHARE, Aligned, Correlator
-from engine.matching.peak_evidence import PeakCandidate, candidate_of
+from engine.matching.peak_evidence import candidate_of
 from engine.ncc_fft import ncc
 from engine.runtime.device import on_host, to_device
 from engine.values import Window
@@ -61,7 +62,7 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
         sigma=max(float(chance.std(dtype=np.float64)), 1e-3),
         is_tested=True,
     )
-    return replace(own, fix=replace(own.fix, window=found.fix.window))
+    return replace(own, by_structure=True, fix=replace(own.fix, window=found.fix.window))
 
 
 def _templates(correlator: Correlator, aligned: Aligned) -> FloatImage:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import larger_variance
-from engine.matching.acceptance import CHANCE
+from engine.matching.agreement import CHANCE
 from engine.matching.align import MAX_FIELD_DEG, to_gray
 from engine.matching.covariance import with_frame_accuracy
 from engine.navigation.motion import GroundMotion, velocity_of

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engine import Reason
-from engine.matching.acceptance import peak_refusal, pose_refusal
+from engine.matching.candidates import PeakCandidate, PoseCandidate
 from engine.matching.evidence import (
     Evidence,
     independent_places,
@@ -19,6 +19,7 @@ from engine.matching.evidence import (
     probability,
     surprise_of,
 )
+from engine.values import Peak
 from tests.support.fixes import a_fix
 
 PLAIN = Evidence(40.0, 8.0, 1000.0, 1000.0, 2.0, 1.0)
@@ -74,17 +75,28 @@ def test_what_is_handed_out_is_wrong_with_no_more_than_the_risk(risk, surprise, 
 
 def test_a_refusal_of_a_pose_tells_its_figures():
     weak = Evidence(3.5 * math.log(10.0), 0.0, 1000.0, 1000.0, None)
-    assert not weak.suffices(1e-4)
-    reason, text = pose_refusal(weak, 1e-4)
+    pose = PoseCandidate(a_fix(), weak)
+    assert not pose.suffices(1e-4)
+    reason, text = pose.refusal(1e-4)
     assert reason is Reason.BAD_POSE
     for figure in ("0.0001 is allowed", "10^3.5", "rival once in 10^0.0", "chi-square unknown"):
         assert figure in text
-    assert "chi-square 3.2" in pose_refusal(replace(weak, prior_chi_square=3.2), 1e-4)[1]
+    assert "chi-square 3.2" in pose.weighed(replace(weak, prior_chi_square=3.2)).refusal(1e-4)[1]
+
+
+def test_a_pose_that_there_was_no_time_to_test_is_late():
+    untested = PoseCandidate(a_fix(), Evidence(32.0, 0.0, 1000.0, 1000.0, None)).untested(1e-4)
+    assert untested.evidence.nats >= needed_nats(1e-4)
+    assert untested.refusal(1e-4)[0] is Reason.LATE
 
 
 # ------------------------------------------------------------------------------------------------------- peaks
 
 PEAK = Evidence(32.0, 10.0, 1000.0, 1000.0, 2.0)
+
+
+def a_peak(evidence):
+    return PeakCandidate(a_fix(), evidence, Peak(1.0, 1.0, 0.9, 0.1, -0.02 * np.eye(2)), None)
 
 
 def test_the_best_of_many_places_is_worth_what_chance_makes_of_so_many():
@@ -140,17 +152,26 @@ def test_a_place_is_held_against_the_errors_of_both():
     ],
 )
 def test_a_peak_is_believed_if_the_risk_allows_it(evidence, risk, reason):
-    assert evidence.suffices(risk) == (reason is None)
+    found = a_peak(evidence)
+    assert found.suffices(risk) == (reason is None)
     if reason is not None:
-        why, figures = peak_refusal(0.8, evidence, risk)
+        why, figures = found.refusal(risk)
         assert why is reason
         assert f"{math.sqrt(2.0 * evidence.surprise):.1f}" in figures
 
 
 def test_what_a_search_fitted_waits_for_the_structure_about_the_place():
-    searched = replace(PEAK, surprise=1250.0, is_tested=False)
+    searched = a_peak(replace(PEAK, surprise=1250.0, is_tested=False))
     assert not searched.suffices(1e-4)
-    assert peak_refusal(0.8, searched, 1e-4)[0] is Reason.UNCONFIRMED
+    assert searched.refusal(1e-4)[0] is Reason.UNCONFIRMED
+
+
+def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_refused():
+    certain = a_peak(Evidence(1e3, 0.0, 1e3, 1e3, None))
+    at_edge = replace(certain, peak=replace(certain.peak, curvature=np.zeros((2, 2))))
+    assert certain.suffices(1e-4)
+    assert not at_edge.suffices(1e-4)
+    assert at_edge.refusal(1e-4) == (Reason.AMBIGUOUS, "NCC 0.900 still rises at the window's edge")
 
 
 def test_a_pose_that_can_be_refined_is_evidence_for_its_place_and_one_that_cannot_against_it():

@@ -15,13 +15,13 @@ from engine.budget import Budget, Deadline
 from engine.errors import DeviceError, OptionError
 from engine.features import match, sift
 from engine.matching.align import to_gray
-from engine.matching.evidence import Candidate, Evidence, probability
+from engine.matching.candidates import PoseCandidate
+from engine.matching.evidence import Evidence, probability
 from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.ncc import Ncc
-from engine.matching.peak_evidence import PeakCandidate
 from engine.matching.query import Query
 from engine.options import AssumedErrors, MatcherOptions, NccOptions, SiftOptions
-from engine.values import Fix, Frame, GridPose, NoFix, Peak, Prior, Reason
+from engine.values import Fix, Frame, GridPose, NoFix, Prior, Reason
 from tests.support.fixes import a_fix, px_off, values_of
 from tests.support.ground import Ground
 from tests.support.landmarks import landmarks_of
@@ -263,22 +263,12 @@ def test_what_is_found_after_the_telemetry_failed_is_weighed_against_other_place
         if nats is None:
             return matcher.query.refuse(Reason.BAD_POSE, "none", "sift")
         evidence = Evidence(nats + math.log(1000.0), 0.0, 1000.0, 1000.0, None)
-        return Candidate(a_fix(100.0 * (len(tried) - 1), confidence=probability(nats)), evidence)
+        return PoseCandidate(a_fix(100.0 * (len(tried) - 1), confidence=probability(nats)), evidence)
 
     monkeypatch.setattr(FeatureMatcher, "_find_with", look)
     answer = with_sift(ground, camera, refine=False).locate(frame, prior)
     assert len(tried) == looks
     assert (answer.east_m if isinstance(answer, Fix) else None) == fixed_at_m
-
-
-def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_refused(site, camera, frame, prior):
-    matcher = SceneMatcher(site, camera, "ncc")
-    query, certain = matcher._query(frame, prior, Deadline(Budget())), Evidence(1e3, 0.0, 1e3, 1e3, None)
-    inside = PeakCandidate(a_fix(), certain, Peak(1.0, 1.0, 0.9, 0.1, -0.02 * np.eye(2)), None, searched=False)
-    at_edge = replace(inside, peak=replace(inside.peak, curvature=np.zeros((2, 2))))
-    assert matcher._method.judge(query, inside) is inside.fix
-    refusal = matcher._method.judge(query, at_edge)
-    assert (refusal.reason, refusal.detail) == (Reason.AMBIGUOUS, "NCC 0.900 still rises at the window's edge")
 
 
 # The null hypothesis of SIFT: what the mirrored frame reaches is chance, and counts against the pose

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from engine import Budget, Fix, MatcherOptions, NccOptions, NoFix, Reason, SceneMatcher
-from engine.matching.ncc import Efforts, Ncc
+from engine.matching.ncc import Ncc, _Rungs
 from engine.matching.refinement import Refinement
 from engine.runtime.scheduler import Costs, OutOfTime, Scheduler
 from tests.support.fixes import px_off
@@ -89,7 +89,7 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(make, frame, pr
     """Where there is no time for the finest level; and where there is, the coarse one is enough."""
     hurried = make("ncc", ncc=cost_of_the_finest(make, frame, prior, "ncc")).locate(frame, prior, HURRY)
     by_coarse = make("ncc").locate(frame, prior)
-    monkeypatch.setattr(Efforts, "_if_coarse_suffices", lambda self, answer: {})
+    monkeypatch.setattr(_Rungs, "_if_coarse_suffices", lambda self, answer: {})
     by_fine = make("ncc").locate(frame, prior)
     for fix in (hurried, by_coarse, by_fine):
         assert px_off(fix, NADIR) < 0.6
@@ -104,41 +104,45 @@ def out_of_time(*_):
 
 def test_steps_that_are_abandoned_leave_the_coarse_fix(make, frame, prior, monkeypatch):
     monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
-    monkeypatch.setattr(Efforts, "_correlate", out_of_time)
+    monkeypatch.setattr(_Rungs, "_correlate", out_of_time)
     fix = make("ncc").locate(frame, prior, HURRY)
     assert px_off(fix, NADIR) < 6
     assert fix.stage == "coarse"
 
 
 @pytest.mark.parametrize(
-    ("reason", "off_m", "is_fixed"),
+    ("off_m", "expected"),
     [
-        (Reason.LATE, None, True),
-        (Reason.AMBIGUOUS, 1.0, True),  # a finer peak at the same place does not contradict
-        (Reason.AMBIGUOUS, 8.0, False),  # a rival is farther off than 6 m
-        (Reason.AMBIGUOUS, 60.0, False),
-        (Reason.LOW_SCORE, None, False),
+        (1.0, "coarse"),  # a finer peak of the same place
+        (8.0, Reason.AMBIGUOUS),  # a rival is farther off than 6 m
+        (60.0, Reason.AMBIGUOUS),
+        (Reason.LATE, "coarse"),
+        (Reason.OUTSIDE_MAP, Reason.OUTSIDE_MAP),
     ],
 )
-def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(
-    make, frame, prior, monkeypatch, reason, off_m, is_fixed
-):
+def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(make, frame, prior, monkeypatch, off_m, expected):
+    """Its evidence is that of a finer peak of the same place, which makes nothing more certain."""
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
-    coarse = []
+    monkeypatch.setattr(Refinement, "refine", out_of_time)
+    monkeypatch.setattr(Ncc, "match_structure", out_of_time)
+    correlate, coarse = Ncc.find, []
 
-    def refused(self, answer, _step):
-        coarse.append(answer)
-        match = None if off_m is None else replace(answer, east_m=answer.east_m + off_m)
-        self._refusal = replace(self.query.refuse(reason, "of the finer peak", "ncc"), match=match)
+    def refused(self, query, *, coarser=0, **how):
+        if coarser > 1:
+            coarse.append(correlate(self, query, coarser=coarser, **how))
+            return coarse[0]
+        if isinstance(off_m, Reason):
+            return query.refuse(off_m, "of the finer peak", "ncc")
+        east_m = coarse[0].fix.east_m + off_m
+        weak = coarse[0].weighed(replace(coarse[0].evidence, surprise=60.0, rival=60.0))
+        return replace(weak, fix=replace(weak.fix, east_m=east_m))
 
-    monkeypatch.setattr(Efforts, "_correlate", refused)
+    monkeypatch.setattr(Ncc, "find", refused)
     result = make("ncc").locate(frame, prior, HURRY)
-    assert isinstance(result, Fix) == is_fixed
-    if is_fixed:  # refinement did not confirm the tilt, and a refused peak makes nothing more certain
-        assert result.confidence == pytest.approx(1.0, abs=1e-3)
+    assert (result.stage if isinstance(result, Fix) else result.reason) == expected
+    if isinstance(result, Fix):  # refinement did not confirm the tilt
+        assert result.confidence == coarse[0].fix.confidence == pytest.approx(1.0, abs=1e-3)
         assert result.relative_sigma_m > 3.5
-        assert replace(result, timings=coarse[0].timings) == coarse[0]
-    assert (result.stage if is_fixed else result.reason) == ("coarse" if is_fixed else reason)
 
 
 @pytest.mark.parametrize("finer", [(), (1,), (1, 0)])
@@ -147,7 +151,7 @@ def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_coarser_level(
 ):
     """And no level is correlated twice."""
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
-    monkeypatch.setattr(Refinement, "refine", lambda _self, found: found.fix)
+    monkeypatch.setattr(Refinement, "refine", lambda _self, found: found)
     correlated, find = [], Ncc.find
 
     def noted(self, query, *, coarser=0, **options):
@@ -166,14 +170,14 @@ def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_coarser_level(
 def test_refinement_at_once_is_begun_only_where_there_is_time_for_it(make, frame, prior, monkeypatch):
     """What comes before it may have taken longer than thought."""
     matcher = make("ncc")
-    search_coarsely = Efforts._search_coarsely
+    search_coarsely = _Rungs._search_coarsely
 
     def slow(self, *args):
         found = search_coarsely(self, *args)
         matcher._costs.per_unit = {"refinement": 1e9, "ncc": 1e9}
         return found
 
-    monkeypatch.setattr(Efforts, "_search_coarsely", slow)
+    monkeypatch.setattr(_Rungs, "_search_coarsely", slow)
     fix = matcher.locate(frame, prior, HURRY)
     assert px_off(fix, NADIR) < 6
     assert fix.stage == "coarse"

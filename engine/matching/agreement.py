@@ -1,0 +1,60 @@
+"""Agreement: whether two estimates of one place contradict each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.geo import chi_square, chi_square_of
+from engine.values import Fix
+
+Array = NDArray[np.float64]
+
+CHANCE = 1e-3
+"""Two estimates contradict each other if chance sets them so far apart less often than this."""
+
+
+def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:
+    """Whether two estimates of one position agree.
+
+    Args:
+        apart_m: (2,) from one to the other, in metres.
+        covariance_m2: (2, 2) sum of their covariances.
+
+    Returns:
+        bool: False if they contradict each other, see :data:`CHANCE`.
+    """
+    return chi_square(apart_m, covariance_m2) <= chi_square_of(CHANCE, 2)
+
+
+def offset_between_m(first: Fix, second: Fix) -> Array:
+    """How far one fix lies from another.
+
+    Args:
+        first: The fix at the offset's end.
+        second: The fix at its start.
+
+    Returns:
+        (2,) metres east and north from the second fix to the first.
+    """
+    return np.array([first.east_m - second.east_m, first.north_m - second.north_m])
+
+
+def agree_in_place(first: Fix, second: Fix) -> bool:
+    """Whether two fixes on one map are of one place (:func:`are_consistent`); they share the map's error."""
+    covariance_m2 = first.relative_covariance_m2 + second.relative_covariance_m2
+    return are_consistent(offset_between_m(first, second), covariance_m2)
+
+
+def agree_in_height(first: Fix, second: Fix) -> bool:
+    """Whether two poses are equally high; the telemetry may hold refinement at a wrong height.
+
+    Args:
+        first: one pose; if it did not measure its height, it agrees with any.
+        second: the other pose.
+    """
+    if first.up_m is None or second.up_m is None:
+        return True
+    variance_m2 = float(first.covariance_m2[2, 2] + second.covariance_m2[2, 2])
+    variance_m2 -= first.map_sigma_m**2 + second.map_sigma_m**2  # they share this error
+    return (first.up_m - second.up_m) ** 2 <= chi_square_of(CHANCE, 1) * variance_m2

@@ -1,0 +1,123 @@
+"""Candidates: what the looks at a frame propose, and why one without enough evidence is refused."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
+
+from engine.matching.evidence import Evidence, is_beyond_doubt, needed_nats, probability
+from engine.values import Fix, Peak, Reason
+
+if TYPE_CHECKING:
+    from engine.matching.correlation import Aligned
+
+Refusal = tuple[Reason, str]
+"""Why a candidate is not accepted, and the figures behind it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate(ABC):
+    """A place that a look at a frame proposes.
+
+    Attributes:
+        fix: that it gives if accepted, with its probability.
+        evidence: for it.
+    """
+
+    fix: Fix
+    evidence: Evidence
+
+    def suffices(self, risk: float) -> bool:
+        """Whether its fix may be handed out: it is wrong with at most this probability."""
+        return self.evidence.suffices(risk)
+
+    @abstractmethod
+    def refusal(self, risk: float) -> Refusal:
+        """Why it does not suffice for this risk."""
+
+    def weighed(self, evidence: Evidence) -> Self:
+        """The candidate by other evidence."""
+        return replace(self, evidence=evidence, fix=replace(self.fix, confidence=probability(evidence.nats)))
+
+    def untested(self, risk: float) -> Self:
+        """The candidate without a test of the null hypothesis, which counts only if it is beyond doubt."""
+        is_tested = is_beyond_doubt(self.evidence.nats, risk)
+        return replace(self, evidence=replace(self.evidence, is_tested=is_tested))
+
+    def _wrong(self, risk: float) -> str:
+        wrong = 1.0 - probability(self.evidence.nats)
+        return f"wrong with probability {wrong:.1g}, at most {risk:g} is allowed"
+
+    @property
+    def _from_prior(self) -> str:
+        off = self.evidence.prior_chi_square
+        return f"chi-square {'unknown' if off is None else f'{off:.1f}'} from the prior"
+
+
+@dataclass(frozen=True, slots=True)
+class PeakCandidate(Candidate):
+    """The place of a correlation peak.
+
+    Attributes:
+        peak: in pixels of the aligned level.
+        aligned: the hypothesis that it belongs to.
+        searched: whether heading and height were fitted to the picture.
+        by_structure: whether structure was matched as well as grey levels.
+    """
+
+    peak: Peak
+    aligned: Aligned
+    searched: bool = False
+    by_structure: bool = False
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether it is a summit, and no slope at the window's edge."""
+        return bool(self.peak.curvature.any())
+
+    def suffices(self, risk: float) -> bool:
+        """As of every candidate; a slope at the window's edge never does."""
+        return self.is_inside and self.evidence.suffices(risk)
+
+    def refusal(self, risk: float) -> Refusal:
+        """Why it does not suffice for this risk."""
+        evidence, score = self.evidence, self.peak.score
+        if not self.is_inside:
+            return Reason.AMBIGUOUS, f"NCC {score:.3f} still rises at the window's edge"
+        if evidence.refined is False:
+            return Reason.AMBIGUOUS, f"{self._wrong(risk)}: the pose cannot be refined there"
+        sigmas, rival = (math.sqrt(2.0 * surprise) for surprise in (evidence.surprise, evidence.chance))
+        if replace(evidence, rival=0.0, null=0.0, prior_chi_square=None).nats < needed_nats(risk):
+            return Reason.LOW_SCORE, f"best NCC {score:.3f}, {sigmas:.1f} sigmas, may be chance"
+        figures = f"NCC {sigmas:.1f} sigmas, rival at {rival:.1f}, {self._from_prior}"
+        if not evidence.is_tested:
+            doubt = "found by a search, not confirmed by the structure about the place"
+            return Reason.UNCONFIRMED, f"{doubt} ({figures})"
+        return Reason.AMBIGUOUS, f"{self._wrong(risk)} ({figures})"
+
+
+@dataclass(frozen=True, slots=True)
+class PoseCandidate(Candidate):
+    """The pose that matched features give.
+
+    Attributes:
+        is_quick: whether it is by few features, and neither refined nor confirmed.
+        is_refinable: False if a refinement of the frame's pose has failed.
+    """
+
+    is_quick: bool = False
+    is_refinable: bool = True
+
+    def refusal(self, risk: float) -> Refusal:
+        """Why it does not suffice for this risk."""
+        evidence, ten = self.evidence, math.log(10.0)
+        if not evidence.is_tested:
+            return Reason.LATE, "no time was left to compare a pose by few features with the mirrored frame's"
+        by_chance = f"by chance once in 10^{evidence.surprise / ten:.1f}"
+        if replace(evidence, null=0.0).nats >= needed_nats(risk):
+            figures = f"{by_chance} against 10^{evidence.null / ten:.1f}"
+            return Reason.AMBIGUOUS, f"the mirrored frame fits the map as well ({figures}): {self._wrong(risk)}"
+        rival = f"rival once in 10^{evidence.rival / ten:.1f}"
+        return Reason.BAD_POSE, f"{self._wrong(risk)} ({by_chance}, {rival}, {self._from_prior})"
