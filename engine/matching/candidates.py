@@ -65,12 +65,14 @@ class PeakCandidate(Candidate):
         aligned: the hypothesis that it belongs to.
         searched: whether heading and height were fitted to the picture.
         by_structure: whether structure was matched as well as grey levels.
+        by_refinement: whether refining its pose was tried.
     """
 
     peak: Peak
     aligned: Aligned
     searched: bool = False
     by_structure: bool = False
+    by_refinement: bool = False
 
     @property
     def is_inside(self) -> bool:
@@ -86,7 +88,7 @@ class PeakCandidate(Candidate):
         evidence, score = self.evidence, self.peak.score
         if not self.is_inside:
             return Reason.AMBIGUOUS, f"NCC {score:.3f} still rises at the window's edge"
-        if evidence.refined is False:
+        if evidence.refined == -math.inf:
             return Reason.AMBIGUOUS, f"{self._wrong(risk)}: the pose cannot be refined there"
         sigmas, rival = (math.sqrt(2.0 * surprise) for surprise in (evidence.surprise, evidence.chance))
         if replace(evidence, rival=0.0, null=0.0, prior_chi_square=None).nats < needed_nats(risk):

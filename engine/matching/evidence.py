@@ -25,9 +25,7 @@ SEARCHED = (2.0 * SPREAD_SIGMAS) ** 2 / (2.0 * math.pi)
 """Area of a window over that of the prior's Gaussian: how much more probable its middle is than other places."""
 _MAX_NATS = 30.0  # above it a probability is 1 to the last digit
 _PLACE_PX = 4.0  # side of the area that counts as one place: enhanced pictures vary on this scale
-# Shares of right and of wrong places where the pose could be refined: 186 of 190 that chance gives less than once
-# in 400, and 2 of 51 that it gives less than once in 8, over six simulated towns in all lights and seasons.
-_REFINED_RIGHT, _REFINED_WRONG = 0.98, 0.04
+_UNREFINABLE = 0.02  # share of right places where no pose can be refined: 4 of 190 over six simulated towns
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +49,8 @@ class Evidence:
         elsewhere: the evidence for the best other place that another attempt found.
         is_tested: whether the null hypothesis was tested, or would change nothing. A score maximised by a fit of
             heading and height is no evidence until the structure around the place confirms it.
-        refined: whether the pose of a known attitude could be refined there over a surface; None if that was not
-            tried, or says nothing.
+        refined: the surprise of the pose refined there, less what was tried for it, -inf if there is none; None if
+            it was not tried, or says nothing.
     """
 
     surprise: float
@@ -64,7 +62,7 @@ class Evidence:
     null: float = 0.0
     elsewhere: float = 0.0
     is_tested: bool = True
-    refined: bool | None = None
+    refined: float | None = None
 
     @property
     def chance(self) -> float:
@@ -75,9 +73,17 @@ class Evidence:
     def nats(self) -> float:
         """What was seen, by how much places look alike; what was known before; and what refinement said."""
         alike = max(1.0, min(self.chance, self.surprise) / math.log(self.measured))
-        seen = self.surprise / alike - math.log(self.tried)
-        known = _of_position(self.prior_chi_square) + _of_height(self.height_chi_square)
-        return max(seen, 0.0) + known - self.elsewhere + _of_refinement(self.refined)
+        seen = max(self.surprise / alike - math.log(self.tried), 0.0)
+        if self.refined is not None:  # peak and pose compare the same picture: the greater evidence counts
+            seen = max(seen + math.log(_UNREFINABLE), self.of_refinement)
+        return seen + _of_position(self.prior_chi_square) + _of_height(self.height_chi_square) - self.elsewhere
+
+    @property
+    def of_refinement(self) -> float:
+        """The evidence of the refined pose alone, in nats; a rival as good as the peak leaves none."""
+        if self.refined is None or self.chance >= self.surprise:
+            return -math.inf
+        return self.refined * (1.0 - self.chance / self.surprise) - math.log(self.tried)
 
     def suffices(self, risk: float) -> bool:
         """Whether a fix may be handed out: it is wrong with at most this probability."""
@@ -121,14 +127,6 @@ def _of_height(chi_square: float | None) -> float:
 
 def _gaussian(chi_square: float) -> float:
     return RELIABILITY * math.exp(-0.5 * min(chi_square, 1e3))
-
-
-def _of_refinement(refined: bool | None) -> float:
-    """Evidence for a place by whether the pose of a known attitude can be refined there over a surface model."""
-    right, wrong = _REFINED_RIGHT, _REFINED_WRONG
-    if refined is None:
-        return 0.0
-    return math.log(right / wrong) if refined else math.log((1.0 - right) / (1.0 - wrong))
 
 
 def probability(nats: float) -> float:

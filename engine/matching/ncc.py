@@ -70,6 +70,8 @@ class Ncc(Method):
             rungs = _Rungs(self, each)
             for answer in rehearse(each, rungs.levels, None):
                 rehearse(each, rungs.refinement, answer)
+                if isinstance(answer, PeakCandidate) and self.can_refine(each):
+                    Refinement(each, self.samples, self.options).rehearse(answer.fix)
         self._rehearse_refused(query, with_search=False)
 
     def warmup_search(self, query: Query) -> None:
@@ -285,14 +287,11 @@ class _Rungs:
         return None if answer.searched and not is_accepted(found, self._query) else found
 
     def _if_refinable(self, answer: Answer | None) -> Works:
-        """The pose of a fine peak, or of a refused one that lacks no more evidence than a refined pose gives."""
-        if not isinstance(answer, PeakCandidate) or answer.evidence.refined is not None:
+        """The pose of a fine peak, or of a refused one, of which it is stronger evidence."""
+        if not isinstance(answer, PeakCandidate) or answer.by_refinement or not self._ncc.can_refine(self._query):
             return {}
-        risk = self._query.risk
-        if answer.suffices(risk):
-            offered = answer.fix.stage == "fine" and self._ncc.can_refine(self._query)
-        else:
-            offered = self._can_confirm and answer.weighed(replace(answer.evidence, refined=True)).suffices(risk)
+        accepted = answer.suffices(self._query.risk)
+        offered = answer.fix.stage == "fine" if accepted else answer.is_inside and answer.evidence.is_tested
         return {_REFINEMENT: self._frame_px} if offered else {}
 
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
-from typing import TypeGuard
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ from engine.kernels.dense import (
     EnhancedFrame,
     GaussianPrior,
     Pose,
+    Samples,
     correlation_at,
     covariance_of,
     refine,
@@ -28,6 +28,7 @@ from engine.matching.agreement import CHANCE, agree_in_height, are_consistent
 from engine.matching.align import shrink
 from engine.matching.candidates import PeakCandidate
 from engine.matching.covariance import tilt_covariance
+from engine.matching.evidence import RELIABILITY, surprise_of
 from engine.matching.oblique import is_oblique
 from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
@@ -37,16 +38,11 @@ from engine.values import Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
 
-_COARSER = (
-    2  # levels above the frame's own on which a refinement restarts if it fails there, or the tilt is unknown
-)
-_TILTS_DEG = (-6.0, -3.0, 0.0, 3.0, 6.0)  # tried first about both axes if the tilt is unknown
-_MIN_CORRELATION = 0.2  # of an accepted pose with a known tilt: true poses over a town in snow reached 0.29
+_CAPTURE_PX = 20.0  # tilts are tried on the level on which one off by one sigma moves the ground by no more
+_TILTS, _STARTS = np.arange(-3.0, 3.5), 3  # sigmas of an unknown tilt, about both axes; the best few are refined
 CONFIRMING_CORRELATION = 0.45
-"""Least correlation of a pose that the picture itself confirms, without a known tilt or at the first attempt.
+"""Correlation of a pose at which nothing else is tried: no coarser level, and no doubt of a known tilt.
 
-Below it coarser levels are tried and a known tilt is doubted. Without a known tilt true poses over simulated towns
-reached 0.53 and wrong ones 0.32.
 By day the frames of three simulated flights reached 0.8 and more; in the evening, on a map from noon, half of them
 reached 0.6. Poses with a wrong tilt reached 0.30 to 0.35, and 0.87 as soon as the tilt was doubted.
 """
@@ -54,10 +50,30 @@ reached 0.6. Poses with a wrong tilt reached 0.30 to 0.35, and 0.87 as soon as t
 # of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; with correct angles all
 # were confirmed.
 _UNCONFIRMED_TILT_DEG = 1.5
-# Standard deviation of each angle of an attitude that the image does not confirm.
-_DOUBTED_DEG = 6.0
 _HEIGHT_SHARE = 2e-4  # bias of the height from walls and the ground hidden behind them: 3 cm at 150 m
 _COARSE_SAMPLES = 800  # on a coarser level
+# Places about a pose that show what correlation chance gives there, as shares of the shorter side of the ground in
+# the picture: far enough to be other places, near enough for most samples to stay in the picture.
+_ELSEWHERE = np.array(
+    [(r * np.cos(a), r * np.sin(a), 0.0) for r in (0.2, 0.3, 0.4) for a in np.arange(8) * np.pi / 4]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """A refined pose.
+
+    Attributes:
+        fix: that it gives; its score is the correlation of picture and map.
+        pose: of the camera.
+        picture: as it was compared with the map.
+        ground: the samples of the map.
+    """
+
+    fix: Fix
+    pose: Pose
+    picture: EnhancedFrame
+    ground: Samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,44 +93,89 @@ class Refinement:
     knows_tilt: bool = True
 
     def refine(self, found: PeakCandidate) -> PeakCandidate | NoFix:
-        """The candidate with its whole pose refined, or a less certain one, or a refusal.
+        """The candidate with its whole pose refined and the evidence of that, or a less certain one, or a refusal.
 
-        If the picture hardly confirms the telemetry's attitude, the pose is refined once more as if roll and pitch
-        were hardly known; the result counts if the picture confirms it. An attitude that it does not confirm
-        counts only if the position agrees with the prior. If roll and pitch are unknown, the picture must
-        determine them over a surface model. Without one, where relief may be the reason, the fix stays as it was.
+        If the picture hardly confirms the telemetry's attitude over a surface model, the pose is refined again as
+        if roll and pitch were hardly known, and the more probable pose counts. An attitude that the picture does
+        not confirm counts only if the position agrees with the prior. If roll and pitch are unknown, the picture
+        must determine them over a surface model. Without one, where relief may be the reason, the fix stays as is.
         """
-        query, has_tilt, fix = self.query, self.query.telemetry.has_tilt, found.fix
-        if has_tilt and query.site.has_surface:
-            return self._over_surface(found)
-        refined = self._through_all(fix)
-        if _is_confirmed(refined):
-            return replace(found, fix=refined)
+        query, has_tilt, found = self.query, self.query.telemetry.has_tilt, replace(found, by_refinement=True)
+        refined = self.refine_pose(found.fix)
+        is_clear = refined is not None and _is_clear(refined.fix)
+        if refined is not None and is_clear and found.suffices(query.risk):
+            return replace(found, fix=refined.fix)
+        own = self._weighed(found, refined)
+        best = self._or_doubted(found, own) if has_tilt and query.site.has_surface and not is_clear else own
+        if best is not None and (is_clear or not has_tilt or best is not own):
+            return best
+        best = best or self._unrefined(found)
+        if not best.suffices(query.risk):
+            return best
         if has_tilt:
-            return self._unconfirmed(replace(found, fix=refined or fix))
+            return self._unconfirmed(best)
         if not query.site.has_surface:
-            return found
-        detail = "roll and pitch are unknown, and the picture does not determine them"
+            return best
+        detail, fix = "roll and pitch are unknown, and the picture does not determine them", best.fix
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
-    def _over_surface(self, found: PeakCandidate) -> PeakCandidate | NoFix:
-        """The same for a known attitude over a surface model, where a pose that can be refined is evidence.
+    def _or_doubted(self, found: PeakCandidate, own: PeakCandidate | None) -> PeakCandidate | None:
+        """The candidate refined by a known attitude, or as if that were hardly known; the more probable one."""
+        doubting = self._doubting()
+        try:
+            other = doubting._weighed(found, doubting.refine_pose(found.fix), math.log(1.0 - RELIABILITY))
+        except OutOfTime:
+            if own is None:
+                raise
+            return own
+        both = [each for each in (own, other) if each is not None]
+        return max(both, key=lambda each: each.evidence.of_refinement, default=None)
 
-        Of an oblique frame it often cannot be at right places as well, so that says nothing.
+    def _weighed(
+        self, found: PeakCandidate, refined: Refined | None, log_prior: float = 0.0
+    ) -> PeakCandidate | None:
+        """The candidate with a refined pose; None if chance may have given that pose as well.
+
+        Args:
+            found: the candidate.
+            refined: its pose.
+            log_prior: of what that assumes about the attitude.
         """
-        query, fix, evidence = self.query, found.fix, found.evidence
-        refined = self._through_all(fix)
-        if not _is_confirmed(refined):
-            try:
-                refined = self._doubting()._through_all(fix) or refined
-            except OutOfTime:
-                if refined is None:
-                    raise
-        if refined or not is_oblique(query, query.telemetry.known_attitude):
-            evidence = replace(evidence, refined=refined is not None)
-        weighed = replace(found, fix=refined or fix).weighed(evidence)
-        is_settled = _is_confirmed(refined) or not weighed.suffices(query.risk)
-        return weighed if is_settled else self._unconfirmed(weighed)
+        if refined is None:
+            return None
+        tilts, off = 1 if self._knows_tilt else len(_TILTS) ** 2, self.query.prior_chi_square(refined.fix)
+        surprise = self.surprise_of(refined) - math.log(tilts) + log_prior
+        evidence = replace(found.evidence, refined=surprise, prior_chi_square=off)
+        if evidence.of_refinement < self.query.needed_nats:
+            return None
+        return replace(found, fix=refined.fix).weighed(evidence)
+
+    def _unrefined(self, found: PeakCandidate) -> PeakCandidate:
+        """A candidate whose pose cannot be refined: evidence against it, unless right ones often cannot be either.
+
+        That is so of oblique frames, of an unknown attitude and over unknown relief.
+        """
+        query = self.query
+        says = self._knows_tilt and query.site.has_surface and found.suffices(query.risk)
+        if not says or is_oblique(query, query.telemetry.known_attitude):
+            return found
+        return found.weighed(replace(found.evidence, refined=-math.inf))
+
+    def surprise_of(self, refined: Refined) -> float:
+        """The surprise of a refined pose's correlation, by what the picture reaches about it; 0 if unknown."""
+        query, pose = self.query, refined.pose
+        height_m = query.telemetry.known_height_m
+        level = query.level_of(height_m)
+        window = self._footprint(pose, height_m, level)
+        if window is None:
+            return 0.0
+        side_m = min(window.width_px, window.height_px) * query.site.gsd_m_per_px * 2.0**level
+        elsewhere = [replace(pose, center_m=pose.center_m + shift) for shift in side_m * _ELSEWHERE]
+        seen = [correlation_at(refined.picture, refined.ground, each) for each in elsewhere]
+        chance = np.array([score for score in seen if score != 0.0])  # 0 if too little of the map is seen
+        if 2 * len(chance) < len(elsewhere):
+            return 0.0
+        return surprise_of(refined.fix.score, float(chance.std()))
 
     def _unconfirmed(self, found: PeakCandidate) -> PeakCandidate | NoFix:
         """A known attitude that the picture does not confirm, refined or not, if the prior agrees."""
@@ -130,36 +191,43 @@ class Refinement:
         return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
 
     def refine_at_once(self, fix: Fix) -> Fix | None:
-        """The fix of a known tilt refined on the frame's own level; None if the picture does not confirm it."""
-        prior = self._prior(fix)
-        return self._refined(fix, prior, self._at_once(prior))
+        """The fix refined on the frame's own level; None if the picture does not confirm it."""
+        refined = self._refined(fix, self._prior(fix), 0)
+        return refined.fix if refined is not None and _is_clear(refined.fix) else None
 
-    def refine_from_coarser(self, fix: Fix) -> Fix | None:
-        """The same from a coarser level, where a few pixels span more ground."""
-        prior = self._prior(fix)
-        return self._refined(fix, prior, self._through_levels(prior, _COARSER))
+    def refine_pose(self, fix: Fix) -> Refined | None:
+        """The pose refined from a level that suits the tilt, then from its neighbours, until it is clear."""
+        prior, best = self._prior(fix), None
+        for coarser in self._levels_above:
+            refined = self._refined(fix, prior, coarser)
+            if refined is not None and (best is None or refined.fix.score > best.fix.score):
+                best = refined
+            if best is not None and _is_clear(best.fix):
+                break
+        return best
+
+    def rehearse(self, fix: Fix) -> None:
+        """Refine on every level, with a known and with a doubted attitude, so that all is prepared."""
+        for refinement in (self, self._doubting()):
+            # a vehicle that flies higher is matched on coarser levels
+            refinement._refined(fix, refinement._prior(fix), max(refinement._levels_above) + 1)
 
     def _doubting(self) -> Refinement:
         """The same for a frame whose attitude is hardly known."""
-        frame = replace(
-            self.query.frame,
-            tilt_sigma_deg=_DOUBTED_DEG,
-            heading_sigma_deg=max(self.query.frame.heading_sigma_deg or 0.0, _DOUBTED_DEG),
-        )
+        frame, sigma_deg = self.query.frame, self.options.errors.unknown_tilt_deg
+        heading_sigma_deg = max(frame.heading_sigma_deg or 0.0, sigma_deg)
+        frame = replace(frame, tilt_sigma_deg=sigma_deg, heading_sigma_deg=heading_sigma_deg)
         return replace(self, query=replace(self.query, frame=frame), knows_tilt=False)
 
-    def _through_all(self, fix: Fix) -> Fix | None:
-        """The fix with its pose refined, from a coarser level if necessary."""
-        prior, fit = self._prior(fix), None
-        if self._knows_tilt:
-            fit = self._at_once(prior)
-        return self._refined(fix, prior, fit or self._through_levels(prior, _COARSER))
-
-    def _refined(self, fix: Fix, prior: GaussianPrior, fit: DenseFit | None) -> Fix | None:
-        """The fix with its pose refined; None if refinement failed or led elsewhere."""
+    def _refined(self, fix: Fix, prior: GaussianPrior, coarser: int, *, is_tilted: bool = False) -> Refined | None:
+        """The fix with its pose refined from a coarser level on; None if that failed or led elsewhere."""
         query, errors = self.query, self.query.errors(self.options.errors)
-        pose_covariance = None if fit is None else covariance_of(fit, prior)
-        if fit is None or pose_covariance is None:
+        found = self._through_levels(prior, coarser)
+        if found is None:
+            return None
+        fit, picture, ground = found
+        pose_covariance, at = covariance_of(fit, prior), fit.pose
+        if pose_covariance is None:
             return None
         if self._is_on_unknown_slope:
             height_m, slope_deg = fit.pose.center_m[2] - query.site.ground_m, errors.unknown_slope_deg
@@ -186,29 +254,39 @@ class Refinement:
         if not are_consistent(moved, allowed_m2):
             return None
         refined = self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3), turns_rad2)
-        return refined if agree_in_height(fix, refined) else None
+        return Refined(refined, at, picture, ground) if agree_in_height(fix, refined) else None
 
     @property
     def _knows_tilt(self) -> bool:
         return self.knows_tilt and self.query.telemetry.has_tilt
 
     @property
+    def _tilt_deg(self) -> float:
+        """The larger standard deviation of roll and pitch."""
+        return max(self.query.errors(self.options.errors).tilts_deg(self.query.telemetry))
+
+    @property
+    def _levels_above(self) -> tuple[int, ...]:
+        """How many levels above the frame's own refinements start, in turn."""
+        query, height_m = self.query, self.query.telemetry.known_height_m
+        own_m = query.site.gsd_m_per_px * 2.0 ** query.level_of(height_m)
+        off_px = height_m * math.radians(self._tilt_deg) / own_m
+        first = max(math.ceil(math.log2(off_px / _CAPTURE_PX)), 0)
+        return (first, *range(first - 1, -1, -1)[:1], first + 1)
+
+    @property
     def _is_on_unknown_slope(self) -> bool:
         return self._knows_tilt and not self.query.site.has_surface
 
-    def _at_once(self, prior: GaussianPrior) -> DenseFit | None:
-        return self._through_levels(prior, 0, CONFIRMING_CORRELATION)
-
     def _through_levels(
-        self, prior: GaussianPrior, coarser: int, min_correlation: float | None = None
-    ) -> DenseFit | None:
+        self, prior: GaussianPrior, coarser: int
+    ) -> tuple[DenseFit, EnhancedFrame, Samples] | None:
         """Refine on levels coarser than the frame's, where a few pixels span more ground; then on its own.
 
-        The pose must fit better than the one to begin with.
+        If the tilt is unknown, others are tried at the start. The pose must fit better than the prior's.
         """
         query, site, height_m = self.query, self.query.site, self.query.telemetry.known_height_m
         own, has_tilt = query.level_of(height_m), self._knows_tilt
-        least = _MIN_CORRELATION if has_tilt else CONFIRMING_CORRELATION
         pose, fit = prior.pose, None
         with query.scheduler.stage("dense"):  # one stage per pass; each may be skipped
             for level in range(min(own + coarser, site.levels - 1), own - 1, -1):
@@ -218,14 +296,23 @@ class Refinement:
                     continue
                 picture = self._enhanced_frame(height_m, level)
                 ground = self.samples.find(window, level, MAX_SAMPLES if level == own else _COARSE_SAMPLES)
+                starts = [pose]
                 if not has_tilt and fit is None:
-                    pose = max(_tilted(pose, height_m), key=lambda start: correlation_at(picture, ground, start))
-                start, fit = pose, refine(picture, ground, pose, prior)
-                pose = start if fit is None else fit.pose
+                    starts = _tilted(pose, height_m, self._tilt_deg)
+                    starts.sort(key=lambda each: -correlation_at(picture, ground, each))
+                fit = None
+                for start in starts[:_STARTS]:
+                    other = refine(picture, ground, start, prior)
+                    if other is not None and (fit is None or other.correlation > fit.correlation):
+                        fit = other
+                    if fit is not None and fit.correlation >= CONFIRMING_CORRELATION:
+                        break
+                pose = pose if fit is None else fit.pose
         if fit is None or not fit.converged:
             return None
-        at_prior = fit.first_correlation if start is prior.pose else correlation_at(picture, ground, prior.pose)
-        return fit if fit.correlation >= max(at_prior, min_correlation or least) else None
+        is_direct = has_tilt and coarser == 0
+        at_prior = fit.first_correlation if is_direct else correlation_at(picture, ground, prior.pose)
+        return (fit, picture, ground) if fit.correlation >= at_prior else None
 
     def _prior(self, fix: Fix) -> GaussianPrior:
         """The telemetry's height and attitude; the correlation's position is only a start, without weight."""
@@ -281,9 +368,9 @@ class Refinement:
         return replace(refined, stage="refined", confidence=fix.confidence)
 
 
-def _is_confirmed(refined: Fix | None) -> TypeGuard[Fix]:
-    """Whether a picture confirms a refined pose."""
-    return refined is not None and refined.score >= CONFIRMING_CORRELATION
+def _is_clear(refined: Fix) -> bool:
+    """Whether the correlation at a refined pose leaves nothing else to try."""
+    return refined.score >= CONFIRMING_CORRELATION
 
 
 def with_unconfirmed_tilt(query: Query, fix: Fix) -> Fix:
@@ -292,14 +379,14 @@ def with_unconfirmed_tilt(query: Query, fix: Fix) -> Fix:
     return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0]))
 
 
-def _tilted(pose: Pose, height_m: float) -> list[Pose]:
+def _tilted(pose: Pose, height_m: float, sigma_deg: float) -> list[Pose]:
     """The pose and tilted variants that look at the same point, where correlation found the frame's middle."""
 
     def reach_m(rotation: Array) -> Array:
         return np.asarray(rotation[2] * (height_m / -rotation[2, 2]))
 
     out = [pose]
-    for x_deg, y_deg in itertools.product(_TILTS_DEG, _TILTS_DEG):
-        rotation = cv2.Rodrigues(np.radians([x_deg, y_deg, 0.0]))[0] @ pose.rotation
+    for x, y in itertools.product(_TILTS, _TILTS):
+        rotation = cv2.Rodrigues(np.radians([x * sigma_deg, y * sigma_deg, 0.0]))[0] @ pose.rotation
         out.append(Pose(rotation, pose.center_m + reach_m(pose.rotation) - reach_m(rotation), pose.slope))
     return out

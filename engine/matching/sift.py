@@ -82,7 +82,7 @@ class Sift(Method):
         for answer in rehearse(query, rungs.all, None):
             rehearse(query, rungs.refinement, answer)
             if is_accepted(answer, query) and self.can_refine(query):
-                self._refinement(query).refine_from_coarser(answer.fix)
+                self._refinement(query).rehearse(answer.fix)
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map."""
@@ -126,9 +126,12 @@ class Sift(Method):
         return is_known and query.site.has_surface
 
     def refined(self, query: Query, fix: Fix) -> Fix | None:
-        """The fix with its pose refined, from a coarser level if necessary; None if that fails."""
+        """The fix with its pose refined; None if that fails, or chance may have given that pose as well."""
         refinement = self._refinement(query)
-        return refinement.refine_at_once(fix) or refinement.refine_from_coarser(fix)
+        found = refinement.refine_pose(fix)
+        if found is None or found.fix.score >= CONFIRMING_CORRELATION:
+            return None if found is None else found.fix
+        return found.fix if refinement.surprise_of(found) >= query.needed_nats else None
 
     def _refinement(self, query: Query) -> Refinement:
         return Refinement(query, self.samples, self._enhancement)

@@ -175,7 +175,12 @@ def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_refused():
 
 
 def test_a_pose_that_can_be_refined_is_evidence_for_its_place_and_one_that_cannot_against_it():
-    right, unknown, wrong = (replace(PLAIN, refined=refined).nats for refined in (True, None, False))
+    right, unknown, wrong = (replace(PLAIN, refined=refined).nats for refined in (90.0, None, -math.inf))
     assert right > unknown > wrong
-    assert math.exp(right - unknown) == pytest.approx(0.98 / 0.04)
-    assert math.exp(wrong - unknown) == pytest.approx(0.02 / 0.96)
+    assert math.exp(wrong - unknown) == pytest.approx(0.02)
+
+
+@given(st.floats(7.0, 1e3))
+def test_a_refined_pose_is_no_evidence_against_a_rival_as_good_as_its_peak(surprise):
+    alike = Evidence(surprise, surprise, 1000.0, 1000.0, None, refined=1e4)
+    assert alike.nats <= 0.0

@@ -40,7 +40,7 @@ def costs_of(others_ms=0.0, **ms):
 
 
 def refuse_to_refine(monkeypatch):
-    for name in ("refine_at_once", "refine_from_coarser"):
+    for name in ("refine_at_once", "refine_pose"):
         monkeypatch.setattr(Refinement, name, lambda _self, _fix: None)
 
 
@@ -90,7 +90,7 @@ def test_where_refinement_fails_or_is_abandoned_all_features_give_the_pose(
     expected = plain.locate(frame, prior)
     refuse_to_refine(monkeypatch)
     if abandoned:
-        monkeypatch.setattr(Refinement, "refine_at_once", out_of_time)
+        monkeypatch.setattr(Refinement, "refine_pose", out_of_time)
     fix = matcher.locate(frame, prior)
     assert fix.stage == "fine"
     assert (fix.east_m, fix.north_m, fix.up_m) == (expected.east_m, expected.north_m, expected.up_m)

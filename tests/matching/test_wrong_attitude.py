@@ -10,7 +10,7 @@ import pytest
 from engine import Fix, NoFix, Reason, SceneMatcher
 from engine.matching.evidence import Evidence, probability
 from engine.matching.ncc import Ncc
-from engine.matching.refinement import Refinement
+from engine.matching.refinement import Refined, Refinement
 from engine.runtime.scheduler import OutOfTime
 
 NADIR = np.array([310.0, 305.0])
@@ -66,42 +66,44 @@ def test_a_tilt_of_the_wrong_sign_never_displaces_a_fix(ground, matchers, camera
 def test_a_pose_that_is_hardly_confirmed_gives_way_to_one_that_is(ground, site, camera, monkeypatch, knows_better):
     """And stands, unconfirmed, where the doubt leads nowhere, or there is no time for it (None)."""
 
-    def through_all(self, fix):
+    def refine_pose(self, fix):
         if not self.knows_tilt and knows_better is None:
             raise OutOfTime
-        better = replace(fix, stage="refined", score=0.9)
-        hardly = replace(fix, stage="refined", score=0.3)
+        better, hardly = refined(fix, 0.9), refined(fix, 0.3)
         return hardly if self.knows_tilt else better if knows_better else None
 
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
-    monkeypatch.setattr(Refinement, "_through_all", through_all)
+    monkeypatch.setattr(Refinement, "refine_pose", refine_pose)
+    monkeypatch.setattr(Refinement, "surprise_of", lambda _self, pose: 300.0 * pose.fix.score)
     frame = ground.frame(camera, NADIR, 150.0, **TRUE)
     fix = SceneMatcher(site, camera, "ncc", "cpu").locate(frame, ground.prior(NADIR))
     assert (fix.stage, fix.score) == (("refined", 0.9) if knows_better else ("unconfirmed", 0.3))
 
 
 @pytest.mark.parametrize(
-    ("is_oblique", "nats", "is_refined", "stage"),
+    ("is_oblique", "nats", "refined_nats", "stage", "left"),
     [
-        (False, 7.0, True, "refined"),
-        (False, 7.0, False, None),
-        (False, 11.0, True, "refined"),
-        (False, 11.0, False, None),
-        (False, 14.0, False, "unconfirmed"),
-        (True, 7.0, True, "refined"),
-        (True, 7.0, False, None),
-        (True, 11.0, False, "unconfirmed"),  # it says nothing
+        (False, 7.0, 30.0, "refined", 30.0),
+        (False, 7.0, 5.0, None, None),  # chance reaches that as well
+        (False, 7.0, None, None, None),
+        (False, 11.0, 30.0, "refined", 11.0),  # enough: nothing more is measured
+        (False, 11.0, None, None, None),
+        (False, 14.0, None, "unconfirmed", 14.0 + math.log(0.02)),
+        (True, 7.0, 30.0, "refined", 30.0),
+        (True, 7.0, None, None, None),
+        (True, 11.0, None, "unconfirmed", 11.0),  # it says nothing
     ],
 )
-def test_whether_the_pose_can_be_refined_speaks_for_or_against_the_place(
-    ground, site, camera, monkeypatch, is_oblique, nats, is_refined, stage
+def test_a_refined_pose_is_evidence_for_the_place_and_a_failure_against_it(
+    ground, site, camera, monkeypatch, is_oblique, nats, refined_nats, stage, left
 ):
     """The usual risk asks for 9.2 nats: less is made up for, and a little more is not enough where it fails."""
-    refined = (lambda _, fix: replace(fix, stage="refined", score=0.9)) if is_refined else lambda _self, _fix: None
-    says = {None: 0.0, True: math.log(0.98 / 0.04), False: math.log(0.02 / 0.96)}
-    monkeypatch.setattr(Evidence, "nats", property(lambda evidence: nats + says[evidence.refined]))
+    monkeypatch.setattr(Ncc, "find", weakened(nats))
+    monkeypatch.setattr(Ncc, "match_structure", lambda *_: None)
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
-    monkeypatch.setattr(Refinement, "_through_all", refined)
+    found = (lambda _, fix: None) if refined_nats is None else lambda _, fix: refined(fix, 0.9)
+    monkeypatch.setattr(Refinement, "refine_pose", found)
+    monkeypatch.setattr(Refinement, "surprise_of", lambda *_: (refined_nats or 0.0) + math.log(1000.0))
     monkeypatch.setattr("engine.matching.refinement.is_oblique", lambda *_: is_oblique)
     frame = ground.frame(camera, NADIR, 150.0, **TRUE)
     answer = SceneMatcher(site, camera, "ncc", "cpu").locate(frame, ground.prior(NADIR))
@@ -109,8 +111,24 @@ def test_whether_the_pose_can_be_refined_speaks_for_or_against_the_place(
         assert isinstance(answer, NoFix)
         return
     assert answer.stage == stage
-    heard = None if is_oblique and not is_refined else is_refined
-    assert answer.confidence == pytest.approx(probability(nats + says[heard]))
+    assert answer.confidence == pytest.approx(probability(left), rel=1e-9)
+
+
+def weakened(nats):
+    """Ncc.find, whose peaks have this evidence, and none but that."""
+    find = Ncc.find
+
+    def weak(self, query, *, coarser=0, widely=False):
+        if widely or coarser:
+            return query.refuse(Reason.LOW_SCORE, "not looked for", "ncc")
+        found = find(self, query)
+        return found.weighed(Evidence(nats + math.log(1000.0), 0.0, 1000.0, 1000.0, None))
+
+    return weak
+
+
+def refined(fix, score):
+    return Refined(replace(fix, stage="refined", score=score), None, None, None)
 
 
 def test_a_refined_pose_does_not_stand_for_the_structure_that_a_search_must_show(
@@ -119,6 +137,6 @@ def test_a_refined_pose_does_not_stand_for_the_structure_that_a_search_must_show
     """Of a place found without a prior, the best of a whole map."""
     monkeypatch.setattr(Evidence, "nats", 20.0)
     monkeypatch.setattr(Ncc, "match_structure", lambda *_: None)
-    monkeypatch.setattr(Refinement, "_through_all", lambda _, fix: replace(fix, stage="refined", score=0.9))
+    monkeypatch.setattr(Refinement, "refine_pose", lambda _, fix: refined(fix, 0.9))
     frame = ground.frame(camera, NADIR, 150.0, **TRUE)
     assert SceneMatcher(site, camera, "ncc", "cpu").locate(frame).reason is Reason.UNCONFIRMED
