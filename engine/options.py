@@ -13,7 +13,6 @@ from engine.sift import BACKENDS
 from engine.values import MAX_SIGMA_M, RISK, GridPose, check, check_choice, check_positive
 
 PROFILES = ("engine", "paper")
-MAP_FEATURES = ("prepared", "per_frame")
 PAPER_SCALE = 0.5
 """To which the paper reduces frame and map before detection."""
 MIN_HEIGHT_M = 1.0
@@ -65,30 +64,25 @@ class AssumedErrors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseOptions:
-    """Inlier tolerance and acceptance thresholds of a pose from matched points.
+    """Tolerances of a pose from matched points.
 
     Attributes:
         reprojection_px: Largest reprojection distance of an inlier.
-        min_inliers: Fewest distinct inliers of a pose.
         distinct_px: Matches nearer to each other than this count once: they see the same pixels. In pixels of the
             picture whose matches vote, and of the frame if nothing was voted for.
-        max_log10_nfa: Upper bound on log10 of the number of false alarms, the expected number of poses with as
-            many inliers by chance.
-        min_spread_px: Smallest standard deviation of the inliers in the image, in the direction of smallest
-            spread; below it they are nearly collinear.
     """
 
     reprojection_px: float = 3.0
-    min_inliers: int = 6
     distinct_px: float = 16.0
-    max_log10_nfa: float = -6.0
-    min_spread_px: float = 6.0
 
     def __post_init__(self) -> None:
-        for name in ("reprojection_px", "distinct_px", "min_spread_px"):
+        for name in ("reprojection_px", "distinct_px"):
             check(self, name, "a positive number", lambda pixels: 0 < pixels < math.inf)
-        check(self, "min_inliers", "at least 4", lambda count: count >= 4)
-        check(self, "max_log10_nfa", "a number", lambda bound: not math.isnan(bound))
+
+    @property
+    def min_spread_px(self) -> float:
+        """Smallest standard deviation of inliers in any direction: what one sees spreads as much by itself."""
+        return self.distinct_px / math.sqrt(12.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,16 +123,12 @@ class SiftOptions:
             "kornia" on the device; "auto" is "compiled".
         upsample: samples per pixel in the first octave of a frame that is drawn in the map's pixels. 2 locates
             small keypoints more exactly and takes three times as long. The map always has 2.
-        map_features: "prepared" once for the map, or found "per_frame" in the window, as the paper does.
-        max_map_keypoints: upper limit for a window that is described per frame.
         tolerance_px: distance, in pixels of the map's level, within which a match agrees with the voted pose.
-        search_widely: if too little is found, search again without the heading and with heights off by up to
-            ``height_factor``.
-        height_factor: see above; 1 trusts the height even then.
+        search_widely: if too little is found, search again without the heading and with heights that make up a
+            level of the map's pyramid either way: from half to double.
         max_height_m: the largest height to search if the height is unknown.
         matcher: replaces the features: it gets the reduced frame and the map's crop; its matches are lifted and
             solved for the pose like those of features.
-        max_tilt_deg: a pose tilted further off the vertical is considered wrong.
         use_attitude: use the known heading, roll and pitch as a prior of the pose, weighted by their assumed
             errors; a few features alone hardly separate a tilt from a displacement.
         refine: refine the pose densely after PnP, if height, heading, tilt and surface are known.
@@ -151,32 +141,25 @@ class SiftOptions:
     keypoints_per_px: float = 0.01
     backend: str = "auto"
     upsample: int = 2
-    map_features: str = "prepared"
-    max_map_keypoints: int = 6000
     tolerance_px: float = 1.0
     search_widely: bool = True
-    height_factor: float = 2.0
     max_height_m: float = 500.0
     matcher: PairMatcher | None = None
-    max_tilt_deg: float = 45.0
     use_attitude: bool = True
     refine: bool = True
     pose: PoseOptions = field(default_factory=PoseOptions)
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
-        for name in ("height_factor", "max_height_m", "tolerance_px"):
+        for name in ("max_height_m", "tolerance_px"):
             check(self, name, "a finite number", lambda value: not math.isinf(value))
-        check(self, "height_factor", "1 or more", lambda factor: factor >= 1.0)
         check(self, "scale", "above 0 and at most 1", lambda scale: 0.0 < scale <= 1.0)
         check(self, "max_height_m", f"above {MIN_HEIGHT_M:g}", lambda height: height > MIN_HEIGHT_M)
-        for name in ("max_tilt_deg", "keypoints_per_px", "tolerance_px"):
+        for name in ("keypoints_per_px", "tolerance_px"):
             check(self, name, "above 0", lambda value: value > 0.0)
         check(self, "upsample", "1 or 2", lambda factor: factor in (1, 2))
-        check_choice(self, "map_features", MAP_FEATURES)
         check_choice(self, "backend", BACKENDS)
-        for name in ("max_keypoints", "max_map_keypoints"):
-            check(self, name, "4 or more", lambda count: count >= 4)
+        check(self, "max_keypoints", "4 or more", lambda count: count >= 4)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,8 +169,7 @@ class LearnedOptions:
     Attributes:
         weights: files of LoFTR, or of LightGlue with DISK, ALIKED or SuperPoint.
         max_picture_px: most pixels that a frame covers on the map level it is matched on.
-        max_keypoints: most keypoints of a frame; LoFTR has none.
-        max_map_keypoints: most keypoints of a window.
+        max_keypoints: most keypoints of a frame, and a quarter of those of a window; LoFTR has none.
         max_window_px: a window with more pixels on its level is not searched.
         tolerance_px: replaces SIFT's; networks locate points less exactly.
     """
@@ -195,15 +177,13 @@ class LearnedOptions:
     weights: tuple[str, ...] = ()
     max_picture_px: int = 130_000
     max_keypoints: int = 512
-    max_map_keypoints: int = 2048
     max_window_px: int = 1 << 22
     tolerance_px: float = 2.0
 
     def __post_init__(self) -> None:
         for name in ("max_picture_px", "max_window_px"):
             check(self, name, "4096 or more", lambda pixels: pixels >= 4096)
-        for name in ("max_keypoints", "max_map_keypoints"):
-            check(self, name, "4 or more", lambda count: count >= 4)
+        check(self, "max_keypoints", "4 or more", lambda count: count >= 4)
         check(self, "tolerance_px", "a positive number", lambda pixels: 0.0 < pixels < math.inf)
 
 

@@ -157,7 +157,6 @@ def _engine(flight: Recorded, options: SiftOptions) -> SceneMatcher:
 
 def variants() -> list[tuple[str, dict[str, Any], SiftOptions]]:
     """Name, what becomes of each frame's telemetry (a number multiplies the height), and the options."""
-    factor = f"`height_factor={SiftOptions().height_factor:g}`"
     unknown = {"heading_deg": None, "height_agl_m": None}
     return [
         ("as recorded", {}, SiftOptions()),
@@ -165,8 +164,8 @@ def variants() -> list[tuple[str, dict[str, Any], SiftOptions]]:
         ("roll and pitch unknown", {"roll_deg": None, "pitch_deg": None}, SiftOptions()),
         ("heading unknown", {"heading_deg": None}, SiftOptions()),
         ("height unknown", {"height_agl_m": None}, SiftOptions()),
-        (f"height given as half, {factor}", {"height_agl_m": 0.5}, SiftOptions()),
-        (f"height given as double, {factor}", {"height_agl_m": 2.0}, SiftOptions()),
+        ("height given as half", {"height_agl_m": 0.5}, SiftOptions()),
+        ("height given as double", {"height_agl_m": 2.0}, SiftOptions()),
         ("heading and height unknown", unknown, SiftOptions()),
         ("nothing known but the start", {**unknown, "roll_deg": None, "pitch_deg": None}, SiftOptions()),
     ]

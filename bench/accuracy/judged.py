@@ -18,7 +18,7 @@ from engine.matching.ncc import Ncc
 from engine.matching.query import Query
 from engine.matching.sift import Sift
 from engine.ncc_fft import surface
-from engine.options import NccOptions, PoseOptions, SiftOptions
+from engine.options import NccOptions, SiftOptions
 from engine.window import level_crop
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 
@@ -36,7 +36,6 @@ GREY, STRUCTURE = "NCC, grey levels", "NCC, structure"
 """Methods for fits: the parts of NCC, of which the second is asked where the first is refused."""
 RISKS = (1e-2, 1e-3, 1e-4)
 """Of the protection levels that are kept."""
-LOOSE = PoseOptions(min_inliers=4, max_log10_nfa=2.0)  # poses that chance may make, so that there is what to judge
 _PSR_PX = 11.0
 
 
@@ -133,14 +132,12 @@ class Bench:
         return self.row(made, method, found.fix, found.suffices(query.risk), scores, [found.evidence.nats])
 
     def posed(self, made: Trial, frame: Frame, prior: Prior | None, options: SiftOptions) -> Row:
-        """The match by SIFT; where it finds nothing, poses that chance may have made are there to be scored."""
+        """The match by SIFT, accepted or not."""
         matcher = self.matcher(made.on, "SIFT")
         query = _query(matcher, frame, prior)
         sift = _part(matcher, "sift", Sift)
         found = sift.find(query, options)
         fixed = not isinstance(found, NoFix) and found.suffices(query.risk)
-        if isinstance(found, NoFix):
-            found = sift.find(replace(query, risk=1.0 - 1e-9), replace(options, pose=LOOSE))
         if isinstance(found, NoFix):
             return self.row(made, "SIFT", None, False, [], [])
         scores = [

@@ -15,7 +15,7 @@ from engine import Budget, Camera, Fix, Frame, NoFix, OrthoMap, Prior
 from engine.budget import Deadline
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.matching.align import to_gray, view_of
-from engine.matching.pose import AttitudePrior, PoseStats, solve_pose
+from engine.matching.pose import MIN_INLIERS, AttitudePrior, PoseStats, solve_pose
 from engine.matching.query import Query
 from engine.options import MatcherOptions, SiftOptions
 from engine.runtime.scheduler import Scheduler
@@ -23,6 +23,9 @@ from engine.values import Attitude, GridPose, Reason, Window
 from engine.window import level_crop, level_for
 
 Image = NDArray[np.float32]
+
+MAX_MAP_KEYPOINTS = 6000  # of a window that is described per frame
+MAX_TILT_DEG = 45.0  # of a right pose
 
 
 def opencv_peak(window: Image, template: Image) -> tuple[int, int, float]:
@@ -142,7 +145,7 @@ class OpenCvFeatures:
         seen = _opencv_features(half, options.max_keypoints)
         known, level, corner = self._map_features(query, window)
         pairs = matches(seen, known)
-        if len(pairs) < options.pose.min_inliers:
+        if len(pairs) < MIN_INLIERS:
             return query.refuse(Reason.TOO_FEW_MATCHES, f"{len(pairs)} matches", "sift", window=window)
         points_px = (seen.xy_px[pairs[:, 0]] + 0.5) / options.scale - 0.5
         map_px = site.full_from_level(known.xy_px[pairs[:, 1]] + corner, level)
@@ -150,7 +153,7 @@ class OpenCvFeatures:
         stats = solve_pose(
             points_m, points_px, self._camera.matrix, options.pose, prior=self._attitude(query.telemetry)
         )
-        if stats is None or stats.rotation[2, 2] > -math.cos(math.radians(options.max_tilt_deg)):
+        if stats is None or stats.rotation[2, 2] > -math.cos(math.radians(MAX_TILT_DEG)):
             return query.refuse(Reason.BAD_POSE, f"no pose from {len(pairs)} matches", "sift", window=window)
         return self._fix(query, stats, window)
 
@@ -175,7 +178,7 @@ class OpenCvFeatures:
         crop = level_crop(site, window, level)
         corner = np.array([crop.x0, crop.y0], np.float64)
         if self._levels is None:
-            found = self._described(crop, level, options.max_map_keypoints)
+            found = self._described(crop, level, MAX_MAP_KEYPOINTS)
             return found, level, corner
         if level not in self._levels:
             rows, columns = site.level_shape(level)

@@ -113,7 +113,6 @@ STEPS: dict[str, Callable[[], Any]] = {
     "OpenCV features, scenematch pose": lambda: _opencv(prepared=False),
     "OpenCV features, scenematch pose, map prepared": lambda: _opencv(prepared=True),
     "scenematch NCC": lambda: _engine("ncc"),
-    "scenematch SIFT, map described per frame": lambda: _engine("sift", map_features="per_frame"),
     "scenematch SIFT": lambda: _engine("sift"),
 }
 

@@ -6,12 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import chi_square, chi_square_of
-from engine.values import Fix
+from engine.values import CHANCE, Fix
 
 Array = NDArray[np.float64]
-
-CHANCE = 1e-3
-"""Two estimates contradict each other if chance sets them so far apart less often than this."""
 
 
 def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:

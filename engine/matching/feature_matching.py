@@ -41,7 +41,6 @@ _MAP_DENSITY = 1.5  # landmarks per pixel over the frame's keypoints per pixel
 _VOTE_RATIO = 0.9  # of Lowe's test where matches vote: a vote tolerates many wrong ones
 _VOTE_SHARE = 0.03  # of the distance to the ground, within which matches agree on a translation
 _MAX_SCALE_FACTOR = 1.5  # by which the scales of a match may contradict a known height
-_UPSAMPLED_PX = 100_000  # an orthophoto with more has enough keypoints without the smallest
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +145,7 @@ def _feature_pairs(
             backend=options.backend,
             upright=True,
             mask=valid[None, None],
-            upsample=options.upsample if shown_px <= _UPSAMPLED_PX else 1,
+            upsample=options.upsample if keypoints < MAX_KEYPOINTS else 1,  # enough without the smallest
             contrast_threshold=MIN_CONTRAST,
         )
     with query.scheduler.stage("map features"):
@@ -278,21 +277,9 @@ def _map_features(
     query: Query, landmarks: LandmarkMap, options: SiftOptions, view: MapView, upright: bool
 ) -> Landmarks:
     """Landmarks of a view, as dense as the features of the reduced frame; denser where pixels are coarser."""
-    site, crop = query.site, view.crop
     reduced_px = query.gray.size * options.scale**2
-    if options.map_features == "prepared":
-        per_px = options.max_keypoints / reduced_px * max(1.0, view.pixel_ratio) ** 2
-        return landmarks.find(crop, view.level, upright=upright, per_px=per_px)
-    count = np.clip(
-        options.max_keypoints * crop.area_px / reduced_px, options.max_keypoints, options.max_map_keypoints
-    )
-    mask = None
-    if not site.fully_valid:
-        mask = to_device(site.valid(crop, view.level), landmarks.device)[None, None]
-    picture = as_picture(site.gray(crop, view.level), landmarks.device)
-    features = sift(picture, max_keypoints=int(count), backend=options.backend, upright=upright, mask=mask)
-    xy_px = on_host(features.xy_px[0])
-    return Landmarks(features, xy_px, lifted(site, site.full_from_level(xy_px + view.corner_px, view.level)))
+    per_px = options.max_keypoints / reduced_px * max(1.0, view.pixel_ratio) ** 2
+    return landmarks.find(view.crop, view.level, upright=upright, per_px=per_px)
 
 
 def lifted(site: OrthoMap, map_px: Array) -> Array:

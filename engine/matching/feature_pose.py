@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from engine.geo import attitude_from_rotation
 from engine.maps.landmarks import LandmarkMap
 from engine.matching.agreement import agree_in_place
+from engine.matching.align import MIN_DOWN
 from engine.matching.candidates import PoseCandidate
 from engine.matching.covariance import tilt_covariance
 from engine.matching.evidence import Evidence, is_beyond_doubt, probability
 from engine.matching.feature_matching import Matched, match_views
-from engine.matching.pose import PoseStats, solve_pose
+from engine.matching.pose import MIN_INLIERS, PoseStats, solve_pose
 from engine.matching.query import Query
 from engine.matching.views import TelemetryHypothesis, level_at, view_in, views_of, x_axis_deg
 from engine.matching.votes import Vote
@@ -32,8 +33,6 @@ if TYPE_CHECKING:  # it loads torch
 Array = NDArray[np.float64]
 
 METHOD = "sift"
-MIN_VOTES = 4
-"""Fewest matches of a pose that they voted for."""
 _MATCHED_HEADING_SIGMA_DEG = 30.0  # of a heading given by the matches alone: nearly no information
 
 
@@ -101,14 +100,14 @@ class FeatureMatcher:
     def _attempts(self) -> Iterator[tuple[FeatureMatcher, TelemetryHypothesis]]:
         """Hypotheses to try in turn: the telemetry, the same at the frame's full resolution, then wider ones."""
         query, options = self.query, self.options
-        height_m, factor = query.telemetry.height_agl_m, options.height_factor
+        height_m = query.telemetry.height_agl_m
         unknown = (MIN_HEIGHT_M, options.max_height_m)
         known = TelemetryHypothesis(unknown if height_m is None else (height_m, height_m), x_axis_deg(query))
         yield self, known
         drawn = height_m is not None and known.x_axis_deg is not None and self.finder is None
         if drawn and level_at(query, known.heights_m[0], options.scale) > level_at(query, known.heights_m[0], 1.0):
             yield replace(self, options=replace(options, scale=1.0)), known
-        wide = TelemetryHypothesis(unknown if height_m is None else (height_m / factor, height_m * factor), None)
+        wide = TelemetryHypothesis(unknown if height_m is None else (height_m / 2.0, height_m * 2.0), None)
         if options.search_widely and wide != known:
             yield self, wide
 
@@ -139,8 +138,8 @@ class FeatureMatcher:
         matched = match_views(query, self.landmarks, options, views, hypothesis, self.finder)
         matched.sort(key=lambda found: len(found.points_px), reverse=True)
         count, window = len(matched[0].points_px), matched[0].view.window
-        if count < MIN_VOTES:
-            detail = f"{count} matches; {MIN_VOTES} are required"
+        if count < MIN_INLIERS:
+            detail = f"{count} matches; {MIN_INLIERS} are required"
             return query.refuse(Reason.TOO_FEW_MATCHES, detail, self.method, window=window)
         if scheduler.deadline.remaining_ms < 0:
             return query.refuse(Reason.LATE, "the budget was spent before the pose", self.method, window=window)
@@ -163,8 +162,6 @@ class FeatureMatcher:
         """
         query, options = self.query, self.options
         pose = replace(options.pose, reprojection_px=found.tolerance_px)
-        if found.vote is not None:  # the vote is evidence for the place, not the pose
-            pose = replace(pose, min_inliers=MIN_VOTES, max_log10_nfa=math.inf)
         matrix = query.camera.matrix
         solve = partial(
             solve_pose, found.points_m, found.points_px, matrix, pose, weights=found.weights, start=found.start
@@ -187,10 +184,10 @@ class FeatureMatcher:
         up = float(stats.center_m[2])
         nadir = site.pixel_from_enu(stats.center_m[:2])
         share = float(stats.inliers.mean())
-        body_down = stats.rotation.T @ query.camera.mount.T[:, 2]
-        tilt = math.degrees(math.acos(float(np.clip(-body_down[2], -1.0, 1.0))))
-        if tilt > options.max_tilt_deg or up <= float(site.surface_at(nadir)):
-            detail = f"the pose is {tilt:.0f} degrees off level at a height of {up:.0f} m"
+        down = -float(stats.rotation[2, 2])
+        if down < MIN_DOWN or up <= float(site.surface_at(nadir)):
+            ray_deg = math.degrees(math.acos(min(max(down, -1.0), 1.0)))
+            detail = f"the pose looks {ray_deg:.0f} degrees off the vertical at a height of {up:.0f} m"
             return query.refuse(Reason.BAD_POSE, detail, self.method, score=share, window=window)
         covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
         turns_rad2 = stats.covariance[3:, 3:] + tilt_covariance(stats.rotation, _slope_rad(site, options.errors))

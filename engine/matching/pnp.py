@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.matching.agreement import CHANCE
+from engine.values import CHANCE
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -20,6 +20,8 @@ from engine.runtime.tensors import torch
 
 Array = NDArray[np.float64]
 
+_WIDER = 4  # times as many keypoints: of a picture with its empty margins, and of a window
+
 
 @dataclass(frozen=True, slots=True)
 class PointFinder:
@@ -78,11 +80,11 @@ class PointFinder:
     ) -> tuple[Array, Array]:
         """Matched pixels of picture and crop; the crop's keypoints are looked up."""
         with query.scheduler.stage("frame features"):
-            mine = matcher.extract(picture, 4 * options.max_keypoints)
+            mine = matcher.extract(picture, _WIDER * options.max_keypoints)
             shown = np.flatnonzero(_is_valid(_points(mine.xy_px), valid))[: options.max_keypoints]
             mine = mine.only(torch.from_numpy(shown).to(mine.xy_px.device))
         with query.scheduler.stage("map features"):
-            theirs = known.find(view.crop, view.level, options.max_map_keypoints)
+            theirs = known.find(view.crop, view.level, _WIDER * options.max_keypoints)
         with query.scheduler.stage("match"):
             size, crop_size = (valid.shape[1], valid.shape[0]), (view.crop.width_px, view.crop.height_px)
             pairs = matcher.match(mine, size, theirs, crop_size)

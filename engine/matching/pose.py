@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.geo import chi_square_of
-from engine.matching.agreement import CHANCE
 from engine.matching.pnp import (
     SLACK,
     Fit,
@@ -37,10 +36,13 @@ from engine.matching.pnp import (
 )
 from engine.matching.votes import chance_of_agreeing
 from engine.options import PoseOptions
+from engine.values import CHANCE
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+MIN_INLIERS = 4
+"""Fewest distinct inliers of a pose: three determine it."""
 _SAME_POSE_DEG = 1.5
 _CLOSER = (1.0, 2.0, 4.0)  # factors on the tolerance, tried in turn; without the prior a pose starts from the last
 _CLOSE_SHARE, _CLOSE_INLIERS = 0.15, 12  # fewest inliers, as a share of those within the widest tolerance
@@ -137,14 +139,15 @@ def solve_pose(
         points_m: (N, 3) map points in metres; they may be coplanar and far from the origin.
         points_px: (N, 2) undistorted pixels (x, y).
         camera_matrix: (3, 3) pinhole intrinsics.
-        options: Thresholds; the defaults suit frames of a few hundred pixels.
+        options: Tolerances; the defaults suit frames of a few hundred pixels.
         weights: (N,) relative inverse variances of the image points; None is 1 for all.
         prior: Attitude for the refinement, which separates tilt from displacement at a small field of view; it is
             dropped if markedly more matches agree without it.
         start: Start of the refinement; None searches for an initial pose.
 
     Returns:
-        None if the matches are few, collinear, behind the camera, ambiguous or not significant.
+        None if the matches are few, collinear, behind the camera, ambiguous or, without a start, as many as chance
+        gives.
 
     Raises:
         ShapeError: An array has another shape.
@@ -153,7 +156,7 @@ def solve_pose(
     options = options or PoseOptions()
     points_m, points_px, K, weights = _checked(points_m, points_px, camera_matrix, weights)
     known = np.flatnonzero(np.isfinite(points_m).all(1) & np.isfinite(points_px).all(1) & (weights > 0))
-    if len(known) < options.min_inliers or _spread(points_px[known].T) < options.min_spread_px:
+    if len(known) < MIN_INLIERS or _spread(points_px[known].T) < options.min_spread_px:
         return None
     origin = points_m[known].mean(0)
     problem = _problem((points_m[known] - origin).T, points_px[known].T, K, weights[known], options, prior)
@@ -166,7 +169,8 @@ def solve_pose(
     if other is not None and start is None:
         return None
     (log10_nfa, log10_tried), covariance = _false_alarms(problem, fit, options), match_covariance(problem, fit)
-    if log10_nfa > options.max_log10_nfa or covariance is None:
+    is_chance = start is None and log10_nfa >= 0.0  # the votes for a start are the evidence for its place
+    if is_chance or covariance is None:
         return None
     if other is not None:  # the place is known but not the tilt: either pose may be right
         apart = np.append(other.center - fit.center, np.zeros(3))
@@ -186,7 +190,7 @@ def _problem(
         attitude=None if prior is None else prior.rotation,
         precision=np.zeros((3, 3)) if prior is None else prior.precision,
         tolerance_px=options.reprojection_px,
-        min_inliers=options.min_inliers,
+        min_inliers=MIN_INLIERS,
     )
 
 
@@ -280,7 +284,7 @@ def _without_wrong_prior(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
 
 def _supported(problem: Problem, fit: Fit, options: PoseOptions) -> bool:
     """Whether there are enough inliers, not collinear, below the camera."""
-    if np.count_nonzero(fit.inliers) < options.min_inliers:
+    if np.count_nonzero(fit.inliers) < MIN_INLIERS:
         return False
     above = float(fit.center[2] - problem.points[2, fit.inliers].mean())
     return above > 0 and _spread(problem.pixels[:, fit.inliers]) >= options.min_spread_px
@@ -300,7 +304,7 @@ def _false_alarms(problem: Problem, fit: Fit, options: PoseOptions) -> tuple[flo
     that a wrong match is an inlier. Three matches determine up to four poses.
     """
     total, k = problem.pixels.shape[1], _distinct(problem.pixels[:, fit.inliers], options)
-    if k < options.min_inliers:
+    if k < MIN_INLIERS:
         return math.inf, 0.0
     area_px2 = float((np.ptp(problem.pixels, axis=1) + 1).prod())
     p = chance_of_agreeing(fit.view.projected, problem.pixels, fit.inliers, options.reprojection_px, area_px2)

@@ -24,7 +24,7 @@ from engine.kernels.dense import (
 from engine.kernels.scores import enhance
 from engine.maps.grids import window_about
 from engine.maps.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
-from engine.matching.agreement import CHANCE, agree_in_height, are_consistent
+from engine.matching.agreement import agree_in_height, are_consistent
 from engine.matching.align import shrink
 from engine.matching.candidates import PeakCandidate
 from engine.matching.covariance import tilt_covariance
@@ -34,7 +34,7 @@ from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.options import NccOptions
 from engine.runtime.scheduler import OutOfTime
-from engine.values import Attitude, Fix, NoFix, Reason, Window
+from engine.values import CHANCE, Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
 

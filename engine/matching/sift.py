@@ -9,9 +9,10 @@ from engine.maps.landmarks import LandmarkMap
 from engine.maps.samples import SampleMap
 from engine.matching.candidates import PoseCandidate
 from engine.matching.explanation import Explanation, explain_features
-from engine.matching.feature_pose import METHOD, MIN_VOTES, FeatureMatcher
+from engine.matching.feature_pose import METHOD, FeatureMatcher
 from engine.matching.ladder import SHARES, Answer, Rung, Works, climb, is_accepted, rehearse, settled
 from engine.matching.method import Method
+from engine.matching.pose import MIN_INLIERS
 from engine.matching.query import Query
 from engine.matching.refinement import CONFIRMING_CORRELATION, Refinement, with_unconfirmed_tilt
 from engine.matching.views import coarser_scale, drawn_px
@@ -56,7 +57,7 @@ class Sift(Method):
         self.landmarks = LandmarkMap(site, on, self.options.backend)
         self._few = replace(
             self.options,
-            max_keypoints=max(MIN_VOTES, round(self.options.max_keypoints * _FEW_SHARE)),
+            max_keypoints=max(MIN_INLIERS, round(self.options.max_keypoints * _FEW_SHARE)),
             keypoints_per_px=self.options.keypoints_per_px * _FEW_SHARE,
             upsample=1,
         )
@@ -72,7 +73,7 @@ class Sift(Method):
 
     def prepare(self) -> None:
         """Find the map's features on every level that is small enough, or load those of an earlier start."""
-        if self.options.map_features == "prepared" and self.options.matcher is None:
+        if self.options.matcher is None:
             self.landmarks.prepare()
 
     def warmup(self, query: Query) -> None:

@@ -21,12 +21,11 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import larger_variance
-from engine.matching.agreement import CHANCE
 from engine.matching.align import MAX_FIELD_DEG, to_gray
 from engine.matching.covariance import with_frame_accuracy
 from engine.navigation.motion import GroundMotion, velocity_of
 from engine.options import AssumedErrors
-from engine.values import Attitude, Frame
+from engine.values import CHANCE, Attitude, Frame
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]

@@ -215,10 +215,16 @@ def test_many_matches_on_one_spot_count_once():
         assert (pose is not None) == carried
 
 
-@pytest.mark.parametrize("found", [*map(range, (0, 1, 3, 4, 5)), 12 * [0, 1, 2, 3, 4], 30 * [0]], ids=len)
+@pytest.mark.parametrize("found", [*map(range, (0, 1, 3)), 12 * [0, 1, 2, 3, 4], 30 * [0]], ids=len)
 def test_too_few_are_refused_however_often_they_are_found(found):
     s, slots = scene(np.random.default_rng(14), 5), np.array(found, int)
     assert solve_pose(s.points_m[slots], s.points_px[slots], K) is None
+
+
+@pytest.mark.parametrize("count", [4, 5])
+def test_four_or_five_matches_determine_a_pose_and_prove_little(count):
+    """As many agree in more than one of 10,000 sets of wrong matches: too little evidence for a fix."""
+    assert solved(scene(np.random.default_rng(14), count)).log10_nfa > -4.0
 
 
 def test_fewer_wrong_matches_are_surer():
