@@ -10,7 +10,7 @@ from engine.geo import chi_square_of
 from engine.kernels.scores import check_score
 from engine.learned.pairs import PairMatcher
 from engine.sift import BACKENDS
-from engine.values import MAX_SIGMA_M, RISK, GridPose, check, check_choice, check_positive
+from engine.values import CHANCE, MAX_SIGMA_M, RISK, GridPose, check, check_choice, check_positive
 
 PROFILES = ("engine", "paper")
 PAPER_SCALE = 0.5
@@ -220,10 +220,8 @@ class NavigatorOptions:
         max_speed_mps: two standard deviations of an unknown velocity, per axis.
         default_interval_s: time between frames without a timestamp.
         gate: chi-square of two degrees of freedom, beyond which a fix contradicts a prediction.
-        min_confidence: lowest probability, by all evidence, that a fix is right.
+        risk: allowed probability, by all evidence of the flight, that a fix is wrong.
         lost_sigma_m: uncertainty of the prediction above which the whole map is searched as well.
-        search_every: while lost, one frame in so many searches the whole map; the others search where dead
-            reckoning leads.
         memory_s: time in which the evidence of past fixes fades: however long a flight, matches that agree with
             each other outweigh it.
         late_s: how much older than the newest frame a frame may be.
@@ -241,9 +239,8 @@ class NavigatorOptions:
     max_speed_mps: float = 15.0
     default_interval_s: float = 0.2
     gate: float = round(chi_square_of(RISK, 2), 1)
-    min_confidence: float = 0.999
+    risk: float = CHANCE
     lost_sigma_m: float = 100.0
-    search_every: int = 3
     memory_s: float = 30.0
     late_s: float = 2.0
     attitude_lag_s: float = 0.1
@@ -255,17 +252,12 @@ class NavigatorOptions:
 
     def __post_init__(self) -> None:
         check_positive(self, *(name for name in self.__dataclass_fields__ if name != "odometry"))
-        check(self, "min_confidence", "a probability below 1", lambda confidence: confidence < 1.0)
-
-    @property
-    def min_log_odds(self) -> float:
-        """The required probability as log(p / (1 - p))."""
-        return math.log(self.min_confidence / (1.0 - self.min_confidence))
+        check(self, "risk", "a probability below 1", lambda risk: risk < 1.0)
 
 
 ACCEPT_ALL = NavigatorOptions(
     gate=1e12,
-    min_confidence=1e-12,
+    risk=1.0 - 1e-12,
     attitude_lag_s=1e-9,
     attitude_jitter_s=1e-9,
     tilt_bias_deg=1e-9,

@@ -34,7 +34,7 @@ class Step:
     begin_mps: Array | None
     end_mps: Array
     sigma_mps: float
-    noise_m2: float = 0.0
+    noise_m2: float
 
     def part(self, begin: float, end: float) -> Step:
         """The part between two shares, in [0, 1], of the way."""

@@ -11,25 +11,25 @@ import numpy as np
 
 from engine.budget import Budget, Deadline
 from engine.matching.covariance import map_sigma_of
-from engine.matching.evidence import SEARCHED, probability
+from engine.matching.evidence import SEARCHED, needed_nats, probability
 from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
 from engine.navigation.motion import (
     Array,
     FrameClock,
     GroundMotion,
     PositionEstimate,
+    Step,
     Ways,
     en_m,
     is_valid,
     position_of,
     velocity_of,
 )
-from engine.navigation.odds import MISS, RELIABLE
 from engine.navigation.odometry import VisualOdometry, odometry_of
 from engine.navigation.repeats import Repeats
 from engine.navigation.state import NavigatorState
 from engine.navigation.telemetry_errors import Calibration, TelemetryErrors, considered
-from engine.navigation.tracks import Match, Track, Tracks, Weighed
+from engine.navigation.tracks import MISS, RELIABLE, Match, Track, Tracks, Weighed
 from engine.options import MatcherOptions, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.values import Fix, Frame, NoFix, Prior, Reason
@@ -196,7 +196,7 @@ class Navigator:
         self._take(frame, None if late else moment)
         if isinstance(result, Fix):
             given = None if prior is None else position_of(prior, self._matcher.site)
-            match = self._match(result, frame, searched, given, is_about_given=is_given)
+            match = self._match(result, frame, moment.ways.seen, searched, given, is_about_given=is_given)
             result = self._judge(match, moment, late=late)
             if isinstance(result, Fix) and given is not None:
                 self._map_offset.add(result, given, moment.time_s)
@@ -270,8 +270,8 @@ class Navigator:
         return track.estimate.sigma_m > self._options.lost_sigma_m
 
     def _is_turn(self, count: int) -> bool:
-        """Whether this frame, of those without a useful prediction, searches the whole map."""
-        return self._matcher.site.is_searchable and count % self._options.search_every == 0
+        """Whether this frame, of those without a useful prediction, searches the whole map: every second does."""
+        return self._matcher.site.is_searchable and count % 2 == 0
 
     def _ground_below(self, fix: Fix) -> float | None:
         """Height of the ground below a fix that measured its height; None if the ground is assumed flat."""
@@ -281,12 +281,17 @@ class Navigator:
 
     def _with_height(self, frame: Frame) -> Frame:
         """The frame, with the last fix's height if it came without one."""
-        fix = None if self._accepted is None or self._lost else self._accepted.fix
-        if frame.height_agl_m is not None or fix is None or fix.up_m is None:
+        if frame.height_agl_m is not None or self._accepted is None or self._lost:
             return frame
+        return replace(frame, height_agl_m=self._height_of(self._accepted.fix))
+
+    def _height_of(self, fix: Fix) -> float | None:
+        """Height above the ground, if the fix measured it."""
+        if fix.up_m is None:
+            return None
         site = self._matcher.site
-        height = fix.up_m - site.ground_at(site.pixel_from_enu(en_m(fix)))
-        return replace(frame, height_agl_m=height) if height > 0 else frame
+        height_m = float(fix.up_m - site.ground_at(site.pixel_from_enu(en_m(fix))))
+        return height_m if height_m > 0.0 else None
 
     # ---------------------------------------------------------------------------------------------- acceptance
 
@@ -294,6 +299,7 @@ class Navigator:
         self,
         fix: Fix,
         frame: Frame,
+        seen: Step | None,
         searched: Prior | None,
         given: PositionEstimate | None,
         *,
@@ -305,7 +311,8 @@ class Navigator:
         if searched is None or fix.confidence is None:  # without a confidence it has not weighed the prior
             area_m2 = max(area_m2, fix.window.area_px * self._matcher.site.gsd_m_per_px**2)
         velocity = self._velocity(frame)
-        return Match(fix, area_m2, frame.height_agl_m, velocity, self._refusals, given, is_about_given)
+        height_m = frame.height_agl_m or self._height_of(fix)
+        return Match(fix, area_m2, height_m, velocity, seen, self._refusals, given, is_about_given)
 
     def _velocity(self, frame: Frame) -> tuple[Array, float] | None:
         """The frame's velocity and its standard deviation."""
@@ -315,7 +322,7 @@ class Navigator:
     def _judge(self, match: Match, moment: _Moment, *, late: bool) -> Fix | NoFix:
         """The fix if there is enough evidence for it; otherwise its account is remembered and it is refused."""
         fix, weighed = match.fix, moment.tracks.weighed(match)
-        if weighed.log_odds >= self._options.min_log_odds:
+        if weighed.log_odds >= needed_nats(self._options.risk):
             self._accept(fix, weighed, moment, late=late)
             return fix
         if not late:
@@ -324,14 +331,14 @@ class Navigator:
         best = moment.tracks.best
         if best is not None and self._is_known(best) and best.estimate.chi_square(fix) > self._options.gate:
             return replace(best.estimate.refusal(fix), match=fix)
-        asked = f"{self._options.min_confidence:g} is required"
+        asked = f"{1.0 - self._options.risk:g} is required"
         return fix.refused(
             Reason.UNCONFIRMED, f"right with a probability of {probability(weighed.log_odds):.4f}, {asked}"
         )
 
     def _is_known(self, track: Track) -> bool:
         """Whether a track may contradict a match: a start, or one that gave a fix, if it is not too uncertain."""
-        known = track.fix is None or track.log_odds >= self._options.min_log_odds
+        known = track.fix is None or track.log_odds >= needed_nats(self._options.risk)
         return known and not self._is_vague(track)
 
     def _accept(self, fix: Fix, weighed: Weighed, moment: _Moment, *, late: bool) -> None:

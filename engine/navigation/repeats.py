@@ -18,16 +18,16 @@ _SAMPLES = 1 << 16  # pixels of a picture that enter its digest
 class _Picture:
     """The last new picture: its digest, and the time and way since then; None if the way was not measured."""
 
-    digest: tuple[object, ...] | None = None
-    since_s: float = 0.0
-    moved_m: Array | None = None
+    digest: tuple[object, ...] | None
+    since_s: float
+    moved_m: Array | None
 
 
 class Repeats:
     """Remembers the last new picture by its digest, since buffers are reused, and the way since then."""
 
     def __init__(self) -> None:
-        self._last = self._next = _Picture()
+        self._last = self._next = _Picture(None, 0.0, None)
 
     def refusal(self, frame: Frame, ways: Ways) -> NoFix | None:
         """Refuse a picture that repeats the last one although the vehicle has moved since; else None."""

@@ -11,94 +11,87 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engine.navigation.motion import Array, PositionEstimate, en_m, velocity_of
-from engine.navigation.odds import MIN_FRAMES
+from engine.navigation.motion import Array, PositionEstimate, Step, Ways, en_m, velocity_of
+from engine.navigation.tracks import MIN_FRAMES, Track
 from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason
 
 TOLERANCE_M = 5.0
 """Smaller contradictions are left to the estimator's own gate."""
-_KNOWN_M = 50.0  # sigma up to which a track is known
-_MAX_GAP_S = 1.0  # longest gap between frames to integrate a stated velocity over
 
 
 @dataclass(frozen=True, slots=True)
-class _Track:
-    """A Kalman filter of matches: estimates the position and the error of the stated velocity.
+class _Course:
+    """A track by matches and by the velocity that the vehicle states.
 
     Attributes:
-        en_m: (2,) position at the newest frame.
-        off_mps: (2,) true velocity minus the stated one.
-        covariance: (2, 2) of position and velocity error along each axis.
-        last: the last match alone, propagated like the position: a filter lags behind a changing velocity.
+        track: the track.
+        stated_mps: (2,) the newest stated velocity.
         matches: number of matches in it.
         silent_s: time since the last of them.
     """
 
-    en_m: Array
-    off_mps: Array
-    covariance: Array
-    last: PositionEstimate
-    matches: int = 0
-    silent_s: float = 0.0
+    track: Track
+    stated_mps: Array
+    matches: int
+    silent_s: float
 
     @property
     def estimate(self) -> PositionEstimate:
-        return replace(self.last, en_m=self.en_m, sigma_m=math.sqrt(self.covariance[0, 0]))
+        """Its position by all of its matches."""
+        sigma_m = math.sqrt(self.track.covariance[1, 1])
+        return replace(self.track.estimate, en_m=self.track.filtered_m, sigma_m=sigma_m)
+
+    @property
+    def off_mps(self) -> Array:
+        """(2,) true velocity minus the stated one."""
+        return self.track.velocity_mps - self.stated_mps
 
     @property
     def found_mps(self) -> float:
         """Error of the stated velocity found along each axis, beyond its uncertainty."""
-        return math.sqrt(max(0.5 * float(self.off_mps @ self.off_mps) - self.covariance[1, 1], 0.0))
+        return math.sqrt(max(0.5 * float(self.off_mps @ self.off_mps) - self.track.covariance[2, 2], 0.0))
 
-    def carried(self, stated_mps: Array, sigma_mps: float, elapsed_s: float) -> _Track:
-        """The track at a later frame; the velocity error stays uncertain by at least ``sigma_mps``."""
-        step, covariance = np.array([[1.0, elapsed_s], [0.0, 1.0]]), self.covariance.copy()
-        covariance[1, 1] = max(covariance[1, 1], sigma_mps**2)
-        moved_m = (stated_mps + self.off_mps) * elapsed_s
-        return replace(
-            self,
-            en_m=self.en_m + moved_m,
-            last=replace(self.last, en_m=self.last.en_m + moved_m),
-            covariance=step @ covariance @ step.T,
-            silent_s=self.silent_s + elapsed_s,
-        )
+    def carried(self, stated_mps: Array, sigma_mps: float, elapsed_s: float, options: NavigatorOptions) -> _Course:
+        """The course at a later frame; the velocity error stays uncertain by at least ``sigma_mps``."""
+        changed_m2 = options.acceleration_mps2**2 * elapsed_s**3 / 3.0  # of a velocity that walks at random
+        step = Step(stated_mps * elapsed_s, self.stated_mps, stated_mps, sigma_mps, changed_m2)
+        track = self.track.carried(Ways(elapsed_s, told=step), options)
+        return replace(self, track=track, stated_mps=stated_mps, silent_s=self.silent_s + elapsed_s)
 
-    def continued(self, fix: Fix) -> _Track:
-        """The track with one more match, which replaces a position from another source than the map."""
-        apart_m, variance_m2 = en_m(fix) - self.en_m, fix.relative_sigma_m**2
-        gain, covariance = np.array([1.0, 0.0]), np.diag([variance_m2, self.covariance[1, 1]])
-        if self.last.on_map:
-            gain = self.covariance[0] / (self.covariance[0, 0] + variance_m2)
-            covariance = self.covariance - np.outer(gain, self.covariance[0])
-        return _Track(
-            self.en_m + gain[0] * apart_m,
-            self.off_mps + gain[1] * apart_m,
-            covariance,
-            _position(fix),
-            self.matches + 1,
-        )
+    def continued(self, fix: Fix) -> _Course:
+        """The course with one more match, which replaces a position from another source than the map."""
+        track, place = self.track, PositionEstimate(en_m(fix), fix.relative_sigma_m, on_map=True)
+        if track.fix is None:
+            begun, sigma_mps = Track.begun(place, 0.0, 0, fix), math.sqrt(track.covariance[2, 2])
+            track = begun.with_velocity(track.velocity_mps, sigma_mps)
+        else:
+            track = track.matched(place, fix, 0.0)
+        return replace(self, track=track, matches=self.matches + 1, silent_s=0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class _Rival:
-    """Matches that contradict the track.
+    """Matches that contradict the course.
 
     Attributes:
-        track: of these matches.
+        course: of these matches.
         first: the first of them.
-        parted: the track that the first match contradicted, at its frame.
+        parted: the course that the first match contradicted, at its frame.
     """
 
-    track: _Track
+    course: _Course
     first: Fix
-    parted: _Track
+    parted: _Course
 
     @property
     def meeting(self) -> PositionEstimate:
-        """Where the first match is expected if the velocity error changed to that of these matches."""
-        parted, last = self.parted, self.parted.last
-        changed_m = 0.5 * (self.track.off_mps - parted.off_mps) * parted.silent_s
+        """Where the first match is expected if the velocity error changed to that of these matches.
+
+        From the last match alone: a filter lags behind a changing velocity.
+        """
+        parted, last = self.parted, self.parted.track.estimate
+        changed_m = 0.5 * (self.course.off_mps - parted.off_mps) * parted.silent_s
         sigma_m = math.hypot(parted.estimate.sigma_m, last.sigma_m, *changed_m)
         return replace(last, en_m=last.en_m + changed_m, sigma_m=sigma_m)
 
@@ -112,7 +105,7 @@ class TrackGuard:
     that continue each other form a rival and start a dispute. During a dispute no match that continues the rival
     is trusted, however vague the track becomes. A dispute ends
 
-    - with three matches in a row that agree with a track still known to 50 m;
+    - with three matches in a row that agree with a track that is not lost;
     - with a rival whose own motion proves the stated velocity wrong, if that motion leads back to the end of the
       track: this happens after an outage, whereas a shifted map causes a jump;
     - with a rival that agrees with the earlier track, if there have been fewer than three fixes since;
@@ -128,7 +121,7 @@ class TrackGuard:
         self._newest_ns: int | None = None
         self._stated_mps = np.zeros(2)  # the newest one
         self._sigma_mps = self._unknown_mps
-        self._track = None if start is None else _begun(start)
+        self._track = None if start is None else self._begun(start)
         self._before = self._track  # as last vague, propagated without the fixes since
         self._rival: _Rival | None = None
         self._agreements = 0
@@ -138,7 +131,7 @@ class TrackGuard:
     @property
     def is_disputed(self) -> bool:
         """Whether matches contradict the track, so that it is unknown which of the two is right."""
-        return self._rival is not None and self._rival.track.matches >= MIN_FRAMES
+        return self._rival is not None and self._rival.course.matches >= MIN_FRAMES
 
     def confirm(self) -> None:
         """Continue the track at the next fix, wherever it is: an operator has confirmed it."""
@@ -148,7 +141,7 @@ class TrackGuard:
     def anchor(self, position: PositionEstimate) -> None:
         """Start the track at another source's position at the newest frame, until a first fix is sent."""
         if not self.has_fix:
-            self._track = self._before = _begun(position)
+            self._track = self._before = self._begun(position)
 
     def advance(self, frame: Frame, time_ns: int) -> None:
         """Propagate track and rival to the time of a frame by the velocity that came with it."""
@@ -158,39 +151,40 @@ class TrackGuard:
         self._newest_ns = time_ns
         self._sigma_mps = self._unknown_mps
         told_mps = velocity_of(frame)
-        if told_mps is not None and elapsed_s <= _MAX_GAP_S:
+        if told_mps is not None:
             self._stated_mps = told_mps
             self._sigma_mps = frame.velocity_sigma_mps or self._options.measured_velocity_sigma_mps
         if self._track is not None:
             sigma_mps = math.hypot(self._sigma_mps, self._track.found_mps)
-            self._track = self._track.carried(self._stated_mps, sigma_mps, elapsed_s)
+            self._track = self._track.carried(self._stated_mps, sigma_mps, elapsed_s, self._options)
+        known = self._stated_mps, self._sigma_mps, elapsed_s, self._options
         if self._before is not None:
-            self._before = self._before.carried(self._stated_mps, self._sigma_mps, elapsed_s)
+            self._before = self._before.carried(*known)
         if self._rival is not None:
-            track = self._rival.track.carried(self._stated_mps, self._sigma_mps, elapsed_s)
-            self._rival = replace(self._rival, track=track)
+            self._rival = replace(self._rival, course=self._rival.course.carried(*known))
 
     def trusts(self, result: Fix | NoFix) -> bool:
         """Whether a fix may be sent; refused matches also count for and against the track."""
         fix = _match(result)
         if fix is None:
             return False
-        track = self._track or _begun(_position(fix))
-        self.distance_m = float(np.hypot(*(en_m(fix) - track.en_m)))
+        track = self._track or self._begun(_position(fix))
+        self.distance_m = float(np.hypot(*(en_m(fix) - track.track.filtered_m)))
         contradicts = self._contradicts(track.estimate, fix)
         was_disputed = self.is_disputed
-        continues = self._rival is not None and not self._contradicts(self._rival.track.estimate, fix)
+        continues = self._rival is not None and not self._contradicts(self._rival.course.estimate, fix)
         if contradicts or (was_disputed and continues):
             self._agreements = 0
             if self._rival is not None and continues:
-                self._rival = replace(self._rival, track=self._rival.track.continued(fix))
+                self._rival = replace(self._rival, course=self._rival.course.continued(fix))
             else:
-                self._rival = _Rival(replace(_begun(_position(fix), self._unknown_mps), matches=1), fix, track)
+                begun = self._begun(_position(fix), fix, self._unknown_mps)
+                self._rival = _Rival(replace(begun, matches=1), fix, track)
             if not (self.is_disputed and self._is_right(self._rival, track, fix)):
                 return False
-            track = self._rival.track
+            track = self._rival.course
         elif was_disputed:
-            self._agreements += track.estimate.sigma_m <= _KNOWN_M
+            self._agreements += track.estimate.sigma_m <= self._options.lost_sigma_m
             if self._agreements < MIN_FRAMES:
                 return False
         self._rival, self._agreements = None, 0
@@ -206,12 +200,17 @@ class TrackGuard:
         """Standard deviation per axis of an unknown velocity."""
         return 0.5 * self._options.max_speed_mps
 
-    def _is_right(self, rival: _Rival, track: _Track, fix: Fix) -> bool:
+    def _begun(self, place: PositionEstimate, fix: Fix | None = None, sigma_mps: float = 0.0) -> _Course:
+        """A course that begins at a place with the stated velocity."""
+        track = Track.begun(place, 0.0, 0, fix).with_velocity(self._stated_mps, sigma_mps)
+        return _Course(track, self._stated_mps, 0, 0.0)
+
+    def _is_right(self, rival: _Rival, track: _Course, fix: Fix) -> bool:
         """Whether the evidence favours a rival: the track has a fix or two, or the stated velocity misled it."""
         if track.matches < MIN_FRAMES:
             return self._before is None or not self._contradicts(self._before.estimate, fix)
-        off_mps = rival.track.off_mps
-        variance = max(rival.track.covariance[1, 1], self._sigma_mps**2)
+        off_mps = rival.course.off_mps
+        variance = max(rival.course.track.covariance[2, 2], self._sigma_mps**2)
         is_velocity_wrong = float(off_mps @ off_mps) > self._options.gate * variance
         return is_velocity_wrong and not self._contradicts(rival.meeting, rival.first)
 
@@ -219,10 +218,6 @@ class TrackGuard:
         """Whether a fix is further from a position than the uncertainties and the tolerance allow."""
         is_far = float(np.hypot(*(en_m(fix) - estimate.en_m))) > TOLERANCE_M
         return is_far and estimate.chi_square(fix) > self._options.gate
-
-
-def _begun(position: PositionEstimate, velocity_sigma_mps: float = 0.0) -> _Track:
-    return _Track(position.en_m, np.zeros(2), np.diag([position.sigma_m**2, velocity_sigma_mps**2]), position)
 
 
 def _match(result: Fix | NoFix) -> Fix | None:

@@ -13,15 +13,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engine.matching.evidence import RELIABILITY
+from engine.matching.evidence import RELIABILITY, nats_of, needed_nats
 from engine.navigation.motion import Array, PositionEstimate, Step, Ways, en_m
-from engine.navigation.odds import CERTAIN, MISS, RELIABLE, stated_nats
 from engine.options import NavigatorOptions
-from engine.values import Fix
+from engine.values import CHANCE, RISK, Fix
 
 MAX_TRACKS = 16
+MIN_FRAMES = 3
+"""Frames that must show the same before it counts: one or two of them may be wrong."""
+CERTAIN = needed_nats(RISK)
+"""Most that one match adds for a place; most that the two motions of an account may differ by."""
+RELIABLE = nats_of(RELIABILITY)
+"""Of another source's position."""
+MISS = math.log(2.0)
+"""What a frame without a match of a place speaks against it: every second frame shows nothing that matches."""
 _SAME_GROUND = 0.5  # weight of a match of ground that was matched before
-_HEIGHT_M = 100.0  # assumed if it is unknown
+
+
+def stated_nats(fix: Fix) -> float:
+    """Log-odds of a match by itself, if every second frame shows a place in its window.
+
+    One that states none, as the paper's, is as good as a navigator asks for by default.
+    """
+    return needed_nats(CHANCE) if fix.confidence is None else nats_of(fix.confidence)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +43,11 @@ class Track:
     """One account of the flight.
 
     Attributes:
-        en_m: (2,) position at the newest frame.
+        en_m: (2,) position at the newest frame: the newest match's own, moved since then.
+        filtered_m: (2,) the same by all matches, from which the velocity follows; the errors of matches last, so
+            that it is no more certain than one.
         velocity_mps: (2,) at the same time.
-        covariance: (2, 2) of position and velocity, along each axis.
+        covariance: (3, 3) of these three, along each axis.
         support: log-odds from its matches.
         trusts_velocity: whether the telemetry's velocity moves it; else only what pictures show, or inertia.
         number: of the account; two tracks share it, of which one trusts the velocity.
@@ -41,14 +57,22 @@ class Track:
     """
 
     en_m: Array
+    filtered_m: Array
     velocity_mps: Array
     covariance: Array
     support: float
     trusts_velocity: bool
     number: int
-    fix: Fix | None = None
-    misses: int = 0
+    fix: Fix | None
+    misses: int
     moved_m: Array | None = None
+
+    @classmethod
+    def begun(cls, place: PositionEstimate, support: float, number: int, fix: Fix | None) -> Track:
+        """A track at a place, at rest, which trusts the telemetry's velocity."""
+        covariance = np.zeros((3, 3))
+        covariance[:2, :2] = place.sigma_m**2
+        return cls(place.en_m, place.en_m, np.zeros(2), covariance, support, True, number, fix, 0)
 
     @property
     def estimate(self) -> PositionEstimate:
@@ -92,11 +116,12 @@ class Track:
         Returns:
             Track: at the same position.
         """
-        covariance = np.diag([self.covariance[0, 0], sigma_mps**2])
+        covariance = np.zeros((3, 3))
+        covariance[:2, :2], covariance[2, 2] = self.covariance[:2, :2], sigma_mps**2
         return replace(self, velocity_mps=mps, covariance=covariance)
 
     def matched(self, place: PositionEstimate, fix: Fix, support: float) -> Track:
-        """The track after a match: its position is the match's own, its velocity is filtered.
+        """The track after a match: its position is the match's own, its velocity is filtered (Kalman).
 
         Args:
             place: of the match.
@@ -106,15 +131,17 @@ class Track:
         Returns:
             Track: at the same time.
         """
-        variance_m2, covariance = place.sigma_m**2, self.covariance
-        gain = covariance[0, 1] / (covariance[0, 0] + variance_m2)
-        velocity_m2ps2 = covariance[1, 1] - gain * covariance[0, 1]
-        both = gain * variance_m2
+        variance_m2, apart_m = place.sigma_m**2, place.en_m - self.filtered_m
+        gain = self.covariance[:, 1] / (self.covariance[1, 1] + variance_m2)
+        gain[0] = 1.0
+        left = np.diag([0.0, 1.0, 1.0])
+        left[1:, 1] -= gain[1:]
         return replace(
             self,
             en_m=place.en_m,
-            velocity_mps=self.velocity_mps + gain * (place.en_m - self.en_m),
-            covariance=np.array([[variance_m2, both], [both, velocity_m2ps2]]),
+            filtered_m=self.filtered_m + gain[1] * apart_m,
+            velocity_mps=self.velocity_mps + gain[2] * apart_m,
+            covariance=left @ self.covariance @ left.T + variance_m2 * np.outer(gain, gain),
             support=support,
             fix=fix,
             misses=0,
@@ -125,41 +152,47 @@ class Track:
         kept = math.exp(-ways.interval_s / options.memory_s)
         step = ways.told if self.trusts_velocity and ways.told is not None else ways.seen
         moved = self._drifted(ways.interval_s, options) if step is None else self._led(step, ways.interval_s)
-        place_m, velocity_mps, covariance = moved
+        moved_m, velocity_mps, covariance = moved
         return replace(
             self,
-            en_m=place_m,
+            en_m=self.en_m + moved_m,
+            filtered_m=self.filtered_m + moved_m,
             velocity_mps=velocity_mps,
             covariance=covariance,
             support=self._faded(kept),
-            moved_m=place_m - self.en_m,
+            moved_m=moved_m,
         )
 
     def _led(self, step: Step, interval_s: float) -> tuple[Array, Array, Array]:
-        """Its state after a step that a source measured, whose velocity has the error that matches found."""
+        """Its way by a step that a source measured, whose velocity has the error that matches found.
+
+        Returns:
+            The way (2,), and velocity (2,) and covariance (3, 3) after it.
+        """
         track = self if step.begin_mps is not None else self.with_velocity(step.end_mps, step.sigma_mps)
         begin_mps = step.end_mps if step.begin_mps is None else step.begin_mps
         off_mps = track.velocity_mps - begin_mps
-        way = np.array([[1.0, interval_s], [0.0, 1.0]])
+        way = np.array([[1.0, 0.0, interval_s], [0.0, 1.0, interval_s], [0.0, 0.0, 1.0]])
         covariance = way @ track.covariance @ way.T
-        covariance[0, 0] += step.noise_m2
-        covariance[1, 1] = max(covariance[1, 1], step.sigma_mps**2)  # the error may change
-        return track.en_m + step.moved_m + off_mps * interval_s, step.end_mps + off_mps, covariance
+        covariance[:2, :2] += step.noise_m2
+        covariance[2, 2] = max(covariance[2, 2], step.sigma_mps**2)  # the error may change
+        return step.moved_m + off_mps * interval_s, step.end_mps + off_mps, covariance
 
     def _drifted(self, interval_s: float, options: NavigatorOptions) -> tuple[Array, Array, Array]:
-        """Its state after a way that nothing measured: an acceleration that changes every second, bounded speed.
+        """As :meth:`_led`, if nothing measured the way: an acceleration that changes every second, bounded speed.
 
         The velocity is an Ornstein-Uhlenbeck process whose standard deviation is half of the highest speed.
         """
         sigma_mps = 0.5 * options.max_speed_mps
         fades_s = 2.0 * (sigma_mps / options.acceleration_mps2) ** 2
         kept = math.exp(-interval_s / fades_s)
-        way = np.array([[1.0, fades_s * (1.0 - kept)], [0.0, kept]])
+        way_s = fades_s * (1.0 - kept)
+        way = np.array([[1.0, 0.0, way_s], [0.0, 1.0, way_s], [0.0, 0.0, kept]])
         place = fades_s**2 * (2.0 * interval_s / fades_s - 3.0 + 4.0 * kept - kept**2)
         both = fades_s * (1.0 - kept) ** 2
-        noise = sigma_mps**2 * np.array([[place, both], [both, 1.0 - kept**2]])
-        covariance = way @ self.covariance @ way.T + noise
-        return self.en_m + way[0, 1] * self.velocity_mps, kept * self.velocity_mps, covariance
+        noise = np.array([[place, place, both], [place, place, both], [both, both, 1.0 - kept**2]])
+        covariance = way @ self.covariance @ way.T + sigma_mps**2 * noise
+        return way_s * self.velocity_mps, kept * self.velocity_mps, covariance
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,8 +202,9 @@ class Match:
     Attributes:
         fix: the match.
         searched_m2: area that was searched.
-        height_m: above the ground, if known.
+        height_m: above the ground; if it is unknown, all ground counts as seen before.
         velocity: (2,) m/s told with the frame and its standard deviation; None if none came.
+        seen: the way to the frame by pictures; None if they were not followed.
         refusals: frames in a row before it without a fix.
         given: another source's position; it speaks for or against a place that no track predicted.
         is_about_given: whether it was searched about that position, so that the two agree and it has spoken.
@@ -180,6 +214,7 @@ class Match:
     searched_m2: float
     height_m: float | None = None
     velocity: tuple[Array, float] | None = None
+    seen: Step | None = None
     refusals: int = 0
     given: PositionEstimate | None = None
     is_about_given: bool = False
@@ -202,7 +237,7 @@ class Match:
         """The share of its ground that the track's last match did not show; a frame shows about its height."""
         if track.fix is None:
             return 1.0
-        return min(1.0, float(np.hypot(*(en_m(self.fix) - en_m(track.fix)))) / (self.height_m or _HEIGHT_M))
+        return min(1.0, float(np.hypot(*(en_m(self.fix) - en_m(track.fix)))) / (self.height_m or math.inf))
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +293,7 @@ class Tracks:
         Returns:
             Tracks: of this account alone.
         """
-        return self._kept(self._born(start, RELIABLE, velocity, None), self.count + 1)
+        return self._kept(self._born(start, RELIABLE, velocity), self.count + 1)
 
     def carried(self, ways: Ways) -> Tracks:
         """At the next frame."""
@@ -287,11 +322,11 @@ class Tracks:
             with_it.append(each.matched(place, fix, log_odds))
             right.append(log_odds - float(np.logaddexp(0.0, -nats)))
             wrong.append(log_odds - float(np.logaddexp(0.0, nats)))
-            if nats < self.options.min_log_odds:
+            if nats < needed_nats(self.options.risk):
                 others.append(each.missed().at(wrong[-1]))
         count = self.count
         if all(each.log_odds < match.support for each in with_it):  # the vehicle is rather elsewhere, namely here
-            with_it += self._born(place, match.support, match.velocity, fix)
+            with_it += self._born(place, match.support, match.velocity, match.seen, fix)
             right.append(match.support)
             count += 1
         odds = float(np.logaddexp.reduce(right)) - float(np.logaddexp.reduce(wrong))
@@ -312,11 +347,17 @@ class Tracks:
         return owners, [each.missed() for each in self.known if id(each) not in taken]
 
     def _born(
-        self, place: PositionEstimate, support: float, velocity: tuple[Array, float] | None, fix: Fix | None
+        self,
+        place: PositionEstimate,
+        support: float,
+        velocity: tuple[Array, float] | None,
+        seen: Step | None = None,
+        fix: Fix | None = None,
     ) -> list[Track]:
-        """The two tracks of a new account, whose velocity is unknown but for the telemetry's."""
-        covariance = np.diag([place.sigma_m**2, (0.5 * self.options.max_speed_mps) ** 2])
-        led = Track(place.en_m, np.zeros(2), covariance, support, trusts_velocity=True, number=self.count, fix=fix)
+        """The two tracks of a new account, whose velocity is unknown but for the telemetry's or the pictures'."""
+        led = Track.begun(place, support, self.count, fix)
+        unknown_mps = 0.5 * self.options.max_speed_mps
+        led = led.with_velocity(*((np.zeros(2), unknown_mps) if seen is None else (seen.end_mps, seen.sigma_mps)))
         free = replace(led, support=support - CERTAIN, trusts_velocity=False)
         return [led if velocity is None else led.with_velocity(*velocity), free]
 
