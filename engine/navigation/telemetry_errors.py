@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.geo import wrap_heading_deg
 from engine.matching.covariance import scale_doubt_m
-from engine.navigation.odds import MIN_FRAMES
+from engine.navigation.tracks import MIN_FRAMES
 from engine.options import AssumedErrors, NavigatorOptions
 from engine.values import Attitude, Fix, Frame
+from engine.window import SPREAD_SIGMAS
 
 Array = NDArray[np.float64]
 
@@ -27,14 +28,12 @@ _ANGLES, _HEIGHT, _LAG = slice(0, 3), 3, 4
 _NO_RATES_DPS: Array = np.zeros(3)  # if they are unknown
 _FIRST_SHARE = 0.07  # error of the height before a picture measured it
 _WALK = np.array([0.2, 0.2, 0.5, 1e-3, 0.01])  # standard deviations of the states' change in one second
-# Standard deviations of a measured attitude, refined or by features alone; of a measured height, and a share.
-_REFINED_DEG, _FEATURES_DEG, _HEIGHT_M, _HEIGHT_SHARE = 0.6, 2.0, 1.0, 0.01
-_MAX_SIGMAS = 3.0  # larger differences are clipped to this: one fix may be wrong; an error beyond it is known
+_REFINED_DEG, _FEATURES_DEG = 0.6, 2.0  # standard deviations of a measured attitude, refined or by features alone
 _SCATTER_SHARE = 0.2  # weight of a new difference in the mean square
 _MAX_INTERVAL_S = 0.5  # between frames; over longer ones the turn rates are unknown
 _MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
 _MAX_LAG_DEG = 180.0  # timestamps in a wrong unit make rates of any size
-_MIN_SIGMAS, _MIN_SHARE = 2.0, 0.03  # of an error before it is corrected: every frame's matching allows for less
+_MIN_SIGMAS = 2.0  # of an angle's error before it is corrected: every frame's matching allows for less
 _SEARCH_GROWTH = 1.5  # of the refusals in a row before the next search
 
 
@@ -220,11 +219,12 @@ class TelemetryErrors:
 
     def _at_its_height(self, frame: Frame) -> Frame:
         """The frame at the height that pictures measured, if it differs by more than a match tolerates."""
-        share, sigma = float(self._mean[_HEIGHT]), math.sqrt(self._covariance[_HEIGHT, _HEIGHT])
-        is_known = self._heights >= MIN_FRAMES and abs(share) > max(_MIN_SHARE, _MAX_SIGMAS * sigma)
-        if frame.height_agl_m is None or not is_known or share <= -1.0:
+        share, height_m = float(self._mean[_HEIGHT]), frame.height_agl_m
+        if height_m is None or self._heights < MIN_FRAMES or share <= -1.0:
             return frame
-        return replace(frame, height_agl_m=(1.0 + share) * frame.height_agl_m)
+        assumed = self._assumed.height_sigma_m(height_m) / height_m
+        least = SPREAD_SIGMAS * max(assumed, math.sqrt(self._covariance[_HEIGHT, _HEIGHT]))
+        return frame if abs(share) <= least else replace(frame, height_agl_m=(1.0 + share) * height_m)
 
     def note(self, fix: Fix, ground_m: float | None) -> None:
         """Learn from an accepted fix of the newest frame.
@@ -248,8 +248,8 @@ class TelemetryErrors:
             self._seen = _Seen(off, sigma_deg, ground_m is not None)
         if ground_m is not None and self._height_m is not None:
             share = (fix.up_m - ground_m) / self._height_m - 1.0
-            noise = np.array([(_HEIGHT_M / self._height_m) ** 2 + _HEIGHT_SHARE**2])
-            self._update(np.array([share]), np.eye(5)[[_HEIGHT]], noise)
+            noise_m2 = float(fix.covariance_m2[2, 2]) + self._assumed.height_sigma_m(self._height_m) ** 2
+            self._update(np.array([share]), np.eye(5)[[_HEIGHT]], np.array([noise_m2 / self._height_m**2]))
             self._heights += 1
 
     def _learn_attitude(self, after: _Turn | None) -> None:
@@ -307,7 +307,7 @@ class TelemetryErrors:
     def _update(self, measured: Array, design: Array, noise: Array, *, only_lag: bool = False) -> Array:
         """A Kalman update (Schmidt's if only the lag is learnt); by how much squares exceed the expected."""
         total = design @ self._covariance @ design.T + np.diag(noise)
-        most = _MAX_SIGMAS * np.sqrt(np.diag(total))
+        most = SPREAD_SIGMAS * np.sqrt(np.diag(total))  # one fix may be wrong
         off = np.clip(measured - design @ self._mean, -most, most)
         gain = self._covariance @ design.T @ np.linalg.inv(total)
         if only_lag:
