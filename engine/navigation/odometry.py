@@ -32,19 +32,15 @@ Gray = NDArray[np.uint8]
 
 _SMALL_PX = 160  # width at which a shift is estimated
 _MAX_SIDE_PX = 640  # larger pictures are reduced first
-_WINDOW_PX = 15  # of Lucas-Kanade
 _APART_PX, _QUALITY = 8, 0.01  # distance between corners; weakest over strongest
 _RANSAC_PX = 1.5
-_STEPS, _CONVERGED = 6, 1e-6  # most Gauss-Newton steps; length of the last, as a share of the height
+_STEPS = 6  # of Gauss-Newton
 _MIN_PX = 0.05  # of a point's error
-_HUBER_SIGMAS = 2.0
 _MAX_POINTS, _MIN_POINTS = 200, 20  # followed between pictures; needed to agree on one motion
 _MIN_SHARE = 0.5  # of the followed points that must agree
 _MIN_SPREAD = 0.12  # of those, as a share of the picture's sides: parts of the vehicle often fill a corner
 _MAX_SIGMA_MPS = 2.0  # a less certain velocity is refused
 _MAX_INTERVAL_S = 3.0  # between two pictures
-_TILT_CHANGE_SIGMA_DEG, _HEADING_CHANGE_SIGMA_DEG = 1.0, 2.0  # between two pictures
-_RELIEF_SHARE = 0.01  # height difference between the followed ground and that below the vehicle
 _POINTS_PER_ERROR = 3.0  # followed points that share one error
 _ERROR_MEMORY_S = 1.0  # how long an error persists, since the same ground is followed
 _LEVEL_DEG = 0.02  # if roll and pitch are unknown their change is not estimated: see docs/odometry.md
@@ -115,6 +111,7 @@ class VisualOdometry:
             self._last = None  # its timestamp is wrong, so the next interval would be too
             return NoMotion("the picture repeats the last one")
         view = _View(self._camera, begin, end, height_m)
+        errors = with_frame_accuracy(later, AssumedErrors())
         moved_m = np.zeros(3) if self._velocity_mps is None else self._velocity_mps * interval_s
         moved_m[2] = (later.height_agl_m or height_m) - height_m
         expected = view.homography(moved_m)
@@ -125,23 +122,21 @@ class VisualOdometry:
         if isinstance(agreed, NoMotion):
             return agreed
         known = None not in (earlier.roll_deg, earlier.pitch_deg, later.roll_deg, later.pitch_deg)
-        solved = view.solve(*agreed, moved_m, has_tilt=known)
+        turn_deg = math.sqrt(2.0) * np.array(
+            [errors.tilt_deg, errors.tilt_deg, errors.heading_deg]
+        )  # of two frames
+        if not known:
+            turn_deg[:2] = _LEVEL_DEG
+        solved = view.solve(*agreed, moved_m, turn_deg)
         if solved is None:
             return NoMotion("the ground is seen too obliquely, or shows no single motion")
-        return self._judged(earlier, interval_s, *solved, len(agreed[0]))
-
-    def _judged(
-        self, frame: Frame, interval_s: float, moved_m: Array, noise_m2: Array, points: int
-    ) -> GroundMotion | NoMotion:
-        """The motion, unless it is too uncertain."""
+        moved_m, noise_m2 = solved
         sigma_mps = math.sqrt(larger_variance(noise_m2)) / interval_s
         if not sigma_mps <= _MAX_SIGMA_MPS:
             return NoMotion(f"the velocity is uncertain by {sigma_mps:.1f} m/s")
-        errors, height_m = with_frame_accuracy(frame, AssumedErrors()), frame.height_agl_m or 1.0
-        height_share = math.hypot(errors.height_sigma_m(height_m) / height_m, _RELIEF_SHARE)
-        lasting = math.hypot(height_share, math.radians(errors.heading_deg))
+        lasting = math.hypot(errors.height_sigma_m(height_m) / height_m, math.radians(errors.heading_deg))
         drift = 1.0 + 2.0 * _ERROR_MEMORY_S / interval_s
-        return GroundMotion(interval_s, moved_m, noise_m2, lasting, drift, points)
+        return GroundMotion(interval_s, moved_m, noise_m2, lasting, drift, len(agreed[0]))
 
     def _agreed(self, begin_px: Array, end_px: Array) -> tuple[Array, Array] | NoMotion:
         """The points that fit one homography, as normalised image coordinates (N, 2)."""
@@ -210,7 +205,7 @@ def track_corners(earlier: Gray, later: Gray, expected: Array) -> tuple[Array, A
     if not len(start):
         return none, none
     shown = cv2.warpPerspective(earlier, expected, size, borderMode=cv2.BORDER_REPLICATE)
-    end, found, _ = cv2.calcOpticalFlowPyrLK(shown, later, start, None, winSize=(_WINDOW_PX, _WINDOW_PX))
+    end, found, _ = cv2.calcOpticalFlowPyrLK(shown, later, start, None)
     good = found[:, 0] > 0
     return begin[good, 0].astype(np.float64), end[good, 0].astype(np.float64)
 
@@ -254,8 +249,14 @@ class _View:
         matrix = self._camera.matrix
         return np.asarray(matrix @ turned @ np.linalg.inv(matrix))
 
-    def solve(self, begin: Array, end: Array, moved_m: Array, *, has_tilt: bool) -> tuple[Array, Array] | None:
-        """The motion from normalised image coordinates (N, 2) before and after, and a first guess (3,) of it.
+    def solve(self, begin: Array, end: Array, moved_m: Array, turn_deg: Array) -> tuple[Array, Array] | None:
+        """The motion from normalised image coordinates before and after.
+
+        Args:
+            begin: (N, 2).
+            end: (N, 2).
+            moved_m: (3,) a first guess.
+            turn_deg: (3,) standard deviations of the turn about east, north and up that the telemetry leaves.
 
         Returns:
             (2,) metres east and north, and their covariance (2, 2); None if it cannot be solved for.
@@ -265,9 +266,7 @@ class _View:
         if steep.min() < math.cos(math.radians(MAX_FIELD_DEG)):
             return None
         ground_m = rays * (self._height_m / -rays[:, 2])[:, None]
-        tilt_deg = _TILT_CHANGE_SIGMA_DEG if has_tilt else _LEVEL_DEG
-        sigmas = np.radians([tilt_deg, tilt_deg, _HEADING_CHANGE_SIGMA_DEG])
-        prior = np.diag([*sigmas**-2.0, 0.0, 0.0, 0.0])
+        prior = np.diag([*np.radians(turn_deg) ** -2.0, 0.0, 0.0, 0.0])
         state = np.array([0.0, 0.0, 0.0, *moved_m])  # turn about east, north, up; motion
         for _ in range(_STEPS):
             seen, by_state = self._seen(ground_m, state)
@@ -280,10 +279,7 @@ class _View:
                 covariance = np.linalg.inv(weighted @ by_state.reshape(-1, 6) + prior)
             except np.linalg.LinAlgError:
                 return None
-            step = covariance @ (weighted @ off.ravel() - prior @ state)
-            state = state + step
-            if np.abs(step[3:]).max() < _CONVERGED * self._height_m:
-                break
+            state = state + covariance @ (weighted @ off.ravel() - prior @ state)
         return (state[3:5], np.asarray(covariance[3:5, 3:5])) if np.isfinite(covariance).all() else None
 
     def _seen(self, ground_m: Array, state: Array) -> tuple[Array | None, Array]:
@@ -305,4 +301,4 @@ class _View:
 def _weights(off: Array, least: float) -> Array:
     """Weight of each point by its distance (N,) from the expected place (Huber); sigma is at least ``least``."""
     sigma = max(float(np.median(off)) / math.sqrt(2.0 * math.log(2.0)), least)  # the median of Rayleigh's law
-    return np.minimum(1.0, _HUBER_SIGMAS * sigma / np.maximum(off, 1e-12)) / sigma**2
+    return np.minimum(1.0, sigma / np.maximum(off, sigma)) / sigma**2

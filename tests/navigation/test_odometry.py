@@ -3,7 +3,6 @@
 import math
 import time
 from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine import Attitude, Budget, Camera, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, Reason
-from engine.navigation.motion import FrameClock, GroundMotion, Ways
+from engine.navigation.motion import FrameClock, GroundMotion, PositionEstimate, Ways
 from engine.navigation.odometry import NoMotion, VisualOdometry
 from engine.navigation.tracks import Track
 from scenematch.runs.settings import TrackSettings, load_settings
+from tests.support.fixes import a_fix
 from tests.support.ground import Ground
 from tests.support.matchers import ScriptedMatcher, a_site
 
@@ -203,7 +203,7 @@ def still(seconds, **velocity):
 
 def test_motions_add_up_and_so_do_their_errors():
     """Four of 5 m: the share of height and heading lasts, the rest does not."""
-    track = Track(np.zeros(2), MOTION.velocity_mps, np.diag([0.0, 0.1**2]), 20.0, trusts_velocity=True, number=0)
+    track = Track.begun(PositionEstimate(np.zeros(2), 0.0), 20.0, 0, None).with_velocity(MOTION.velocity_mps, 0.1)
     for _ in range(4):
         track = track.carried(Ways(1.0, seen=MOTION.step(MOTION.velocity_mps)), NavigatorOptions())
     assert track.en_m == pytest.approx([12.0, 16.0])
@@ -264,7 +264,7 @@ def test_the_time_that_odometry_takes_is_the_frames(monkeypatch, total_ms, searc
 def test_odometry_flies_at_the_height_that_fixes_showed(monkeypatch):
     navigator = Navigator(blind(camera=CAMERA), START, options=NavigatorOptions(odometry=True))
     errors, flown = navigator._errors, frame(picture((0.0, 0.0)))
-    higher = SimpleNamespace(attitude=None, up_m=1.2 * HEIGHT_M, stage="refined")
+    higher = a_fix(up_m=1.2 * HEIGHT_M)
     for _ in range(5):
         errors.corrected(flown, 0.0, late=False)
         errors.note(higher, 0.0)
