@@ -24,7 +24,6 @@ _log = logging.getLogger("scenematch")
 
 _JOIN_S = 5.0  # closing waits this long for abandoned workers, then leaves them behind
 _MAX_MS = 60_000.0  # of any wait in flight
-_MAX_DOUBLINGS = 10  # the time allowed to create a navigator doubles at most this often
 _LOOK_S = 0.02  # polling interval of a clock of another speed while something is due
 
 
@@ -69,11 +68,11 @@ class Answer:
 class Counts:
     """Counts of frames: submitted = answered + dropped + at most one waiting and one in work."""
 
-    submitted: int = 0
-    dropped: int = 0
-    answered: int = 0
-    late: int = 0
-    workers_replaced: int = 0
+    submitted: int
+    dropped: int
+    answered: int
+    late: int
+    workers_replaced: int
 
 
 @dataclass(slots=True, eq=False)
@@ -271,7 +270,7 @@ class Live:
         if self._creating_since_ns is not None:
             creating_for_ms = (self._machine_ns() - self._creating_since_ns) * 1e-6
             # A slow creation would never finish if each attempt got the same time.
-            return (deadline_ms + patience_ms) * 2.0 ** min(self._hung_creations, _MAX_DOUBLINGS) - creating_for_ms
+            return (deadline_ms + patience_ms) * 2.0**self._hung_creations - creating_for_ms
         if self._working is None or not self._working.answered:
             return math.inf
         return deadline_ms + patience_ms - (self._machine_ns() - self._working.submitted_ns) * 1e-6

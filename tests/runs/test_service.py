@@ -199,7 +199,7 @@ def test_a_ros_bridge_reports_as_the_other_does(manager, flight, progress, monke
 
 
 def test_the_line_of_a_ros_bridge_names_what_was_not_published():
-    counts = Counts(submitted=9, dropped=1, answered=8)
+    counts = Counts(submitted=9, dropped=1, answered=8, late=0, workers_replaced=0)
     status = RosStatus(counts, fixes=5, refused={"late": 2, "low_score": 1}, unusable=4, restarts=1)
     stated = "9 pictures; published 5; not published: late 2, low_score 1, unusable 4, dropped 1; 1 restarts"
     assert status.line() == stated
