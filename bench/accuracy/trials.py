@@ -73,7 +73,7 @@ class Ground:
             columns, rows = np.meshgrid(np.arange(site.width_px), np.arange(site.height_px))
             surface = site.surface_at(np.c_[columns.ravel(), rows.ravel()]).reshape(gray.shape)
         valid = site.valid(self._whole)
-        return OrthoMap.from_arrays(gray, site._grid.pixel_to_crs, site.crs, surface_m=surface, valid=valid)
+        return OrthoMap.from_arrays(gray, site.grid.pixel_to_crs, site.crs, surface_m=surface, valid=valid)
 
     @cached_property
     def old(self) -> OrthoMap:
@@ -97,7 +97,7 @@ class Ground:
         best = max(tiles, key=lambda tile: float(tile.std()))
         repeats = [-(-n // side) for n in self.gray.shape]
         out = np.ascontiguousarray(np.tile(best, repeats)[: self.gray.shape[0], : self.gray.shape[1]])
-        return OrthoMap.from_arrays(out, self.site._grid.pixel_to_crs, self.site.crs)
+        return OrthoMap.from_arrays(out, self.site.grid.pixel_to_crs, self.site.crs)
 
 
 @dataclass(frozen=True)
