@@ -208,8 +208,7 @@ class Refinement:
 
     def rehearse(self, fix: Fix) -> None:
         """Refine on every level, with a known and with a doubted attitude, so that all is prepared."""
-        for refinement in (self, self._doubting()):
-            # a vehicle that flies higher is matched on coarser levels
+        for refinement in (self, self._doubting()):  # one level more, for a vehicle that flies higher
             refinement._refined(fix, refinement._prior(fix), max(refinement._levels_above) + 1)
 
     def _doubting(self) -> Refinement:
@@ -219,7 +218,7 @@ class Refinement:
         frame = replace(frame, tilt_sigma_deg=sigma_deg, heading_sigma_deg=heading_sigma_deg)
         return replace(self, query=replace(self.query, frame=frame), knows_tilt=False)
 
-    def _refined(self, fix: Fix, prior: GaussianPrior, coarser: int, *, is_tilted: bool = False) -> Refined | None:
+    def _refined(self, fix: Fix, prior: GaussianPrior, coarser: int) -> Refined | None:
         """The fix with its pose refined from a coarser level on; None if that failed or led elsewhere."""
         query, errors = self.query, self.query.errors(self.options.errors)
         found = self._through_levels(prior, coarser)
