@@ -8,6 +8,7 @@ from dataclasses import replace
 from engine.maps.landmarks import LandmarkMap
 from engine.maps.samples import SampleMap
 from engine.matching.candidates import PoseCandidate
+from engine.matching.evidence import is_beyond_doubt
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import METHOD, FeatureMatcher
 from engine.matching.ladder import SHARES, Answer, Rung, Works, climb, is_accepted, rehearse, settled
@@ -132,7 +133,7 @@ class Sift(Method):
         found = refinement.refine_pose(fix)
         if found is None or found.fix.score >= CONFIRMING_CORRELATION:
             return None if found is None else found.fix
-        return found.fix if refinement.surprise_of(found) >= query.needed_nats else None
+        return found.fix if is_beyond_doubt(refinement.surprise_of(found), query.risk) else None
 
     def _refinement(self, query: Query) -> Refinement:
         return Refinement(query, self.samples, self._enhancement)
