@@ -208,8 +208,8 @@ class Refinement:
 
     def rehearse(self, fix: Fix) -> None:
         """Refine on every level, with a known and with a doubted attitude, so that all is prepared."""
-        for refinement in (self, self._doubting()):
-            refinement._refined(fix, refinement._prior(fix), max(refinement._levels_above))
+        for refinement in (self, self._doubting()):  # one level more, for a vehicle that flies higher
+            refinement._refined(fix, refinement._prior(fix), max(refinement._levels_above) + 1)
 
     def _doubting(self) -> Refinement:
         """The same for a frame whose attitude is hardly known."""
@@ -271,7 +271,7 @@ class Refinement:
         own_m = query.site.gsd_m_per_px * 2.0 ** query.level_of(height_m)
         off_px = height_m * math.radians(self._tilt_deg) / own_m
         first = max(math.ceil(math.log2(off_px / _CAPTURE_PX)), 0)
-        return (first, *range(first - 1, -1, -1)[:1], first + 2)
+        return (first, *range(first - 1, -1, -1)[:1], first + 1, first + 2)
 
     @property
     def _is_on_unknown_slope(self) -> bool:
