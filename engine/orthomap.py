@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from engine.errors import MapError
 from engine.maps.georeference import Georeference
-from engine.maps.grids import Array, Grid, metric_grid, pixels_between
+from engine.maps.grids import Array, Grid, metric_grid, warp_between
 from engine.maps.metric_copy import ProgressCallback, open_readable
 from engine.maps.pyramid import Pyramid, check_arrays
 from engine.maps.rasters import (
@@ -172,13 +172,13 @@ class OrthoMap(Georeference):
         site.georeference_sigma_m = stated_sigma(georeference_sigma_m, None, GEOREFERENCE_TAG)
         site.slope_sigma_deg = stated_sigma(slope_sigma_deg, None, SLOPE_TAG)
         if heights is not None:
-            site._attach(SurfaceModel(heights, pixels_between(grid, grid)), grid)
+            site._attach(SurfaceModel(heights, warp_between(grid, grid)), grid)
         return site
 
     def _attach(self, surface: SurfaceModel, surface_grid: Grid) -> None:
         known = self._known_heights(surface, self.grid.lattice(257))
         if known.size < _MIN_KNOWN:  # a surface of a small part of the map, or a map of small parts
-            to_map = pixels_between(surface_grid, self.grid)
+            to_map = warp_between(surface_grid, self.grid)
             known = self._known_heights(surface, to_map(surface_grid.lattice(257)))
         if known.size == 0:
             raise MapError("surface: expected known heights under the valid part of the map, got none")

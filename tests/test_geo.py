@@ -1,4 +1,4 @@
-"""geo.py against the Earth's own axes, its inverses, and the signs of the conventions."""
+"""geo.py against pyproj, its own inverses, and the signs of the conventions."""
 
 import math
 
@@ -15,8 +15,10 @@ from engine.geo import (
     angle_covariance_deg2,
     attitude_from_rotation,
     chi_square,
+    ecef_from_geodetic,
     enu_from_body,
     enu_turn_covariance_rad2,
+    geodetic_from_ecef,
     larger_variance,
     transport_covariance,
     wrap_difference_deg,
@@ -24,22 +26,44 @@ from engine.geo import (
 )
 from tests.support.ground import body_axes
 
+LATITUDES = st.floats(-90.0, 90.0)
 LONGITUDES = st.floats(-180.0, 180.0)
 PLACES = [(0.0, 0.0), (32.79, 34.99), (-33.9, 151.2), (71.0, -156.8), (89.9, 12.0), (-45.0, 179.9999)]
 
 
+def topocentric(lat_deg, lon_deg):
+    """PROJ's own east-north-up about a point on the ellipsoid."""
+    return Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        f"+step +proj=topocentric +ellps=WGS84 +lon_0={lon_deg!r} +lat_0={lat_deg!r} +h_0=0"
+    )
+
+
+@given(LATITUDES, LONGITUDES, st.floats(-500.0, 20_000.0))
+@settings(max_examples=60, deadline=None)
+def test_ecef_agrees_with_proj(lat_deg, lon_deg, height_m):
+    proj = Transformer.from_crs(4979, 4978, always_xy=True)
+    expected = proj.transform(lon_deg, lat_deg, height_m)
+    np.testing.assert_allclose(ecef_from_geodetic(lat_deg, lon_deg, height_m), expected, atol=1e-6)
+
+
+@given(LATITUDES, LONGITUDES, st.floats(-500.0, 20_000.0))
+@settings(max_examples=60, deadline=None)
+def test_ecef_round_trip_closes_to_a_micrometre(lat_deg, lon_deg, height_m):
+    point = ecef_from_geodetic(lat_deg, lon_deg, height_m)
+    np.testing.assert_allclose(ecef_from_geodetic(*geodetic_from_ecef(point)), point, atol=1e-6)
+    lat, _, height = geodetic_from_ecef(point)
+    assert float(lat) == pytest.approx(lat_deg, abs=1e-11)
+    assert float(height) == pytest.approx(height_m, abs=1e-6)
+
+
 @pytest.mark.parametrize(("lat_deg", "lon_deg"), PLACES)
-def test_enu_is_what_the_earths_axes_give(lat_deg, lon_deg):
-    """EPSG:4978, Earth-centred and Earth-fixed, turned to the east, north and up of the origin."""
+def test_enu_agrees_with_proj_topocentric(lat_deg, lon_deg):
     lat = lat_deg + np.array([[0.0, 0.02], [-0.03, 0.05]])
     lon = lon_deg + np.array([[0.0, 0.01], [0.04, -0.05]])
-    to_ecef = Transformer.from_crs(4979, 4978, always_xy=True)
-    point_m = np.stack(to_ecef.transform(lon, lat, np.zeros((2, 2))), axis=-1)
-    (sin_lat, cos_lat), (sin_lon, cos_lon) = ((math.sin(v), math.cos(v)) for v in np.radians([lat_deg, lon_deg]))
-    axes = np.array([[-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]])
-    expected = (point_m - point_m[0, 0]) @ axes.T  # the first point is the origin
+    east, north, _ = topocentric(lat_deg, lon_deg).transform(lon, lat, np.zeros((2, 2)))
     enu = LocalFrame(lat_deg, lon_deg).enu_from_geodetic(lat, lon)
-    np.testing.assert_allclose(enu, expected, atol=1e-6)
+    np.testing.assert_allclose(enu, np.stack([east, north], axis=-1), atol=1e-6)
 
 
 OFFSETS_M = arrays(np.float64, (2, 3), elements=st.floats(-20_000.0, 20_000.0))

@@ -1,4 +1,4 @@
-"""Points of a map: bilinear heights and samples, compiled by numba.
+"""Points of a map: polynomials of its georeference and bilinear heights, compiled by numba.
 
 One point costs a microsecond instead of thirty by NumPy calls; a frame needs some dozens.
 """
@@ -8,6 +8,35 @@ from __future__ import annotations
 import numpy as np
 
 from engine.runtime.jit import compiled
+
+
+@compiled("(f8[:, ::1], f8[::1], f8[::1], f8[:, :, ::1], f8[:, ::1])")
+def polynomials(points, centre, half, coefficients, out):
+    """Evaluate two polynomials of the plane.
+
+    Args:
+        points: (N, 2).
+        centre: (2,) of their domain.
+        half: (2,) half its sides.
+        coefficients: (P, P, 2) of the powers of x, of y, and of which polynomial; of points in units of the box.
+        out: (N, 2) takes the values.
+
+    Returns:
+        Whether all points are inside the box; if not, the rest of ``out`` is undefined.
+    """
+    last = coefficients.shape[0] - 1
+    for n in range(points.shape[0]):
+        x, y = (points[n, 0] - centre[0]) / half[0], (points[n, 1] - centre[1]) / half[1]
+        if not (abs(x) <= 1.0 and abs(y) <= 1.0):
+            return False
+        first = second = 0.0
+        for i in range(last, -1, -1):
+            one = two = 0.0
+            for j in range(last, -1, -1):
+                one, two = one * y + coefficients[i, j, 0], two * y + coefficients[i, j, 1]
+            first, second = first * x + one, second * x + two
+        out[n, 0], out[n, 1] = first, second
+    return True
 
 
 @compiled("(f4[:, ::1], f8[:, ::1], f8[::1])")

@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike
 
 from engine.errors import MapError
 from engine.geo import LocalFrame
-from engine.maps.grids import Array, Grid, wgs84
+from engine.maps.grids import WARP_MARGIN, Array, Grid, Warp, wgs84
 
 GSD_RANGE_M = (1e-3, 1e3)
 
 
 class Georeference:
-    """Coordinates of the pixels of a metric grid.
+    """Coordinates of the pixels of a metric grid, by polynomials that are exact to 0.1 mm and 1e-4 px.
 
     Attributes:
         grid: in use.
@@ -38,12 +38,27 @@ class Georeference:
         self._to_geodetic, self._from_geodetic = grid.pixels_of(wgs84())
         lon_deg, lat_deg = self._to_geodetic(grid.centre_px)
         self.frame = LocalFrame(float(lat_deg), float(lon_deg))
+        box = grid.box(WARP_MARGIN)
+        self._to_enu = Warp(self._exact_enu, box, tolerance=1e-4)
+        enu = self._to_enu(np.stack(np.meshgrid(box[:, 0], box[:, 1]), axis=-1).reshape(-1, 2))
+        self._from_enu = Warp(self._exact_pixel, np.stack([enu.min(axis=0), enu.max(axis=0)]), tolerance=1e-4)
+        self._lonlat = Warp(self._to_geodetic, box, tolerance=1e-9)  # degrees: 0.1 mm
         self.gsd_m_per_px = math.sqrt(abs(np.linalg.det(self.enu_jacobian(grid.centre_px))))
         if not GSD_RANGE_M[0] <= self.gsd_m_per_px <= GSD_RANGE_M[1]:
             raise MapError(f"map: expected 1 mm to 1 km a pixel, got {self.gsd_m_per_px:.3g} m; is its CRS right?")
         lonlat = self._to_geodetic(grid.lattice())
         (west, south), (east, north) = lonlat.min(axis=0), lonlat.max(axis=0)
         self.bounds_deg = (float(west), float(south), float(east), float(north))
+
+    def _exact_enu(self, xy_px: Array) -> Array:
+        lonlat = self._to_geodetic(xy_px)
+        with np.errstate(invalid="ignore"):  # far outside its CRS a pixel has no coordinates
+            return self.frame.enu_from_geodetic(lonlat[..., 1], lonlat[..., 0])
+
+    def _exact_pixel(self, en_m: Array) -> Array:
+        with np.errstate(invalid="ignore"):
+            lat, lon = self.frame.geodetic_from_enu(en_m[..., 0], en_m[..., 1])
+        return self._from_geodetic(np.stack([lon, lat], axis=-1))
 
     def enu_from_pixel(self, xy_px: ArrayLike) -> Array:
         """Local coordinates of pixels.
@@ -54,8 +69,7 @@ class Georeference:
         Returns:
             (..., 2) east and north in metres.
         """
-        lonlat = self._to_geodetic(np.asarray(xy_px, np.float64))
-        return self.frame.enu_from_geodetic(lonlat[..., 1], lonlat[..., 0])
+        return self._to_enu(np.asarray(xy_px, np.float64))
 
     def pixel_from_enu(self, en_m: ArrayLike) -> Array:
         """Pixels of local coordinates.
@@ -66,8 +80,7 @@ class Georeference:
         Returns:
             (..., 2) pixels of the map.
         """
-        east_north = np.asarray(en_m, np.float64)
-        return self.pixel_from_geodetic(*self.frame.geodetic_from_enu(east_north[..., 0], east_north[..., 1]))
+        return self._from_enu(np.asarray(en_m, np.float64))
 
     def enu_jacobian(self, xy_px: ArrayLike) -> Array:
         """Jacobian of the local coordinates by the pixel.
@@ -81,7 +94,7 @@ class Georeference:
             (2, 2) d(east, north) / d(x, y) in metres per pixel.
         """
         half_steps = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
-        right, left, below, above = self.enu_from_pixel(np.asarray(xy_px, np.float64) + half_steps)
+        right, left, below, above = self._to_enu(np.asarray(xy_px, np.float64) + half_steps)
         return np.column_stack([right - left, below - above])
 
     def geodetic_from_pixel(self, xy_px: ArrayLike) -> tuple[Array, Array]:
@@ -93,7 +106,7 @@ class Georeference:
         Returns:
             WGS84 latitude and longitude in degrees, (...,) each.
         """
-        lonlat = self._to_geodetic(np.asarray(xy_px, np.float64))
+        lonlat = self._lonlat(np.asarray(xy_px, np.float64))
         return lonlat[..., 1], lonlat[..., 0]
 
     def pixel_from_geodetic(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:

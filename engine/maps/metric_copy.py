@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 from engine.errors import MapError
-from engine.maps.grids import Grid, by_corner, pixels_between, transformed_window, wgs84, window_about
+from engine.maps.grids import Grid, Warp, apply_affine, by_corner, wgs84, window_about
 from engine.maps.rasters import BLOCK_PX, Gray, GrayReader, Source, is_large, map_errors, open_source
 from engine.maps.tiles import tiles_under
 from engine.runtime.cache_folder import cache_folder
 from engine.values import Window
 
-GRID_VERSION = 3
+GRID_VERSION = 2
 """Part of the key of cached copies; raise it with every change in how they are created."""
 FACTORS = [2, 4, 8, 16, 32]
 """Of the overviews of a large copy. The file is padded to a multiple, so that their pixels lie on the levels'."""
@@ -82,9 +82,12 @@ def _resampled(reader: GrayReader, source: Grid, grid: Grid, windows: Iterable[W
     """Blocks of the copy, resampled: grey is cubic, alpha 255 where all of it is valid."""
     import cv2
 
-    to_source, size = pixels_between(grid, source), np.array([source.width_px, source.height_px])
+    to_source = source.pixels_of(grid.crs)[1]
+    warp = Warp(lambda xy: to_source(apply_affine(grid.pixel_to_crs, xy)), grid.box(), tolerance=0.005)
     for window in windows:
-        at = np.clip(transformed_window(to_source, window), -9.0, size + 9.0)
+        columns = np.arange(window.x0, window.x1, dtype=np.float64)
+        rows = np.arange(window.y0, window.y1, dtype=np.float64)
+        at = np.nan_to_num(warp.on_grid(columns, rows), nan=-9.0, posinf=-9.0, neginf=-9.0)
         seen = window_about(at.reshape(-1, 2), (source.height_px, source.width_px), margin_px=3)
         block = np.zeros((2, window.height_px, window.width_px), np.uint8)
         if seen is not None:
@@ -94,7 +97,7 @@ def _resampled(reader: GrayReader, source: Grid, grid: Grid, windows: Iterable[W
             solid = cv2.erode(valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
             block[0] = cv2.remap(gray, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
             solid = cv2.remap(solid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            inside = ((at >= -0.5) & (at <= size - 0.5)).all(axis=-1)
+            inside = ((at >= -0.5) & (at <= [source.width_px - 0.5, source.height_px - 0.5])).all(axis=-1)
             block[1] = np.where((np.asarray(solid) == 255) & inside, 255, 0)
         yield window, block
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import MapError
-from engine.maps.grids import Array, Function, Grid, overlap, part_grid, pixels_between, square_lattice
+from engine.maps.grids import Array, Grid, Warp, overlap, part_grid, square_lattice, warp_between
 from engine.maps.rasters import COARSE_LIMIT_PX, MEMORY_LIMIT_PX, Source, map_errors
 from engine.maps.tiles import TILE_PX
 from engine.values import Window
@@ -80,7 +80,7 @@ class SurfaceModel:
     """
 
     def __init__(
-        self, heights_m: Heights | HeightTiles, from_map: Function, decimated: SurfaceModel | None = None
+        self, heights_m: Heights | HeightTiles, from_map: Warp, decimated: SurfaceModel | None = None
     ) -> None:
         if isinstance(heights_m, np.ndarray):  # the loops are compiled for one type
             heights_m = np.ascontiguousarray(heights_m, np.float32)
@@ -166,10 +166,10 @@ def open_surface(source: Source, grid: Grid) -> tuple[SurfaceModel, Grid]:
     part = surface_part(source, grid)
     large = part.area_px > SURFACE_LIMIT_PX
     heights, surface_grid = read_surface(source, grid, COARSE_LIMIT_PX if large else SURFACE_LIMIT_PX)
-    surface = SurfaceModel(heights, pixels_between(grid, surface_grid))
+    surface = SurfaceModel(heights, warp_between(grid, surface_grid))
     if large:
         tiles = HeightTiles(source, part)
-        surface = SurfaceModel(tiles, pixels_between(grid, part_grid(source.grid, part, tiles.shape)), surface)
+        surface = SurfaceModel(tiles, warp_between(grid, part_grid(source.grid, part, tiles.shape)), surface)
     return surface, surface_grid
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from engine.errors import MapError
-from engine.maps.grids import Grid, pixels_between, transformed_window
+from engine.maps.grids import Grid, warp_between
 from engine.maps.metric_copy import open_metric_copy
 from engine.maps.rasters import GrayReader, Source, map_errors, open_source
 from engine.maps.surface import read_surface
@@ -98,8 +98,8 @@ def _heights(
     if not known.any():
         raise MapError(f"surface: expected known heights under the map, got none in {surface}")
     filled = np.where(known, raw, np.float32(np.percentile(raw[known], 20.0))).astype(np.float32)
-    whole = Window(0, 0, grid.width_px, grid.height_px)
-    at = transformed_window(pixels_between(grid, surface_grid), whole).astype(np.float32)
+    columns, rows = np.arange(shape[1], dtype=np.float64), np.arange(shape[0], dtype=np.float64)
+    at = warp_between(grid, surface_grid).on_grid(columns, rows).astype(np.float32)
     heights: Any = cv2.remap(filled, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     lowest = float(heights.min())
     heights = np.asarray(heights - np.float32(lowest), dtype=np.float32)

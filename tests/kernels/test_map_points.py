@@ -1,9 +1,28 @@
-"""Bilinear heights by OpenCV's own."""
+"""Polynomials and bilinear heights by NumPy's and OpenCV's own."""
 
 import cv2
 import numpy as np
+from numpy.polynomial.polynomial import polyval2d
 
-from engine.kernels.map_points import bilinear_heights
+from engine.kernels.map_points import bilinear_heights, polynomials
+
+CENTRE, HALF = np.array([300.0, -200.0]), np.array([50.0, 20.0])
+
+
+def test_polynomials_are_those_of_numpy():
+    rng = np.random.default_rng(1)
+    coefficients, unit = rng.normal(size=(6, 6, 2)), rng.uniform(-1, 1, (100, 2))
+    out = np.empty((100, 2))
+    assert polynomials(CENTRE + HALF * unit, CENTRE, HALF, coefficients, out)
+    for k in (0, 1):
+        np.testing.assert_allclose(out[:, k], polyval2d(*unit.T, coefficients[..., k]), atol=1e-12)
+
+
+def test_points_outside_the_box_are_not_evaluated():
+    out = np.empty((2, 2))
+    for far in ((351.0, -200.0), (300.0, -221.0), (np.nan, 0.0), (np.inf, 0.0)):
+        assert not polynomials(np.stack([CENTRE, far]), CENTRE, HALF, np.ones((6, 6, 2)), out)
+    assert polynomials(np.stack([CENTRE + HALF, CENTRE - HALF]), CENTRE, HALF, np.ones((6, 6, 2)), out)
 
 
 def test_heights_inside_are_those_of_opencv():
