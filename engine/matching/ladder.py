@@ -18,7 +18,7 @@ from engine.values import NoFix, Reason, Result
 SHARES = (1.0, 0.5)
 """Of the scale at which features are matched, a level of the map apart; the smaller if time is short."""
 Works = Mapping[Hashable, float]
-"""Steps, as the scheduler knows them, by their work."""
+"""The work of each step that may be taken, as the scheduler knows it."""
 Answer: TypeAlias = Candidate | NoFix
 """What is known of a frame's place, accepted or not, or why nothing is."""
 
@@ -40,7 +40,8 @@ class Rung:
 def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Answer:
     """The answer after every rung that can change it and that time allows.
 
-    With a fix, work ends before a deadline that would make it late; no fix is lost to a lack of time.
+    With a fix, work ends before a deadline that would make it late; a refusal for lack of time replaces no fix.
+    Any other answer of a later rung replaces an earlier one.
 
     Args:
         query: the frame.

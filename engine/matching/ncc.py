@@ -251,7 +251,7 @@ class _Rungs:
         return replace(answer, fix=refined or with_unconfirmed_tilt(self._query, answer.fix))
 
     def _finer(self, answer: Answer | None) -> Works:
-        """Every level that is finer than the answer."""
+        """Levels that are finer than the answer, the finest first; one of them is correlated."""
         if answer is None:
             return self._works
         # Beside a coarse fix a finer level that does not fit is not missed, so its cost shall not fade.
@@ -281,7 +281,7 @@ class _Rungs:
         return {_STRUCTURE: answer.aligned.work_px(self._ncc.surroundings(self._query, answer))}
 
     def _match_structure(self, answer: Answer | None, step: Hashable) -> Answer | None:
-        """Structure where the refused peak lies; it sees what grey levels see, and more."""
+        """Structure where the refused peak lies: it sees what grey levels see, and more, and replaces their peak."""
         assert isinstance(answer, PeakCandidate)  # or it was not offered
         found = self._ncc.match_structure(self._query, answer, self._ncc.surroundings(self._query, answer))
         return None if answer.searched and not is_accepted(found, self._query) else found

@@ -39,7 +39,7 @@ from engine.values import CHANCE, Attitude, Fix, NoFix, Reason, Window
 Array = NDArray[np.float64]
 
 _CAPTURE_PX = 20.0  # tilts are tried on the level on which one off by one sigma moves the ground by no more
-_TILTS, _STARTS = np.arange(-3.0, 3.5, 1.5), 3  # sigmas of an unknown tilt, about both axes; the best few are refined
+_TILTS, _STARTS = np.arange(-3.0, 3.5, 1.5), 3  # sigmas of an unknown tilt, about both axes; the best are refined
 CONFIRMING_CORRELATION = 0.45
 """Correlation of a pose at which nothing else is tried: no coarser level, and no doubt of a known tilt.
 
