@@ -281,7 +281,7 @@ class _Rungs:
         return {_STRUCTURE: answer.aligned.work_px(self._ncc.surroundings(self._query, answer))}
 
     def _match_structure(self, answer: Answer | None, step: Hashable) -> Answer | None:
-        """Structure where the refused peak lies: it sees what grey levels see, and more, and replaces their peak."""
+        """Structure where the refused peak lies; it sees what grey levels see, and more: its peak counts."""
         assert isinstance(answer, PeakCandidate)  # or it was not offered
         found = self._ncc.match_structure(self._query, answer, self._ncc.surroundings(self._query, answer))
         return None if answer.searched and not is_accepted(found, self._query) else found
