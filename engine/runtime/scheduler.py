@@ -39,7 +39,10 @@ class OutOfTime(Exception):  # noqa: N818 - no error, and never seen by a caller
 
 
 class Costs:
-    """Costs of steps, and of their rest from each stage on, per unit of work; and the machine's load."""
+    """Costs of steps, and of their rest from each stage on, per unit of work; and the machine's load.
+
+    Threads share them, so a deque is read by list(): within tuple() the garbage collector may let another in.
+    """
 
     def __init__(self) -> None:
         self._runs: dict[Hashable, deque[tuple[float, float]]] = {}  # milliseconds on the processor, and taken
@@ -74,7 +77,7 @@ class Costs:
 
     def needed_ms(self, step: Hashable, work: float, *, has_fix: bool = True) -> float:
         """Time that a step needs; 0 with fewer than two runs."""
-        runs = tuple(self._runs.get(step, ()))
+        runs = list(self._runs.get(step, ()))
         if len(runs) < 2:
             return 0.0
         usual = median_low([used for used, _ in runs])
@@ -84,7 +87,7 @@ class Costs:
 
     def least_ms(self, step: Hashable, work: float) -> float:
         """Processor time that a step needs by its quickest recent run; 0 with fewer than two."""
-        runs = tuple(self._runs.get(step, ()))
+        runs = list(self._runs.get(step, ()))
         return min(used for used, _ in runs) * self._faded(step, work) if len(runs) > 1 else 0.0
 
     def _faded(self, step: Hashable, work: float) -> float:
@@ -92,12 +95,12 @@ class Costs:
 
     def load(self) -> float:
         """Elapsed over processor time of recent stages, without the longest wait; 1 on an idle machine."""
-        stages = tuple(self._stages_ms)
+        stages = list(self._stages_ms)
         return 1.0 + sum(sorted(waited for _, waited in stages)[:-1]) / max(sum(used for used, _ in stages), 1e-3)
 
     def wait_ms(self) -> float:
         """How long a step may wait for the processor: the second longest recent wait."""
-        return min(sorted([0.0, 0.0, *tuple(self._waits_ms)])[-2], MAX_WAIT_MS)
+        return min(sorted([0.0, 0.0, *list(self._waits_ms)])[-2], MAX_WAIT_MS)
 
 
 class Scheduler:
