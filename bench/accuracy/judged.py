@@ -115,7 +115,7 @@ class Bench:
         if isinstance(found, NoFix):
             return self.row(made, "NCC", None, False, [], [])
         if not found.suffices(query.risk):
-            found = ncc.match_structure(query, found, found.fix.window) or found
+            found = ncc.match_structure(query, found) or found
         ratio = math.sqrt(found.evidence.rival / max(found.evidence.surprise, 1e-6))
         scores = [found.fix.confidence or 0.0, found.peak.score, _psr(query, ncc, found), -ratio]
         return self.row(made, "NCC", found.fix, found.suffices(query.risk), scores, [found.evidence.nats])
@@ -125,7 +125,7 @@ class Bench:
         query, ncc, peak = self.peak(made)
         found = None if isinstance(peak, NoFix) else peak
         if found is not None and method == STRUCTURE:
-            found = ncc.match_structure(query, found, found.fix.window)
+            found = ncc.match_structure(query, found)
         if found is None:
             return self.row(made, method, None, False, [], [])
         scores = [found.fix.confidence or 0.0, found.peak.score]

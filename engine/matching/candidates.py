@@ -46,6 +46,10 @@ class Candidate(ABC):
         is_tested = is_beyond_doubt(self.evidence.nats, risk)
         return replace(self, evidence=replace(self.evidence, is_tested=is_tested))
 
+    def coarse(self) -> Self:
+        """The candidate, its fix at reduced resolution."""
+        return replace(self, fix=replace(self.fix, stage="coarse"))
+
     def _wrong(self, risk: float) -> str:
         wrong = 1.0 - probability(self.evidence.nats)
         return f"wrong with probability {wrong:.1g}, at most {risk:g} is allowed"

@@ -69,8 +69,7 @@ def settled(query: Query, answer: Answer) -> Result:
         return answer
     if answer.suffices(query.risk):
         return answer.fix
-    fix, (reason, detail) = answer.fix, answer.refusal(query.risk)
-    return replace(query.refuse(reason, detail, fix.method, score=fix.score, window=fix.window), match=fix)
+    return replace(answer.fix.refused(*answer.refusal(query.risk)), match=answer.fix)
 
 
 def is_accepted(answer: Answer | None, query: Query) -> TypeGuard[Candidate]:

@@ -60,9 +60,7 @@ class Learned(Method):
     def _match(self, query: Query, answer: Answer | None, step: Hashable) -> Answer:
         assert isinstance(step, tuple)
         found = self._feature_matcher(query, step[1]).find()
-        if step[1] == 1.0 or isinstance(found, NoFix):
-            return found
-        return replace(found, fix=replace(found.fix, stage="coarse"))
+        return found if step[1] == 1.0 or isinstance(found, NoFix) else found.coarse()
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""

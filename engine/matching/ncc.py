@@ -71,23 +71,20 @@ class Ncc(Method):
             for answer in rehearse(each, rungs.levels, None):
                 rehearse(each, rungs.refinement, answer)
                 if isinstance(answer, PeakCandidate) and self.can_refine(each):
-                    Refinement(each, self.samples, self.options).rehearse(answer.fix)
-        self._rehearse_refused(query, with_search=False)
+                    rungs.refinement_of(answer).rehearse(answer.fix)
+        rehearse(query, _Rungs(self, query).structure, self._refused(query))
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map, or headings and heights about the prior."""
         if query.prior is None:
             self.locate(query)
         else:
-            self._rehearse_refused(query, with_search=True)
+            rehearse(query, _Rungs(self, query).search, self._refused(query))
 
-    def _rehearse_refused(self, query: Query, *, with_search: bool) -> None:
-        """Run what follows a peak that is refused."""
-        found, rungs = self.find(query), _Rungs(self, query)
-        if isinstance(found, PeakCandidate):
-            found = found.weighed(replace(found.evidence, surprise=0.0))
-            for rung in [rungs.structure, rungs.search] if with_search else [rungs.structure]:
-                rehearse(query, rung, found)
+    def _refused(self, query: Query) -> Answer:
+        """The frame's peak, without evidence."""
+        found = self.find(query)
+        return found if isinstance(found, NoFix) else found.weighed(replace(found.evidence, surprise=0.0))
 
     def locate(self, query: Query, *, widely: bool = True) -> Result:
         """The fix of a coarse peak whose pose the picture confirms, else of the finest level that time allows.
@@ -159,19 +156,18 @@ class Ncc(Method):
             return null_tested(correlator, found)
         return found if searched else found.untested(query.risk)
 
-    def match_structure(self, query: Query, found: PeakCandidate, window: Window) -> PeakCandidate | None:
+    def match_structure(self, query: Query, found: PeakCandidate) -> PeakCandidate | None:
         """The highest peak by structure as well, see :mod:`engine.matching.structure`.
 
         Args:
             query: the frame.
             found: the candidate by grey levels.
-            window: to match in; the fix names that of the candidate in any case.
 
         Returns:
             PeakCandidate | None: None if the template is nowhere on the map.
         """
         with query.scheduler.stage("structure"):
-            return match_structure(self._correlator(query), found, window)
+            return match_structure(self._correlator(query), found, self.surroundings(query, found))
 
     def surroundings(self, query: Query, found: PeakCandidate) -> Window:
         """The window to match structure in: the first one's; after a search, the surroundings of the place."""
@@ -247,7 +243,7 @@ class _Rungs:
     def _refine_at_once(self, answer: Answer | None, step: Hashable) -> Answer:
         """The pose of a coarse peak refined, or the peak with a tilt that nothing confirmed."""
         assert isinstance(answer, PeakCandidate)  # or it was not offered
-        refined = self._refinement(answer).refine_at_once(answer.fix)
+        refined = self.refinement_of(answer).refine_at_once(answer.fix)
         return replace(answer, fix=refined or with_unconfirmed_tilt(self._query, answer.fix))
 
     def _finer(self, answer: Answer | None) -> Works:
@@ -283,7 +279,7 @@ class _Rungs:
     def _match_structure(self, answer: Answer | None, step: Hashable) -> Answer | None:
         """Structure where the refused peak lies; it sees what grey levels see, and more: its peak counts."""
         assert isinstance(answer, PeakCandidate)  # or it was not offered
-        found = self._ncc.match_structure(self._query, answer, self._ncc.surroundings(self._query, answer))
+        found = self._ncc.match_structure(self._query, answer)
         return None if answer.searched and not is_accepted(found, self._query) else found
 
     def _if_refinable(self, answer: Answer | None) -> Works:
@@ -296,7 +292,7 @@ class _Rungs:
 
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer:
         assert isinstance(answer, PeakCandidate)  # or it was not offered
-        return self._refinement(answer).refine(answer)
+        return self.refinement_of(answer).refine(answer)
 
     def _if_refused(self, answer: Answer | None) -> Works:
         """The search of headings and heights, if a peak is refused."""
@@ -310,7 +306,7 @@ class _Rungs:
         found = self._ncc.find(self._query, widely=True)
         if isinstance(found, NoFix):
             return None
-        again = self._ncc.match_structure(self._query, found, self._ncc.surroundings(self._query, found))
+        again = self._ncc.match_structure(self._query, found)
         return again if is_accepted(again, self._query) else None
 
     def _is_coarse(self, answer: Answer | None) -> TypeGuard[PeakCandidate]:
@@ -327,7 +323,7 @@ class _Rungs:
         query = self._query
         return query.telemetry.has_tilt and query.site.has_surface and self._ncc.can_refine(query)
 
-    def _refinement(self, found: PeakCandidate) -> Refinement:
+    def refinement_of(self, found: PeakCandidate) -> Refinement:
         """Of the frame, with the heading and height of a candidate that a search fitted."""
         query = self._query.at(found.aligned.pose) if found.searched else self._query
         return Refinement(query, self._ncc.samples, self._ncc.options)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -75,6 +75,11 @@ class Refined:
     picture: EnhancedFrame
     ground: Samples
 
+    @property
+    def is_clear(self) -> bool:
+        """Whether the correlation leaves nothing else to try."""
+        return self.fix.score >= CONFIRMING_CORRELATION
+
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
@@ -85,12 +90,14 @@ class Refinement:
         samples: of the map.
         options: of the correlation.
         knows_tilt: whether to trust the roll and pitch that came with the frame, or only to start from them.
+        pictures: the frame enhanced so far, by level.
     """
 
     query: Query
     samples: SampleMap
     options: NccOptions
     knows_tilt: bool = True
+    pictures: dict[int, EnhancedFrame] = field(default_factory=dict, repr=False, compare=False)
 
     def refine(self, found: PeakCandidate) -> PeakCandidate | NoFix:
         """The candidate with its whole pose refined and the evidence of that, or a less certain one, or a refusal.
@@ -102,7 +109,7 @@ class Refinement:
         """
         query, has_tilt, found = self.query, self.query.telemetry.has_tilt, replace(found, by_refinement=True)
         refined = self.refine_pose(found.fix)
-        is_clear = refined is not None and _is_clear(refined.fix)
+        is_clear = refined is not None and refined.is_clear
         if refined is not None and is_clear and found.suffices(query.risk):
             return replace(found, fix=refined.fix)
         own = self._weighed(found, refined)
@@ -116,8 +123,8 @@ class Refinement:
             return self._unconfirmed(best)
         if not query.site.has_surface:
             return best
-        detail, fix = "roll and pitch are unknown, and the picture does not determine them", best.fix
-        return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
+        detail = "roll and pitch are unknown, and the picture does not determine them"
+        return best.fix.refused(Reason.BAD_POSE, detail)
 
     def _or_doubted(self, found: PeakCandidate, own: PeakCandidate | None) -> PeakCandidate | None:
         """The candidate refined by a known attitude, or as if that were hardly known; the more probable one."""
@@ -188,12 +195,12 @@ class Refinement:
             return replace(found, fix=replace(fix, stage="unconfirmed"))
         against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
         detail = f"the picture does not confirm the attitude, and {against}"
-        return query.refuse(Reason.BAD_POSE, detail, fix.method, score=fix.score, window=fix.window)
+        return fix.refused(Reason.BAD_POSE, detail)
 
     def refine_at_once(self, fix: Fix) -> Fix | None:
         """The fix refined on the frame's own level; None if the picture does not confirm it."""
         refined = self._refined(fix, self._prior(fix), 0)
-        return refined.fix if refined is not None and _is_clear(refined.fix) else None
+        return refined.fix if refined is not None and refined.is_clear else None
 
     def refine_pose(self, fix: Fix) -> Refined | None:
         """The pose refined from a level that suits the tilt, then from its neighbours, until it is clear."""
@@ -202,7 +209,7 @@ class Refinement:
             refined = self._refined(fix, prior, coarser)
             if refined is not None and (best is None or refined.fix.score > best.fix.score):
                 best = refined
-            if best is not None and _is_clear(best.fix):
+            if best is not None and best.is_clear:
                 break
         return best
 
@@ -268,10 +275,10 @@ class Refinement:
     def _levels_above(self) -> tuple[int, ...]:
         """How many levels above the frame's own refinements start, in turn."""
         query, height_m = self.query, self.query.telemetry.known_height_m
-        own_m = query.site.gsd_m_per_px * 2.0 ** query.level_of(height_m)
-        off_px = height_m * math.radians(self._tilt_deg) / own_m
-        first = max(math.ceil(math.log2(off_px / _CAPTURE_PX)), 0)
-        return (first, *range(first - 1, -1, -1)[:1], first + 1, first + 2)
+        own = query.level_of(height_m)
+        off_px = height_m * math.radians(self._tilt_deg) / (query.site.gsd_m_per_px * 2.0**own)
+        first, most = max(math.ceil(math.log2(off_px / _CAPTURE_PX)), 0), query.site.levels - 1 - own
+        return tuple(dict.fromkeys(min(max(first + n, 0), most) for n in (0, -1, 1, 2)))
 
     @property
     def _is_on_unknown_slope(self) -> bool:
@@ -341,14 +348,17 @@ class Refinement:
         return window
 
     def _enhanced_frame(self, height_m: float, level: int) -> EnhancedFrame:
-        """The frame at the resolution of a level, enhanced like the map."""
+        """The frame at the resolution of a level, enhanced like the map, once for all attempts."""
+        if level in self.pictures:
+            return self.pictures[level]
         query, options = self.query, self.options
         scale = height_m / query.camera.focal_px / (query.site.gsd_m_per_px * 2.0**level)
         gray, smaller = shrink(query.gray, scale)
         scale /= math.sqrt(smaller[0, 0] * smaller[1, 1])
         radius_px = max(1, round(options.enhance_radius_px / scale)) if options.enhance_radius_px else 0
         enhanced = enhance(gray, radius_px=radius_px, score=options.score)
-        return EnhancedFrame(enhanced, smaller @ query.camera.matrix)
+        self.pictures[level] = EnhancedFrame(enhanced, smaller @ query.camera.matrix)
+        return self.pictures[level]
 
     def _refined_fix(self, fix: Fix, fit: DenseFit, covariance_m2: Array, turns_rad2: Array) -> Fix:
         query, center_m = self.query, fit.pose.center_m
@@ -365,11 +375,6 @@ class Refinement:
             map_sigma_m=self.options.errors.map_m,
         )
         return replace(refined, stage="refined", confidence=fix.confidence)
-
-
-def _is_clear(refined: Fix) -> bool:
-    """Whether the correlation at a refined pose leaves nothing else to try."""
-    return refined.score >= CONFIRMING_CORRELATION
 
 
 def with_unconfirmed_tilt(query: Query, fix: Fix) -> Fix:

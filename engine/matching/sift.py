@@ -103,7 +103,7 @@ class Sift(Method):
         """
         answer = climb(query, METHOD, _Rungs(self, query, agrees).in_order)
         if isinstance(answer, PoseCandidate) and answer.is_quick:  # it follows the telemetry's attitude
-            answer = replace(answer, fix=replace(with_unconfirmed_tilt(query, answer.fix), stage="coarse"))
+            answer = replace(answer, fix=with_unconfirmed_tilt(query, answer.fix)).coarse()
         return settled(query, answer)
 
     def few_options(self, query: Query) -> SiftOptions | None:
@@ -131,9 +131,10 @@ class Sift(Method):
         """The fix with its pose refined; None if that fails, or chance may have given that pose as well."""
         refinement = self._refinement(query)
         found = refinement.refine_pose(fix)
-        if found is None or found.fix.score >= CONFIRMING_CORRELATION:
-            return None if found is None else found.fix
-        return found.fix if is_beyond_doubt(refinement.surprise_of(found), query.risk) else None
+        if found is None:
+            return None
+        counts = found.is_clear or is_beyond_doubt(refinement.surprise_of(found), query.risk)
+        return found.fix if counts else None
 
     def _refinement(self, query: Query) -> Refinement:
         return Refinement(query, self.samples, self._enhancement)
@@ -166,9 +167,7 @@ class Sift(Method):
         """The pose by all features at a share of the usual scale, not refined."""
         options = self.options if share == 1.0 else replace(self.options, scale=self.options.scale * share)
         found = self.find(query, options)
-        if share == 1.0 or isinstance(found, NoFix):
-            return found
-        return replace(found, fix=replace(found.fix, stage="coarse"))
+        return found if share == 1.0 or isinstance(found, NoFix) else found.coarse()
 
 
 class _Rungs:

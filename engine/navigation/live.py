@@ -68,11 +68,11 @@ class Answer:
 class Counts:
     """Counts of frames: submitted = answered + dropped + at most one waiting and one in work."""
 
-    submitted: int
-    dropped: int
-    answered: int
-    late: int
-    workers_replaced: int
+    submitted: int = 0
+    dropped: int = 0
+    answered: int = 0
+    late: int = 0
+    workers_replaced: int = 0
 
 
 @dataclass(slots=True, eq=False)

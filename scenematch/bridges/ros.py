@@ -133,7 +133,7 @@ class RosBridge:
         self._last_image_s = time.monotonic()
         self._fixes = self._unusable = self._restarts = 0
         self._refused: Counter[str] = Counter()
-        self._counts_before = Counts(**dict.fromkeys(Counts.__slots__, 0))  # of replaced pipelines
+        self._counts_before = Counts()  # of replaced pipelines
 
     def close(self) -> None:
         """Answer the frame in progress and stop."""
