@@ -34,7 +34,7 @@ from scenematch.files.track import read_track
 from scenematch.files.truth import interpolate_truth, read_truth
 
 LIMIT_S = 2.0
-"""A file that takes longer is a hang."""
+"""Of the processor; a file that takes longer is a hang."""
 IMAGE = np.zeros((2, 2), np.uint8)
 
 
@@ -265,7 +265,7 @@ def mutated(rng: random.Random, name: str, data: bytes) -> bytes:
 def fuzz(count: int, seed: int, kinds: tuple[str, ...] = ()) -> Fuzzed:
     """So many files of each kind; whatever is neither read nor refused in one line and in time is raised."""
     result, rng = Fuzzed(), random.Random(seed)
-    before = signal.signal(signal.SIGALRM, _ring)
+    before = signal.signal(signal.SIGPROF, _ring)
     with tempfile.TemporaryDirectory() as text, warnings.catch_warnings():
         warnings.simplefilter("error")
         folder = Path(text)
@@ -282,13 +282,13 @@ def fuzz(count: int, seed: int, kinds: tuple[str, ...] = ()) -> Fuzzed:
                     if number == 0 and outcome != "read":
                         raise AssertionError(f"{kind}: the sound file was refused")
         finally:
-            signal.signal(signal.SIGALRM, before)
+            signal.signal(signal.SIGPROF, before)
     return result
 
 
 def _tried(use: Callable[[Path], object], path: Path) -> tuple[str, float]:
     begin = time.perf_counter()
-    signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+    signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
     outcome = "read"
     try:
         use(path)
@@ -297,18 +297,18 @@ def _tried(use: Callable[[Path], object], path: Path) -> tuple[str, float]:
             raise AssertionError(f"a refusal of more than one line: {error}") from error
         outcome = "refused"
     except BaseException as error:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         kept = Path(tempfile.gettempdir()) / f"fuzz-{path.name}"
         kept.write_bytes(path.read_bytes())
         error.add_note(f"the file is kept as {kept}")
         raise
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
     return outcome, time.perf_counter() - begin
 
 
 def _ring(*_: object) -> None:
-    raise Hang(f"no answer after {LIMIT_S:g} s")
+    raise Hang(f"no answer after {LIMIT_S:g} s of the processor")
 
 
 if __name__ == "__main__":
