@@ -107,7 +107,10 @@ class Bench:
         """The highest peak of a match by NCC's grey levels, accepted or not."""
         matcher = self.matcher(made.on, "NCC")
         query, ncc = _query(matcher, made.frame, made.prior), _part(matcher, "ncc", Ncc)
-        return query, ncc, ncc.find(query)
+        found = ncc.find(query)
+        if not isinstance(found, NoFix) and found.promises(query.risk) and not found.suffices(query.risk):
+            found = ncc.null_tested(query, found)
+        return query, ncc, found
 
     def peaked(self, made: Trial) -> Row:
         """The match by NCC alone: by structure where the peak by grey levels is refused."""

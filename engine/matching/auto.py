@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.matching.agreement import agree_in_height, agree_in_place, offset_between_m
+from engine.matching.candidates import Candidate
 from engine.matching.explanation import Explanation
-from engine.matching.ladder import is_late
+from engine.matching.ladder import Answer, is_accepted, is_late
 from engine.matching.method import Method
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
@@ -19,7 +20,7 @@ from engine.matching.sift import Sift
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.values import Fix, NoFix, Reason, Result, Window
+from engine.values import Fix, Window
 
 
 class Auto(Method):
@@ -64,38 +65,47 @@ class Auto(Method):
         else:
             self.ncc.warmup_search(query)
 
-    def locate(self, query: Query) -> Result:
-        """The more accurate of two agreeing fixes, a wider one if they hardly agree, or the only fix.
+    def locate(self, query: Query) -> Answer:
+        """What both propose: SIFT checks NCC's fix, or looks where NCC has none.
 
-        The second method checks a fix. It runs last, so that it never takes time from the first.
+        It runs last, so that it never takes time from NCC.
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
         first = self.ncc.locate(query, widely=False)  # SIFT finds the heading by itself
-        # Few features follow the telemetry's attitude, and so does a fix that no picture refined: SIFT's will be.
-        agrees = partial(_agree, first) if isinstance(first, Fix) and not first.rests_on_attitude else None
-        with query.scheduler.with_fix(isinstance(first, Fix)):
+        agrees = None
+        if is_accepted(first, query) and not first.fix.rests_on_attitude:
+            # Few features follow the telemetry's attitude, and so does a fix that no picture refined.
+            agrees = partial(_agree, first.fix)
+        with query.scheduler.with_fix(is_accepted(first, query)):
             second = self.sift.locate(query, agrees)
-        if isinstance(first, NoFix):
-            return first if is_late(second) else second
-        if isinstance(second, NoFix):
-            return first
-        offset_m = offset_between_m(first, second)
-        if not agree_in_place(first, second):
-            if float(np.hypot(*offset_m)) < self.ncc.options.exclusion_m:
-                return _vaguer(second, offset_m)
-            detail = f"NCC and SIFT are {float(np.hypot(*offset_m)):.1f} m apart"
-            return query.refuse(Reason.INCONSISTENT, detail, "auto", score=first.score, window=first.window)
-        if not agree_in_height(first, second):
-            return _vaguer(second, offset_m)
-        # Both compare the same picture and map with the same prior, so their odds are not multiplied.
-        stated = [fix.confidence for fix in (first, second) if fix.confidence is not None]
-        best = min(first, second, key=lambda fix: fix.sigma_m)
-        return replace(best, stage="verified", confidence=max(stated, default=None))
+        if isinstance(first, Candidate) and isinstance(second, Candidate):
+            return self._posterior(query, first, second)
+        return first if is_accepted(first, query) or is_late(second) else second
+
+    def _posterior(self, query: Query, first: Candidate, second: Candidate) -> Candidate:
+        """Of one place the more accurate candidate, of two the more evident one, with the other against it.
+
+        Both compare the same picture and map with the same prior, so their evidence is not added.
+        """
+        both = [each for each in (first, second) if is_accepted(each, query)]
+        offset_m = offset_between_m(first.fix, second.fix)
+        is_near = float(np.hypot(*offset_m)) < self.ncc.options.exclusion_m
+        if len(both) < 2 or not (is_near or agree_in_place(first.fix, second.fix)):
+            best = max(both or [first, second], key=_nats)
+            return best.against([first, second])
+        if not _agree(first.fix, second.fix):
+            return replace(second, fix=_vaguer(second.fix, offset_m))
+        greater, best = max(both, key=_nats).evidence, min(both, key=lambda each: each.fix.sigma_m)
+        return replace(best, fix=replace(best.fix, stage="verified")).weighed(greater)
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """As NCC does."""
         return self.ncc.explain(query, window)
+
+
+def _nats(candidate: Candidate) -> float:
+    return candidate.evidence.nats
 
 
 def _agree(first: Fix, second: Fix) -> bool:

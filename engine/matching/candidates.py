@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
-from engine.matching.evidence import Evidence, is_beyond_doubt, needed_nats, probability
+from engine.matching.agreement import agree_in_place
+from engine.matching.evidence import Evidence, needed_nats, probability
 from engine.values import Fix, Peak, Reason
 
 if TYPE_CHECKING:
@@ -29,22 +31,42 @@ class Candidate(ABC):
     fix: Fix
     evidence: Evidence
 
+    @property
+    def is_possible(self) -> bool:
+        """Whether its evidence counts at all."""
+        return True
+
+    def promises(self, risk: float) -> bool:
+        """Whether it suffices unless the null hypothesis, if that is not tested yet, does as well."""
+        return self.is_possible and self.evidence.promises(risk)
+
     def suffices(self, risk: float) -> bool:
         """Whether its fix may be handed out: it is wrong with at most this probability."""
-        return self.evidence.suffices(risk)
+        return self.is_possible and self.evidence.suffices(risk)
 
-    @abstractmethod
     def refusal(self, risk: float) -> Refusal:
         """Why it does not suffice for this risk."""
+        if replace(self, evidence=replace(self.evidence, elsewhere=0.0)).suffices(risk):
+            against = f"evidence for another place: {self.evidence.elsewhere:.1f} nats"
+            return Reason.AMBIGUOUS, f"{self._wrong(risk)} ({against})"
+        return self._refusal(risk)
+
+    @abstractmethod
+    def _refusal(self, risk: float) -> Refusal:
+        """Why its own evidence does not suffice for this risk."""
+
+    def against(self, others: Iterable[Candidate]) -> Self:
+        """The candidate with the evidence for any other place against it."""
+        rivals = [
+            other.evidence.nats
+            for other in others
+            if other.is_possible and not agree_in_place(other.fix, self.fix)
+        ]
+        return self.weighed(replace(self.evidence, elsewhere=max([0.0, *rivals])))
 
     def weighed(self, evidence: Evidence) -> Self:
         """The candidate by other evidence."""
         return replace(self, evidence=evidence, fix=replace(self.fix, confidence=probability(evidence.nats)))
-
-    def untested(self, risk: float) -> Self:
-        """The candidate without a test of the null hypothesis, which counts only if it is beyond doubt."""
-        is_tested = is_beyond_doubt(self.evidence.nats, risk)
-        return replace(self, evidence=replace(self.evidence, is_tested=is_tested))
 
     def coarse(self) -> Self:
         """The candidate, its fix at reduced resolution."""
@@ -67,14 +89,16 @@ class PeakCandidate(Candidate):
     Attributes:
         peak: in pixels of the aligned level.
         aligned: the hypothesis that it belongs to.
-        searched: whether heading and height were fitted to the picture.
+        by_search: whether it is the best of more than one window at one heading and height.
+        is_fitted: whether heading and height were fitted to the picture, which maximises its score.
         by_structure: whether structure was matched as well as grey levels.
         by_refinement: whether refining its pose was tried.
     """
 
     peak: Peak
     aligned: Aligned
-    searched: bool = False
+    by_search: bool = False
+    is_fitted: bool = False
     by_structure: bool = False
     by_refinement: bool = False
 
@@ -83,12 +107,12 @@ class PeakCandidate(Candidate):
         """Whether it is a summit, and no slope at the window's edge."""
         return bool(self.peak.curvature.any())
 
-    def suffices(self, risk: float) -> bool:
-        """As of every candidate; a slope at the window's edge never does."""
-        return self.is_inside and self.evidence.suffices(risk)
+    @property
+    def is_possible(self) -> bool:
+        """Whether its evidence counts: not a slope's, nor a fitted score until structure confirms the place."""
+        return self.is_inside and (self.by_structure or not self.is_fitted)
 
-    def refusal(self, risk: float) -> Refusal:
-        """Why it does not suffice for this risk."""
+    def _refusal(self, risk: float) -> Refusal:
         evidence, score = self.evidence, self.peak.score
         if not self.is_inside:
             return Reason.AMBIGUOUS, f"NCC {score:.3f} still rises at the window's edge"
@@ -96,11 +120,17 @@ class PeakCandidate(Candidate):
             return Reason.AMBIGUOUS, f"{self._wrong(risk)}: the pose cannot be refined there"
         sigmas, rival = (math.sqrt(2.0 * surprise) for surprise in (evidence.surprise, evidence.chance))
         if replace(evidence, rival=0.0, null=0.0, prior_chi_square=None).nats < needed_nats(risk):
-            return Reason.LOW_SCORE, f"best NCC {score:.3f}, {sigmas:.1f} sigmas, may be chance"
+            needed = math.sqrt(2.0 * (math.log(evidence.tried) + needed_nats(risk)))
+            among = f"{needed:.1f} are needed among {evidence.tried:,.0f} places"
+            return Reason.LOW_SCORE, f"best NCC {score:.3f}, {sigmas:.1f} sigmas may be chance: {among}"
         figures = f"NCC {sigmas:.1f} sigmas, rival at {rival:.1f}, {self._from_prior}"
-        if not evidence.is_tested:
-            doubt = "found by a search, not confirmed by the structure about the place"
-            return Reason.UNCONFIRMED, f"{doubt} ({figures})"
+        if evidence.promises(risk):
+            confirmed = (
+                "confirmed by the structure about the place"
+                if self.by_search
+                else "compared with its mirror image"
+            )
+            return Reason.UNCONFIRMED, f"found but not yet {confirmed} ({figures})"
         return Reason.AMBIGUOUS, f"{self._wrong(risk)} ({figures})"
 
 
@@ -116,10 +146,9 @@ class PoseCandidate(Candidate):
     is_quick: bool = False
     is_refinable: bool = True
 
-    def refusal(self, risk: float) -> Refusal:
-        """Why it does not suffice for this risk."""
+    def _refusal(self, risk: float) -> Refusal:
         evidence, ten = self.evidence, math.log(10.0)
-        if not evidence.is_tested:
+        if evidence.promises(risk):
             return Reason.LATE, "no time was left to compare a pose by few features with the mirrored frame's"
         by_chance = f"by chance once in 10^{evidence.surprise / ten:.1f}"
         if replace(evidence, null=0.0).nats >= needed_nats(risk):

@@ -47,8 +47,8 @@ class Evidence:
             measured, or the telemetry's is unknown or doubted.
         null: the surprise of the null hypothesis, the mirrored frame; 0 if it was not matched, or is a rival.
         elsewhere: the evidence for the best other place that another attempt found.
-        is_tested: whether the null hypothesis was tested, or would change nothing. A score maximised by a fit of
-            heading and height is no evidence until the structure around the place confirms it.
+        is_tested: whether the null hypothesis was tested, or is among the rivals; if not, only evidence beyond
+            doubt counts.
         refined: the surprise of the pose refined there, less what was tried for it, -inf if there is none; None if
             it was not tried, or says nothing.
     """
@@ -61,7 +61,7 @@ class Evidence:
     height_chi_square: float | None = None
     null: float = 0.0
     elsewhere: float = 0.0
-    is_tested: bool = True
+    is_tested: bool = False
     refined: float | None = None
 
     @property
@@ -85,9 +85,13 @@ class Evidence:
             return -math.inf
         return self.refined * (1.0 - self.chance / self.surprise) - math.log(self.tried)
 
+    def promises(self, risk: float) -> bool:
+        """Whether it suffices unless the null hypothesis, if that is not tested yet, does as well."""
+        return self.nats >= needed_nats(risk)
+
     def suffices(self, risk: float) -> bool:
         """Whether a fix may be handed out: it is wrong with at most this probability."""
-        return self.is_tested and self.nats >= needed_nats(risk)
+        return self.promises(risk) and (self.is_tested or is_beyond_doubt(self.nats, risk))
 
 
 def independent_places(positions: float) -> float:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from engine.geo import attitude_from_rotation
 from engine.maps.landmarks import LandmarkMap
-from engine.matching.agreement import agree_in_place
 from engine.matching.align import MIN_DOWN
 from engine.matching.candidates import PoseCandidate
 from engine.matching.covariance import tilt_covariance
@@ -82,20 +81,18 @@ class FeatureMatcher:
         best, matcher, hypothesis = max(found, key=lambda each: each[0].evidence.nats)
         if len(found) == 1 and is_beyond_doubt(best.evidence.nats, query.risk):
             return best
-        return matcher._null_tested(_against(best, [each for each, _, _ in found]), hypothesis)
+        return matcher._null_tested(best.against(each for each, _, _ in found), hypothesis)
 
     def find_at_once(self) -> PoseCandidate | NoFix:
         """The pose of a frame by its own telemetry, with no second attempt and no null hypothesis."""
-        found = self.query.refuse_flat(self.method) or self._find_with(next(self._attempts())[1])
-        return found if isinstance(found, NoFix) else found.untested(self.query.risk)
+        return self.query.refuse_flat(self.method) or self._find_with(next(self._attempts())[1])
 
     def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
         """The candidate compared with the mirrored frame under the same telemetry."""
         mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
         null = replace(self, query=mirrored)._find_with(hypothesis)
-        if isinstance(null, NoFix):
-            return found
-        return found.weighed(replace(found.evidence, null=null.evidence.surprise))
+        surprise = 0.0 if isinstance(null, NoFix) else null.evidence.surprise
+        return found.weighed(replace(found.evidence, null=surprise, is_tested=True))
 
     def _attempts(self) -> Iterator[tuple[FeatureMatcher, TelemetryHypothesis]]:
         """Hypotheses to try in turn: the telemetry, the same at the frame's full resolution, then wider ones."""
@@ -230,12 +227,6 @@ class FeatureMatcher:
         prior_chi_square = query.prior_chi_square(fix)
         evidence = Evidence(surprise, rival, tried, tried, prior_chi_square, height_chi_square)
         return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
-
-
-def _against(best: PoseCandidate, all_found: list[PoseCandidate]) -> PoseCandidate:
-    """The best candidate, with the evidence for any other place against it."""
-    others = [each.evidence.nats for each in all_found if not agree_in_place(each.fix, best.fix)]
-    return best.weighed(replace(best.evidence, elsewhere=max([0.0, *others])))
 
 
 def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:

@@ -63,9 +63,9 @@ def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Answer:
     return answer or query.refuse_late(method)
 
 
-def settled(query: Query, answer: Answer) -> Result:
+def settled(query: Query, answer: Candidate | Result) -> Result:
     """The fix of an accepted candidate, else the refusal that says why it is not accepted."""
-    if isinstance(answer, NoFix):
+    if not isinstance(answer, Candidate):
         return answer
     if answer.suffices(query.risk):
         return answer.fix

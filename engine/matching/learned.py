@@ -11,7 +11,7 @@ from engine.learned import KeypointMatcher, load_matcher
 from engine.maps.keypoints import KeypointMap
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import FeatureMatcher
-from engine.matching.ladder import SHARES, Answer, Rung, Works, climb, settled
+from engine.matching.ladder import SHARES, Answer, Rung, Works, climb
 from engine.matching.method import Method
 from engine.matching.point_finding import PointFinder
 from engine.matching.query import Query
@@ -19,7 +19,7 @@ from engine.matching.views import map_px_per_pixel
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.values import NoFix, Result, Window
+from engine.values import NoFix, Window
 
 METHOD = "learned"
 
@@ -52,10 +52,10 @@ class Learned(Method):
         """How many entries of each cache were created so far."""
         return {} if self.keypoints is None else {"keypoint tiles": self.keypoints.tiles.created}
 
-    def locate(self, query: Query) -> Result:
+    def locate(self, query: Query) -> Answer:
         """A fix on the finest level of the map that time allows."""
         works: Works = {(METHOD, share): query.gray.size * self._scale(query, share) ** 2 for share in SHARES}
-        return settled(query, climb(query, METHOD, [Rung(lambda _: works, partial(self._match, query))]))
+        return climb(query, METHOD, [Rung(lambda _: works, partial(self._match, query))])
 
     def _match(self, query: Query, answer: Answer | None, step: Hashable) -> Answer:
         assert isinstance(step, tuple)

@@ -18,6 +18,7 @@ from engine.matching import method_type
 from engine.matching.align import to_gray
 from engine.matching.covariance import options_on_map
 from engine.matching.explanation import Explanation
+from engine.matching.ladder import settled
 from engine.matching.method import Method
 from engine.matching.query import Query
 from engine.options import MatcherOptions
@@ -168,7 +169,7 @@ class SceneMatcher:
         if prior is None and not self.site.is_searchable:
             detail = f"the map of {self.site.size_km} is not searched as a whole; a start position is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method)
-        result = self._method.locate(query)
+        result = settled(query, self._method.locate(query))
         query.scheduler.note_answer()
         if isinstance(result, Fix) and not deadline.met:
             detail = "the answer came after the budget"

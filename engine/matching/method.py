@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
 
+from engine.matching.candidates import Candidate
 from engine.matching.explanation import Explanation
 from engine.matching.query import Query
 from engine.options import MatcherOptions
@@ -56,8 +57,8 @@ class Method(ABC):
         """
 
     @abstractmethod
-    def locate(self, query: Query) -> Result:
-        """The fix of one frame, or its refusal."""
+    def locate(self, query: Query) -> Candidate | Result:
+        """What one frame shows: a candidate, judged by its evidence, or a fix or refusal that is final."""
 
     @abstractmethod
     def explain(self, query: Query, window: Window) -> Explanation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable
 from dataclasses import replace
 from typing import TypeGuard
@@ -15,8 +16,9 @@ from engine.matching import hypothesis_search
 from engine.matching.agreement import agree_in_place, offset_between_m
 from engine.matching.candidates import PeakCandidate
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
+from engine.matching.evidence import Evidence
 from engine.matching.explanation import Explanation, explain_correlation
-from engine.matching.ladder import Answer, Rung, Works, climb, is_accepted, rehearse, settled
+from engine.matching.ladder import Answer, Rung, Works, climb, is_accepted, rehearse
 from engine.matching.method import Method
 from engine.matching.peak_evidence import candidate_of, early_stop, null_tested, places_in
 from engine.matching.query import Query
@@ -25,11 +27,11 @@ from engine.matching.structure import match_structure
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.values import Fix, NoFix, Prior, Reason, Result, Window
+from engine.values import Fix, NoFix, Prior, Reason, Window
 
 MAX_WINDOW_PX = WHOLE_LEVEL_PX
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
-_SEARCH, _STRUCTURE, _HYPOTHESES = "ncc search", "ncc structure", "ncc hypotheses"  # steps
+_SEARCH, _NULL, _STRUCTURE, _HYPOTHESES = "ncc search", "ncc null", "ncc structure", "ncc hypotheses"  # steps
 _AT_ONCE, _REFINEMENT = "refinement at once", "refinement"
 _SURROUNDINGS_SIGMA_M = 30.0  # of the window around a place found by a search, in which it must stand out
 
@@ -72,22 +74,24 @@ class Ncc(Method):
                 rehearse(each, rungs.refinement, answer)
                 if isinstance(answer, PeakCandidate) and self.can_refine(each):
                     rungs.refinement_of(answer).rehearse(answer.fix)
-        rehearse(query, _Rungs(self, query).structure, self._refused(query))
+        rungs = _Rungs(self, query)
+        rehearse(query, rungs.null, self._known(query, query.needed_nats))
+        rehearse(query, rungs.structure, self._known(query, 0.0))
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map, or headings and heights about the prior."""
         if query.prior is None:
             self.locate(query)
         else:
-            rehearse(query, _Rungs(self, query).search, self._refused(query))
+            rehearse(query, _Rungs(self, query).search, self._known(query, 0.0))
 
-    def _refused(self, query: Query) -> Answer:
-        """The frame's peak, without evidence."""
+    def _known(self, query: Query, nats: float) -> Answer:
+        """The frame's peak, with this evidence instead of its own."""
         found = self.find(query)
-        return found if isinstance(found, NoFix) else found.weighed(replace(found.evidence, surprise=0.0))
+        return found if isinstance(found, NoFix) else found.weighed(Evidence(nats, 0.0, math.e, 1.0, None))
 
-    def locate(self, query: Query, *, widely: bool = True) -> Result:
-        """The fix of a coarse peak whose pose the picture confirms, else of the finest level that time allows.
+    def locate(self, query: Query, *, widely: bool = True) -> Answer:
+        """The place of a coarse peak whose pose the picture confirms, else of the finest level that time allows.
 
         Args:
             query: the frame.
@@ -95,7 +99,7 @@ class Ncc(Method):
         """
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
-        return settled(query, climb(query, METHOD, _Rungs(self, query).all(widely=widely)))
+        return climb(query, METHOD, _Rungs(self, query).all(widely=widely))
 
     def works(self, query: Query) -> Works:
         """Correlation on each level, the frame's own first; or the search of the whole map."""
@@ -150,11 +154,14 @@ class Ncc(Method):
         if query.scheduler.deadline.remaining_ms < 0:
             detail = "the budget was spent before the peak was known"
             return query.refuse(Reason.LATE, detail, METHOD, window=window)
-        tried, searched = hypotheses * places_in(aligned, window), hypotheses > 1
-        found = candidate_of(correlator, aligned, peak, window, searched=searched, tried=tried)
-        if is_window:
-            return null_tested(correlator, found)
-        return found if searched else found.untested(query.risk)
+        tried, fitted = hypotheses * places_in(aligned, window), hypotheses > 1
+        return candidate_of(
+            correlator, aligned, peak, window, by_search=not is_window, is_fitted=fitted, tried=tried
+        )
+
+    def null_tested(self, query: Query, found: PeakCandidate) -> PeakCandidate:
+        """The candidate with what chance reaches in its window."""
+        return null_tested(self._correlator(query), found)
 
     def match_structure(self, query: Query, found: PeakCandidate) -> PeakCandidate | None:
         """The highest peak by structure as well, see :mod:`engine.matching.structure`.
@@ -171,7 +178,7 @@ class Ncc(Method):
 
     def surroundings(self, query: Query, found: PeakCandidate) -> Window:
         """The window to match structure in: the first one's; after a search, the surroundings of the place."""
-        if found.evidence.is_tested:
+        if not found.by_search:
             return found.fix.window
         place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
         return self._correlator(replace(query, prior=place)).window(found.aligned) or found.fix.window
@@ -208,15 +215,20 @@ class _Rungs:
         self._works, self._frame_px = ncc.works(query), float(query.gray.size)
         self.coarsest = Rung(self._if_coarse_suffices, self._search_coarsely)
         self.at_once = Rung(self._if_coarse, self._refine_at_once)
+        self.null = Rung(self._if_untested, self._test_null)
         self.levels = Rung(self._finer, self._correlate)
+        self.refinement = Rung(self._if_unrefined, self._refine)
         self.structure = Rung(self._if_unseen, self._match_structure)
-        self.refinement = Rung(self._if_refinable, self._refine)
         self.search = Rung(self._if_refused, self._search)
 
     def all(self, *, widely: bool) -> list[Rung]:
-        """In their order; ``widely`` is that of :meth:`Ncc.locate`."""
-        wide = [self.search, self.refinement] if widely else []
-        return [self.coarsest, self.at_once, self.levels, self.structure, self.refinement, *wide]
+        """In their order; ``widely`` is that of :meth:`Ncc.locate`.
+
+        A null hypothesis is tested if refinement leaves doubt: the pose is stronger evidence, and cheaper.
+        """
+        coarse = [self.coarsest, self.at_once, self.null]
+        fine = [self.levels, self.refinement, self.null, self.structure, self.refinement, self.null]
+        return [*coarse, *fine, *([self.search, self.refinement] if widely else [])]
 
     def _if_coarse_suffices(self, answer: Answer | None) -> Works:
         """The coarsest level, if refinement may start from its peak and there is time for both.
@@ -233,9 +245,9 @@ class _Rungs:
         return {coarsest: work}
 
     def _search_coarsely(self, answer: Answer | None, step: Hashable) -> Answer | None:
-        """The peak of the coarsest level, if it is accepted; a refusal says nothing, as finer levels show more."""
+        """The peak of the coarsest level, if it promises a fix; else it says nothing: finer levels show more."""
         found = self._find(step)
-        return found if is_accepted(found, self._query) else None
+        return found if self._is_promising(found) else None
 
     def _if_coarse(self, answer: Answer | None) -> Works:
         return {_AT_ONCE: self._frame_px} if self._is_coarse(answer) else {}
@@ -243,12 +255,23 @@ class _Rungs:
     def _refine_at_once(self, answer: Answer | None, step: Hashable) -> Answer:
         """The pose of a coarse peak refined, or the peak with a tilt that nothing confirmed."""
         assert isinstance(answer, PeakCandidate)  # or it was not offered
-        refined = self.refinement_of(answer).refine_at_once(answer.fix)
-        return replace(answer, fix=refined or with_unconfirmed_tilt(self._query, answer.fix))
+        refined = self.refinement_of(answer).refine_at_once(answer)
+        return refined or replace(answer, fix=with_unconfirmed_tilt(self._query, answer.fix))
+
+    def _if_untested(self, answer: Answer | None) -> Works:
+        """A peak of one window that suffices unless chance does as well there."""
+        if not self._is_promising(answer) or is_accepted(answer, self._query) or answer.by_search:
+            return {}
+        return {_NULL: answer.aligned.work_px(answer.fix.window)}
+
+    def _test_null(self, answer: Answer | None, step: Hashable) -> Answer | None:
+        """The peak, compared with what chance reaches."""
+        assert isinstance(answer, PeakCandidate)  # or it was not offered
+        return self._ncc.null_tested(self._query, answer)
 
     def _finer(self, answer: Answer | None) -> Works:
-        """Levels that are finer than the answer, the finest first; one of them is correlated."""
-        if answer is None:
+        """Levels that are finer than the answer, the finest first; all if there is none that promises a fix."""
+        if not self._is_promising(answer):
             return self._works
         # Beside a coarse fix a finer level that does not fit is not missed, so its cost shall not fade.
         *finer, _ = self._works.items()
@@ -280,14 +303,13 @@ class _Rungs:
         """Structure where the refused peak lies; it sees what grey levels see, and more: its peak counts."""
         assert isinstance(answer, PeakCandidate)  # or it was not offered
         found = self._ncc.match_structure(self._query, answer)
-        return None if answer.searched and not is_accepted(found, self._query) else found
+        return None if answer.is_fitted and not is_accepted(found, self._query) else found
 
-    def _if_refinable(self, answer: Answer | None) -> Works:
-        """The pose of a fine peak, or of a refused one, of which it is stronger evidence."""
+    def _if_unrefined(self, answer: Answer | None) -> Works:
+        """The pose of a peak, of which it is stronger evidence."""
         if not isinstance(answer, PeakCandidate) or answer.by_refinement or not self._ncc.can_refine(self._query):
             return {}
-        accepted = answer.suffices(self._query.risk)
-        offered = answer.fix.stage == "fine" if accepted else answer.is_inside and answer.evidence.is_tested
+        offered = answer.is_possible and (answer.fix.stage == "fine" or self._is_refused(answer))
         return {_REFINEMENT: self._frame_px} if offered else {}
 
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer:
@@ -310,9 +332,11 @@ class _Rungs:
         return again if is_accepted(again, self._query) else None
 
     def _is_coarse(self, answer: Answer | None) -> TypeGuard[PeakCandidate]:
-        """Whether the answer is a fix at reduced resolution."""
-        is_peak = isinstance(answer, PeakCandidate) and answer.fix.stage == "coarse"
-        return is_peak and is_accepted(answer, self._query)
+        """Whether the answer is at reduced resolution, and promises a fix."""
+        return self._is_promising(answer) and answer.fix.stage == "coarse"
+
+    def _is_promising(self, answer: Answer | None) -> TypeGuard[PeakCandidate]:
+        return isinstance(answer, PeakCandidate) and answer.promises(self._query.risk)
 
     def _is_refused(self, answer: Answer | None) -> TypeGuard[PeakCandidate]:
         return isinstance(answer, PeakCandidate) and not answer.suffices(self._query.risk)
@@ -325,7 +349,7 @@ class _Rungs:
 
     def refinement_of(self, found: PeakCandidate) -> Refinement:
         """Of the frame, with the heading and height of a candidate that a search fitted."""
-        query = self._query.at(found.aligned.pose) if found.searched else self._query
+        query = self._query.at(found.aligned.pose) if found.is_fitted else self._query
         return Refinement(query, self._ncc.samples, self._ncc.options)
 
     def _is_same(self, coarse: Fix, fine: Fix) -> bool:

@@ -46,10 +46,10 @@ def candidate_of(
     peak: Peak,
     window: Window,
     *,
-    searched: bool = False,
+    by_search: bool = False,
+    is_fitted: bool = False,
     tried: float = 0.0,
     sigma: float | None = None,
-    is_tested: bool = False,
 ) -> PeakCandidate:
     """The candidate that a peak gives.
 
@@ -58,20 +58,20 @@ def candidate_of(
         aligned: the hypothesis.
         peak: in pixels of its level.
         window: in which its rival is the best.
-        searched: whether heading and height were fitted to the picture.
+        by_search: whether it is the best of more than this window at one heading and height.
+        is_fitted: whether heading and height were fitted to the picture.
         tried: places, times headings and heights, among which it is the best, if more than the window's.
         sigma: standard deviation of a chance score, if measured.
-        is_tested: whether the null hypothesis is among its rivals, or would change nothing.
     """
     query, (rows, columns) = correlator.query, aligned.template.shape
-    fix = fix_of(correlator, aligned, peak, window, searched=searched)
+    fix = fix_of(correlator, aligned, peak, window, is_fitted=is_fitted)
     sigma = score_sigma(rows * columns) if sigma is None else sigma
     measured = places_in(aligned, window)
     surprise, rival = surprise_of(peak.score, sigma), surprise_of(peak.second_score, sigma)
     off = query.prior_chi_square(fix)
-    evidence = Evidence(surprise, rival, measured, max(tried, measured), off, is_tested=is_tested)
+    evidence = Evidence(surprise, rival, measured, max(tried, measured), off)
     fix = replace(fix, confidence=probability(evidence.nats))
-    return PeakCandidate(fix, evidence, peak, aligned, searched)
+    return PeakCandidate(fix, evidence, peak, aligned, by_search, is_fitted)
 
 
 def places_in(aligned: Aligned, window: Window) -> float:
@@ -83,42 +83,19 @@ def places_in(aligned: Aligned, window: Window) -> float:
 
 
 def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
-    """The candidate; unless beyond doubt, compared with its frame upside down and mirrored."""
-    query, peak, aligned, window = correlator.query, found.peak, found.aligned, found.fix.window
-    evidence = replace(found.evidence, is_tested=True)
-    if is_beyond_doubt(evidence.nats, query.risk):
-        return found.weighed(evidence)
-    matters = evidence.nats >= query.needed_nats
-    null_score = _null_score(correlator, aligned, window, peak.second_score, matters=matters)
-    return found.weighed(replace(evidence, null=surprise_of(null_score, score_sigma(aligned.template.size))))
-
-
-def _null_score(
-    correlator: Correlator, aligned: Aligned, window: Window, rival_score: float, *, matters: bool
-) -> float:
-    """The best score of the null-hypothesis templates: what chance reaches in this window.
-
-    Args:
-        correlator: of the frame.
-        aligned: the hypothesis.
-        window: that was searched.
-        rival_score: score of the peak's best rival; certainly lower scores are ignored.
-        matters: whether the peak is accepted without it; if not, the best score of an early stop suffices.
-    """
-    options, best = correlator.options, -1.0
-    quick = EarlyStop(
-        is_clear=lambda peak: max(peak.score, peak.second_score) <= rival_score,
-        is_hopeless=lambda _: not matters,
-    )
+    """The candidate compared with its frame upside down and mirrored, which show what chance reaches."""
+    options, aligned, rival_score, best = correlator.options, found.aligned, found.peak.second_score, -1.0
+    quick = EarlyStop(lambda peak: max(peak.score, peak.second_score) <= rival_score, lambda _: False)
     for patch in correlator.nowhere(aligned):
         enhanced = enhance(patch, radius_px=options.enhance_radius_px, score=options.score)
-        rival = correlator.search(replace(aligned, template=enhanced), window, quick)
+        rival = correlator.search(replace(aligned, template=enhanced), found.fix.window, quick)
         best = best if rival is None else max(best, rival.score)
-    return best
+    null = surprise_of(best, score_sigma(aligned.template.size))
+    return found.weighed(replace(found.evidence, null=null, is_tested=True))
 
 
-def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window, *, searched: bool) -> Fix:
-    """The camera's nadir and its covariance; also the heading if it was searched."""
+def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window, *, is_fitted: bool) -> Fix:
+    """The camera's nadir and its covariance; also the heading if it was fitted."""
     query, pose = correlator.query, aligned.pose
     is_coarse = aligned.level > query.level_of(query.telemetry.known_height_m)
     errors = query.errors(correlator.options.errors)
@@ -132,7 +109,7 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
         covariance,
         score=peak.score,
         window=window,
-        grid_attitude=pose.grid_attitude if searched else None,
+        grid_attitude=pose.grid_attitude if is_fitted else None,
         map_sigma_m=errors.map_m,
         stage="coarse" if is_coarse else "fine",
     )

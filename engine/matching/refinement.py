@@ -89,14 +89,14 @@ class Refinement:
         query: the frame, with height and heading.
         samples: of the map.
         options: of the correlation.
-        knows_tilt: whether to trust the roll and pitch that came with the frame, or only to start from them.
+        doubts_tilt: whether the roll and pitch that came with the frame are only a start.
         pictures: the frame enhanced so far, by level.
     """
 
     query: Query
     samples: SampleMap
     options: NccOptions
-    knows_tilt: bool = True
+    doubts_tilt: bool = False
     pictures: dict[int, EnhancedFrame] = field(default_factory=dict, repr=False, compare=False)
 
     def refine(self, found: PeakCandidate) -> PeakCandidate | NoFix:
@@ -117,7 +117,7 @@ class Refinement:
         if best is not None and (is_clear or not has_tilt or best is not own):
             return best
         best = best or self._unrefined(found)
-        if not best.suffices(query.risk):
+        if not best.promises(query.risk):
             return best
         if has_tilt:
             return self._unconfirmed(best)
@@ -163,7 +163,7 @@ class Refinement:
         That is so of oblique frames, of an unknown attitude and over unknown relief.
         """
         query = self.query
-        says = self._knows_tilt and query.site.has_surface and found.suffices(query.risk)
+        says = self._knows_tilt and query.site.has_surface and found.promises(query.risk)
         if not says or is_oblique(query, query.telemetry.known_attitude):
             return found
         return found.weighed(replace(found.evidence, refined=-math.inf))
@@ -197,10 +197,14 @@ class Refinement:
         detail = f"the picture does not confirm the attitude, and {against}"
         return fix.refused(Reason.BAD_POSE, detail)
 
-    def refine_at_once(self, fix: Fix) -> Fix | None:
-        """The fix refined on the frame's own level; None if the picture does not confirm it."""
-        refined = self._refined(fix, self._prior(fix), 0)
-        return refined.fix if refined is not None and refined.is_clear else None
+    def refine_at_once(self, found: PeakCandidate) -> PeakCandidate | None:
+        """The candidate refined on the frame's own level; None if the picture does not confirm it."""
+        refined = self._refined(found.fix, self._prior(found.fix), 0)
+        if refined is None or not refined.is_clear:
+            return None
+        if found.suffices(self.query.risk):
+            return replace(found, fix=refined.fix)
+        return self._weighed(found, refined)
 
     def refine_pose(self, fix: Fix) -> Refined | None:
         """The pose refined from a level that suits the tilt, then from its neighbours, until it is clear."""
@@ -223,7 +227,7 @@ class Refinement:
         frame, sigma_deg = self.query.frame, self.options.errors.unknown_tilt_deg
         heading_sigma_deg = max(frame.heading_sigma_deg or 0.0, sigma_deg)
         frame = replace(frame, tilt_sigma_deg=sigma_deg, heading_sigma_deg=heading_sigma_deg)
-        return replace(self, query=replace(self.query, frame=frame), knows_tilt=False)
+        return replace(self, query=replace(self.query, frame=frame), doubts_tilt=True)
 
     def _refined(self, fix: Fix, prior: GaussianPrior, coarser: int) -> Refined | None:
         """The fix with its pose refined from a coarser level on; None if that failed or led elsewhere."""
@@ -255,7 +259,7 @@ class Refinement:
         turns_rad2 = pose_covariance[3:6, 3:6] + tilt_covariance(fit.pose.rotation, tilt_rad)
         moved = (fit.pose.center_m - prior.pose.center_m)[:2]
         allowed_m2 = fix.relative_covariance_m2 + covariance[:2, :2]
-        if not self.knows_tilt:  # which displaced the peak
+        if self.doubts_tilt:  # which displaced the peak
             allowed_m2 += (height_m * math.radians(errors.tilt_deg)) ** 2 * np.eye(2)
         if not are_consistent(moved, allowed_m2):
             return None
@@ -264,7 +268,7 @@ class Refinement:
 
     @property
     def _knows_tilt(self) -> bool:
-        return self.knows_tilt and self.query.telemetry.has_tilt
+        return self.query.telemetry.has_tilt and not self.doubts_tilt
 
     @property
     def _tilt_deg(self) -> float:

@@ -11,7 +11,7 @@ from engine.matching.candidates import PoseCandidate
 from engine.matching.evidence import is_beyond_doubt
 from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import METHOD, FeatureMatcher
-from engine.matching.ladder import SHARES, Answer, Rung, Works, climb, is_accepted, rehearse, settled
+from engine.matching.ladder import SHARES, Answer, Rung, Works, climb, is_accepted, rehearse
 from engine.matching.method import Method
 from engine.matching.pose import MIN_INLIERS
 from engine.matching.query import Query
@@ -20,7 +20,7 @@ from engine.matching.views import coarser_scale, drawn_px
 from engine.options import MatcherOptions, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import CPU, Device
-from engine.values import Fix, NoFix, Result, Window
+from engine.values import Fix, NoFix, Window
 
 _FEW_SHARE = 0.5  # of the keypoints, if a pose is refined from few
 _FEW, _REFINEMENT = "sift by few features", "refinement of sift"  # steps
@@ -91,8 +91,8 @@ class Sift(Method):
         if query.prior is None:
             self.locate(query)
 
-    def locate(self, query: Query, agrees: Callable[[Fix], bool] | None = None) -> Result:
-        """A refined fix by few features, else one by all at the highest resolution that time allows.
+    def locate(self, query: Query, agrees: Callable[[Fix], bool] | None = None) -> Answer:
+        """A refined pose by few features, else one by all at the highest resolution that time allows.
 
         Few features take a fifth of the time, and refinement restores the accuracy that their pose lacks.
 
@@ -104,7 +104,7 @@ class Sift(Method):
         answer = climb(query, METHOD, _Rungs(self, query, agrees).in_order)
         if isinstance(answer, PoseCandidate) and answer.is_quick:  # it follows the telemetry's attitude
             answer = replace(answer, fix=with_unconfirmed_tilt(query, answer.fix)).coarse()
-        return settled(query, answer)
+        return answer
 
     def few_options(self, query: Query) -> SiftOptions | None:
         """Of few features, at their scale; None if they are not wanted or the map has no such level."""

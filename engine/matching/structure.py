@@ -50,18 +50,18 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
         return None
     peak = find_peak(scores[0], exclusion_px=correlator.exclusion_px(aligned.level))
     rival = max(peak.second_score, float(chance.max()))
-    if not found.evidence.is_tested and found.peak.score > 0.0:  # only the search knows the rest of the map
+    if found.by_search and found.peak.score > 0.0:  # only the search knows the rest of the map
         rival = max(rival, found.peak.second_score / found.peak.score * peak.score)
     own = candidate_of(
         correlator,
         aligned,
         replace(peak, x=peak.x + crop.x0, y=peak.y + crop.y0, second_score=rival),
         window,
-        searched=found.searched,
+        is_fitted=found.is_fitted,
         tried=found.evidence.tried,
         sigma=max(float(chance.std(dtype=np.float64)), 1e-3),
-        is_tested=True,
     )
+    own = own.weighed(replace(own.evidence, is_tested=True))
     return replace(own, by_structure=True, fix=replace(own.fix, window=found.fix.window))
 
 

@@ -18,7 +18,7 @@ MEANINGS = {
     Reason.LOW_SCORE: "The best match may be chance: the frame may not show this part of the map.",
     Reason.TOO_FEW_MATCHES: "Fewer features were matched than a pose requires.",
     Reason.BAD_POSE: "No pose explains enough of the matches, or only one that is implausible for a drone.",
-    Reason.INCONSISTENT: "Two methods, or the match and a well-known prediction, contradict each other.",
+    Reason.INCONSISTENT: "The match and a well-known prediction contradict each other.",
     Reason.UNCONFIRMED: "Only the match itself supports the position, and too few other fixes agree yet.",
     Reason.NO_HEIGHT: "The telemetry gives no height above the ground, which sets the scale of a frame.",
     Reason.NO_HEADING: "The telemetry gives no heading, without which a frame cannot be rotated.",

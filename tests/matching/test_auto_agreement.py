@@ -1,38 +1,68 @@
-"""Where NCC and SIFT differ: at one place SIFT's pose is taken and made vaguer, at two places nothing is."""
+"""Where NCC and SIFT differ: of one place SIFT's pose is taken and made vaguer, of two the more evident one."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from engine import SceneMatcher
+from engine.matching.evidence import Evidence, probability
 from engine.matching.ncc import Ncc
 from engine.matching.sift import Sift
-from engine.values import Reason
+from engine.values import Fix, NoFix, Reason
 
 
-@pytest.mark.parametrize(("off_m", "same_place"), [(4.0, True), (25.0, False)])
-def test_a_small_difference_widens_the_covariance_and_a_large_one_refuses(
-    site, camera, frame, prior, monkeypatch, off_m, same_place
-):
-    own, compared = Ncc.locate, Sift.locate
-    seen = []
-    monkeypatch.setattr(Sift, "locate", lambda self, *args: seen.append(compared(self, *args)) or seen[-1])
+@pytest.fixture
+def told(site, camera, frame, prior, monkeypatch):
+    """The answer of auto if NCC's fix is this far off, by the evidence for each; and SIFT's fix."""
 
-    def off(self, query, *args, **kwargs):
-        fix = own(self, query, *args, **kwargs)
-        off = {"east_m": fix.east_m + off_m, "covariance_m2": 0.01 * np.eye(3), "map_sigma_m": 0.0}
-        return replace(fix, stage="fine", **off)
+    def answer(off_m, ncc_nats, sift_nats):
+        by_ncc, by_sift, seen = Ncc.locate, Sift.locate, []
 
-    monkeypatch.setattr(Ncc, "locate", off)
-    result = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)
-    if same_place:
-        (sift,) = seen
-        assert (result.east_m, result.north_m) == (sift.east_m, sift.north_m)
-        assert result.covariance_m2[0, 0] > sift.covariance_m2[0, 0] + 0.8 * off_m**2
-    else:
-        assert result.reason is Reason.INCONSISTENT
-        assert "m apart" in result.detail
+        def off(self, query, *args, **kwargs):
+            found = by_ncc(self, query, *args, **kwargs)
+            moved = {"east_m": found.fix.east_m + off_m, "covariance_m2": 0.01 * np.eye(3), "map_sigma_m": 0.0}
+            return weighed(replace(found, fix=replace(found.fix, stage="fine", **moved)), ncc_nats)
+
+        def noted(self, query, *args):
+            seen.append(weighed(by_sift(self, query, *args), sift_nats))
+            return seen[-1]
+
+        monkeypatch.setattr(Ncc, "locate", off)
+        monkeypatch.setattr(Sift, "locate", noted)
+        return SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior), seen[0].fix
+
+    return answer
+
+
+def weighed(found, nats):
+    return found.weighed(Evidence(nats, 0.0, math.e, 1.0, None, is_tested=True))
+
+
+def test_a_small_difference_widens_the_covariance(told):
+    result, sift = told(4.0, ncc_nats=30.0, sift_nats=30.0)
+    assert (result.east_m, result.north_m) == (sift.east_m, sift.north_m)
+    assert result.covariance_m2[0, 0] > sift.covariance_m2[0, 0] + 0.8 * 4.0**2
+
+
+@pytest.mark.parametrize(
+    ("ncc_nats", "sift_nats", "wins"), [(10.0, 30.0, "sift"), (30.0, 10.0, "ncc"), (8.0, 30.0, "sift")]
+)
+def test_of_two_places_the_far_more_evident_one_is_the_answer(told, ncc_nats, sift_nats, wins):
+    result, sift = told(25.0, ncc_nats=ncc_nats, sift_nats=sift_nats)
+    assert isinstance(result, Fix)
+    assert result.method == wins
+    assert ((result.east_m, result.north_m) == (sift.east_m, sift.north_m)) == (wins == "sift")
+    assert result.confidence == pytest.approx(probability(abs(ncc_nats - sift_nats)), rel=1e-9)
+
+
+@pytest.mark.parametrize("sift_nats", [22.0, 30.0, 38.0])
+def test_two_places_that_are_about_as_evident_refuse(told, sift_nats):
+    result, _ = told(25.0, ncc_nats=30.0, sift_nats=sift_nats)
+    assert isinstance(result, NoFix)
+    assert result.reason is Reason.AMBIGUOUS
+    assert "evidence for another place" in result.detail
 
 
 def test_few_features_that_disagree_are_not_the_second_opinion(site, camera, frame, prior, monkeypatch):

@@ -66,7 +66,7 @@ def test_a_probability_tells_its_evidence(nats):
 
 @given(st.floats(1e-12, 0.5), st.floats(0, 300), known, known)
 def test_what_is_handed_out_is_wrong_with_no_more_than_the_risk(risk, surprise, prior, height):
-    evidence = Evidence(surprise, 0.0, 1000.0, 1000.0, prior, height)
+    evidence = Evidence(surprise, 0.0, 1000.0, 1000.0, prior, height, is_tested=True)
     handed_out = evidence.suffices(risk)
     assert handed_out == (evidence.nats >= needed_nats(risk))
     if handed_out and evidence.nats < 30.0:
@@ -84,15 +84,22 @@ def test_a_refusal_of_a_pose_tells_its_figures():
     assert "chi-square 3.2" in pose.weighed(replace(weak, prior_chi_square=3.2)).refusal(1e-4)[1]
 
 
+@given(st.floats(1e-12, 0.1), st.floats(0, 300))
+def test_without_the_null_hypothesis_only_evidence_beyond_doubt_is_handed_out(risk, surprise):
+    untested = Evidence(surprise, 0.0, 1000.0, 1000.0, None)
+    assert untested.promises(risk) == replace(untested, is_tested=True).suffices(risk)
+    assert untested.suffices(risk) == (untested.nats >= 3.0 * needed_nats(risk))
+
+
 def test_a_pose_that_there_was_no_time_to_test_is_late():
-    untested = PoseCandidate(a_fix(), Evidence(32.0, 0.0, 1000.0, 1000.0, None)).untested(1e-4)
-    assert untested.evidence.nats >= needed_nats(1e-4)
+    untested = PoseCandidate(a_fix(), Evidence(32.0, 0.0, 1000.0, 1000.0, None))
+    assert untested.promises(1e-4)
     assert untested.refusal(1e-4)[0] is Reason.LATE
 
 
 # ------------------------------------------------------------------------------------------------------- peaks
 
-PEAK = Evidence(32.0, 10.0, 1000.0, 1000.0, 2.0)
+PEAK = Evidence(32.0, 10.0, 1000.0, 1000.0, 2.0, is_tested=True)
 
 
 def a_peak(evidence):
@@ -161,9 +168,10 @@ def test_a_peak_is_believed_if_the_risk_allows_it(evidence, risk, reason):
 
 
 def test_what_a_search_fitted_waits_for_the_structure_about_the_place():
-    searched = a_peak(replace(PEAK, surprise=1250.0, is_tested=False))
+    searched = replace(a_peak(replace(PEAK, surprise=1250.0)), by_search=True, is_fitted=True)
     assert not searched.suffices(1e-4)
     assert searched.refusal(1e-4)[0] is Reason.UNCONFIRMED
+    assert replace(searched, by_structure=True).suffices(1e-4)
 
 
 def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_refused():

@@ -67,10 +67,10 @@ def test_a_pose_that_is_hardly_confirmed_gives_way_to_one_that_is(ground, site, 
     """And stands, unconfirmed, where the doubt leads nowhere, or there is no time for it (None)."""
 
     def refine_pose(self, fix):
-        if not self.knows_tilt and knows_better is None:
+        if self.doubts_tilt and knows_better is None:
             raise OutOfTime
         better, hardly = refined(fix, 0.9), refined(fix, 0.3)
-        return hardly if self.knows_tilt else better if knows_better else None
+        return (better if knows_better else None) if self.doubts_tilt else hardly
 
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
     monkeypatch.setattr(Refinement, "refine_pose", refine_pose)
@@ -122,7 +122,7 @@ def weakened(nats):
         if widely or coarser:
             return query.refuse(Reason.LOW_SCORE, "not looked for", "ncc")
         found = find(self, query)
-        return found.weighed(Evidence(nats + math.log(1000.0), 0.0, 1000.0, 1000.0, None))
+        return found.weighed(Evidence(nats + math.log(1000.0), 0.0, 1000.0, 1000.0, None, is_tested=True))
 
     return weak
 
@@ -138,5 +138,6 @@ def test_a_refined_pose_does_not_stand_for_the_structure_that_a_search_must_show
     monkeypatch.setattr(Evidence, "nats", 20.0)
     monkeypatch.setattr(Ncc, "match_structure", lambda *_: None)
     monkeypatch.setattr(Refinement, "refine_pose", lambda _, fix: refined(fix, 0.9))
+    monkeypatch.setattr(Refinement, "surprise_of", lambda *_: 50.0)
     frame = ground.frame(camera, NADIR, 150.0, **TRUE)
     assert SceneMatcher(site, camera, "ncc", "cpu").locate(frame).reason is Reason.UNCONFIRMED
