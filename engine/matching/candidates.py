@@ -93,6 +93,7 @@ class PeakCandidate(Candidate):
         is_fitted: whether heading and height were fitted to the picture, which maximises its score.
         by_structure: whether structure was matched as well as grey levels.
         by_refinement: whether refining its pose was tried.
+        is_contradicted: whether the picture should have confirmed the pose, and did not.
     """
 
     peak: Peak
@@ -101,6 +102,7 @@ class PeakCandidate(Candidate):
     is_fitted: bool = False
     by_structure: bool = False
     by_refinement: bool = False
+    is_contradicted: bool = False
 
     @property
     def is_inside(self) -> bool:
@@ -110,20 +112,20 @@ class PeakCandidate(Candidate):
     @property
     def is_possible(self) -> bool:
         """Whether its evidence counts: not a slope's, nor a fitted score until structure confirms the place."""
-        return self.is_inside and (self.by_structure or not self.is_fitted)
+        return self.is_inside and not self.is_contradicted and (self.by_structure or not self.is_fitted)
 
     def _refusal(self, risk: float) -> Refusal:
         evidence, score = self.evidence, self.peak.score
         if not self.is_inside:
             return Reason.AMBIGUOUS, f"NCC {score:.3f} still rises at the window's edge"
-        if evidence.refined == -math.inf:
-            return Reason.AMBIGUOUS, f"{self._wrong(risk)}: the pose cannot be refined there"
         sigmas, rival = (math.sqrt(2.0 * surprise) for surprise in (evidence.surprise, evidence.chance))
         if replace(evidence, rival=0.0, null=0.0, prior_chi_square=None).nats < needed_nats(risk):
             needed = math.sqrt(2.0 * (math.log(evidence.tried) + needed_nats(risk)))
             among = f"{needed:.1f} are needed among {evidence.tried:,.0f} places"
             return Reason.LOW_SCORE, f"best NCC {score:.3f}, {sigmas:.1f} sigmas may be chance: {among}"
         figures = f"NCC {sigmas:.1f} sigmas, rival at {rival:.1f}, {self._from_prior}"
+        if self.is_contradicted and evidence.promises(risk):
+            return Reason.BAD_POSE, f"the picture does not confirm roll and pitch there ({figures})"
         if evidence.promises(risk):
             confirmed = (
                 "confirmed by the structure about the place"

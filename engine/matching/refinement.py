@@ -100,12 +100,13 @@ class Refinement:
     pictures: dict[int, EnhancedFrame] = field(default_factory=dict, repr=False, compare=False)
 
     def refine(self, found: PeakCandidate) -> PeakCandidate | NoFix:
-        """The candidate with its whole pose refined and the evidence of that, or a less certain one, or a refusal.
+        """The candidate with its whole pose refined and the evidence of that, or one that the picture contradicts.
 
         If the picture hardly confirms the telemetry's attitude over a surface model, the pose is refined again as
-        if roll and pitch were hardly known, and the more probable pose counts. An attitude that the picture does
-        not confirm counts only if the position agrees with the prior. If roll and pitch are unknown, the picture
-        must determine them over a surface model. Without one, where relief may be the reason, the fix stays as is.
+        if roll and pitch were hardly known, and the more probable pose counts. If neither has evidence, a wrong
+        attitude is as probable as a right one: right poses can be refined in 98 of 100 frames, and attitudes are
+        right in 99 of 100. Without a surface model, or in an oblique frame, relief may be the reason: the fix
+        stays as it is, a known attitude's if the position agrees with the prior.
         """
         query, has_tilt, found = self.query, self.query.telemetry.has_tilt, replace(found, by_refinement=True)
         refined = self.refine_pose(found.fix)
@@ -114,17 +115,11 @@ class Refinement:
             return replace(found, fix=refined.fix)
         own = self._weighed(found, refined)
         best = self._or_doubted(found, own) if has_tilt and query.site.has_surface and not is_clear else own
-        if best is not None and (is_clear or not has_tilt or best is not own):
+        if best is not None:
             return best
-        best = best or self._unrefined(found)
-        if not best.promises(query.risk):
-            return best
-        if has_tilt:
-            return self._unconfirmed(best)
-        if not query.site.has_surface:
-            return best
-        detail = "roll and pitch are unknown, and the picture does not determine them"
-        return best.fix.refused(Reason.BAD_POSE, detail)
+        if query.site.has_surface and not is_oblique(query, query.telemetry.known_attitude):
+            return replace(found, is_contradicted=True)
+        return self._unconfirmed(found) if has_tilt and found.promises(query.risk) else found
 
     def _or_doubted(self, found: PeakCandidate, own: PeakCandidate | None) -> PeakCandidate | None:
         """The candidate refined by a known attitude, or as if that were hardly known; the more probable one."""
@@ -157,17 +152,6 @@ class Refinement:
             return None
         return replace(found, fix=refined.fix).weighed(evidence)
 
-    def _unrefined(self, found: PeakCandidate) -> PeakCandidate:
-        """A candidate whose pose cannot be refined: evidence against it, unless right ones often cannot be either.
-
-        That is so of oblique frames, of an unknown attitude and over unknown relief.
-        """
-        query = self.query
-        says = self._knows_tilt and query.site.has_surface and found.promises(query.risk)
-        if not says or is_oblique(query, query.telemetry.known_attitude):
-            return found
-        return found.weighed(replace(found.evidence, refined=-math.inf))
-
     def surprise_of(self, refined: Refined) -> float:
         """The surprise of a refined pose's correlation, by what the picture reaches about it; 0 if unknown."""
         query, pose = self.query, refined.pose
@@ -185,9 +169,9 @@ class Refinement:
         return surprise_of(refined.fix.score, float(chance.std()))
 
     def _unconfirmed(self, found: PeakCandidate) -> PeakCandidate | NoFix:
-        """A known attitude that the picture does not confirm, refined or not, if the prior agrees."""
+        """A known attitude that the picture does not confirm, if the prior agrees."""
         query, fix = self.query, found.fix
-        if query.site.has_surface and fix.stage != "refined":
+        if query.site.has_surface:
             fix = with_unconfirmed_tilt(query, fix)
         off = query.prior_chi_square(fix)
         agrees = off <= chi_square_of(CHANCE, 2) if off is not None else not query.site.has_surface

@@ -182,13 +182,18 @@ def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_refused():
     assert at_edge.refusal(1e-4) == (Reason.AMBIGUOUS, "NCC 0.900 still rises at the window's edge")
 
 
-def test_a_pose_that_can_be_refined_is_evidence_for_its_place_and_one_that_cannot_against_it():
-    right, unknown, wrong = (replace(PLAIN, refined=refined).nats for refined in (90.0, None, -math.inf))
-    assert right > unknown > wrong
-    assert math.exp(wrong - unknown) == pytest.approx(0.02)
+def test_of_a_peak_and_its_refined_pose_the_greater_evidence_counts():
+    strong, unknown, weak = (replace(PLAIN, refined=refined).nats for refined in (90.0, None, 9.0))
+    assert strong > unknown == weak
+
+
+def test_a_peak_whose_pose_the_picture_contradicts_is_refused_whatever_its_evidence():
+    certain = replace(a_peak(replace(PEAK, surprise=1250.0)), is_contradicted=True)
+    assert not certain.suffices(1e-4)
+    assert certain.refusal(1e-4)[0] is Reason.BAD_POSE
 
 
 @given(st.floats(7.0, 1e3))
 def test_a_refined_pose_is_no_evidence_against_a_rival_as_good_as_its_peak(surprise):
     alike = Evidence(surprise, surprise, 1000.0, 1000.0, None, refined=1e4)
-    assert alike.nats <= 0.0
+    assert alike.nats == pytest.approx(0.0, abs=1e-9)
