@@ -83,6 +83,11 @@ class Evidence:
             return -math.inf
         return self.refined * (1.0 - self.chance / self.surprise) - math.log(self.tried)
 
+    @property
+    def of_pose(self) -> float:
+        """The evidence for the refined pose alone: of its correlation, and of where it lies."""
+        return self.of_refinement + _of_position(self.prior_chi_square)
+
     def promises(self, risk: float) -> bool:
         """Whether it suffices unless the null hypothesis, if that is not tested yet, does as well."""
         return self.nats >= needed_nats(risk)

@@ -131,7 +131,7 @@ class Refinement:
                 raise
             return own
         both = [each for each in (own, other) if each is not None]
-        return max(both, key=lambda each: each.evidence.of_refinement, default=None)
+        return max(both, key=lambda each: each.evidence.of_pose, default=None)
 
     def _weighed(
         self, found: PeakCandidate, refined: Refined | None, log_prior: float = 0.0
@@ -148,7 +148,7 @@ class Refinement:
         tilts, off = 1 if self._knows_tilt else len(_TILTS) ** 2, self.query.prior_chi_square(refined.fix)
         surprise = self.surprise_of(refined) - math.log(tilts) + log_prior
         evidence = replace(found.evidence, refined=surprise, prior_chi_square=off)
-        if evidence.of_refinement < self.query.needed_nats:
+        if evidence.of_pose < self.query.needed_nats:
             return None
         return replace(found, fix=refined.fix).weighed(evidence)
 
