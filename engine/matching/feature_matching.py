@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from engine.features import Features, Matches, match, sift
 from engine.geo import wrap_heading_deg
 from engine.maps.landmarks import MIN_CONTRAST, LandmarkMap, Landmarks, as_picture
-from engine.maps.samples import ROUGH_REACH_PX
 from engine.matching.align import Orthophoto, orthorectify
 from engine.matching.pose import PoseStart
 from engine.matching.query import Query
@@ -34,7 +33,6 @@ if TYPE_CHECKING:  # it loads torch
 
 Array = NDArray[np.float64]
 
-_BLUNT_PX = 1.6  # scale at which a keypoint's position variance is twice a small one's
 MAX_KEYPOINTS = 1000
 """Of the largest orthophoto."""
 _MAP_DENSITY = 1.5  # landmarks per pixel over the frame's keypoints per pixel
@@ -51,7 +49,6 @@ class Matched:
         view: the part of the map.
         points_px: (M, 2) pixels of the frame.
         points_m: (M, 3) metres on the ground.
-        weights: (M,) relative inverse variances of the pixels.
         tolerance_px: largest reprojection distance in the frame at which a match agrees with a pose.
         start: the pose with the most votes; None if there was no vote.
         vote: the winning translation; None if there was no vote.
@@ -60,7 +57,6 @@ class Matched:
     view: MapView
     points_px: Array
     points_m: Array
-    weights: Array
     tolerance_px: float
     start: PoseStart | None = None
     vote: Vote | None = None
@@ -119,22 +115,20 @@ def _by_orthophoto(
     if photo is None:
         return None
     if isinstance(source, LandmarkMap):
-        photo_px, map_px, scale_px = _feature_pairs(query, source, photo, view, options)
+        photo_px, map_px = _feature_pairs(query, source, photo, view, options)
     else:
         photo_px, map_px = source.find(query, as_picture(photo.gray, query.device), photo.valid, view)
-        scale_px = np.zeros(len(photo_px))
     ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
-    weights = _weights(query.site, ground_m, scale_px)
     per_px = 2.0**view.level / map_px_per_pixel(query, height_m)  # frame pixels per pixel of the level
-    matched = Matched(view, photo.to_frame(photo_px), ground_m, weights, options.tolerance_px * max(per_px, 1.0))
+    matched = Matched(view, photo.to_frame(photo_px), ground_m, options.tolerance_px * max(per_px, 1.0))
     with query.scheduler.stage("vote"):
         return _voted(query, options, matched, photo, photo_px, map_px, attitude, height_m)
 
 
 def _feature_pairs(
     query: Query, landmarks: LandmarkMap, photo: Orthophoto, view: MapView, options: SiftOptions
-) -> tuple[Array, Array, Array]:
-    """Matched features: (M, 2) pixels of the orthophoto, (M, 2) of the level, and (M,) their scales."""
+) -> tuple[Array, Array]:
+    """Matched features: (M, 2) pixels of the orthophoto, and (M, 2) of the level."""
     with query.scheduler.stage("frame features"):
         shown_px = int(np.count_nonzero(photo.valid))
         keypoints = max(options.max_keypoints, min(round(shown_px * options.keypoints_per_px), MAX_KEYPOINTS))
@@ -153,15 +147,14 @@ def _feature_pairs(
         known = landmarks.find(view.crop, view.level, upright=True, per_px=per_px)
     with query.scheduler.stage("match"):
         found = match(features, known.features, ratio=_VOTE_RATIO, max_scale_factor=_MAX_SCALE_FACTOR)
-        photo_px, scale_px, index = _matched(features, found)
-        return photo_px.astype(np.float64), known.xy_px[index].astype(np.float64), scale_px
+        photo_px, index = _matched(features, found)
+        return photo_px.astype(np.float64), known.xy_px[index].astype(np.float64)
 
 
-def _matched(features: Features, found: Matches) -> tuple[NDArray[np.float32], Array, NDArray[np.int64]]:
-    """Accepted pairs: (M, 2) feature pixels, (M,) their scales, (M,) indices on the map."""
-    columns = (features.xy_px[0], features.scale_px[0], found.valid[0], found.train_index[0])
-    xy_px, scale_px, valid, index = map(on_host, columns)
-    return xy_px[valid], scale_px[valid].astype(np.float64), index[valid]
+def _matched(features: Features, found: Matches) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Accepted pairs: (M, 2) feature pixels, (M,) indices on the map."""
+    xy_px, valid, index = map(on_host, (features.xy_px[0], found.valid[0], found.train_index[0]))
+    return xy_px[valid], index[valid]
 
 
 def _voted(
@@ -241,10 +234,8 @@ def _by_frame(
                 scale=1.0 / view.pixel_ratio,
                 max_scale_factor=None if hypothesis.height_m is None else _MAX_SCALE_FACTOR,
             )
-            xy_px, scale_px, index = _matched(features, found)
-            points_px, points_m = reduced.full(xy_px), known.points_m[index]
-            weights = _weights(query.site, points_m, scale_px)
-            matched.append(Matched(view, points_px, points_m, weights, _frame_tolerance_px(options)))
+            xy_px, index = _matched(features, found)
+            matched.append(Matched(view, reduced.full(xy_px), known.points_m[index], _frame_tolerance_px(options)))
     return matched
 
 
@@ -255,8 +246,7 @@ def _by_reduced(query: Query, finder: PointFinder, options: SiftOptions, views: 
     for view in views:
         points_px, map_px = finder.find(query, reduced.picture, valid, view)
         ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
-        weights = _weights(query.site, ground_m, np.zeros(len(ground_m)))
-        matched.append(Matched(view, reduced.full(points_px), ground_m, weights, _frame_tolerance_px(options)))
+        matched.append(Matched(view, reduced.full(points_px), ground_m, _frame_tolerance_px(options)))
     return matched
 
 
@@ -285,9 +275,3 @@ def _map_features(
 def lifted(site: OrthoMap, map_px: Array) -> Array:
     """(N, 3) east, north and the height of the surface at pixels (N, 2) of the map."""
     return np.column_stack([site.enu_from_pixel(map_px), site.surface_at(map_px)])
-
-
-def _weights(site: OrthoMap, points_m: Array, scale_px: Array) -> Array:
-    """Weights (N,) of matches: large keypoints are less accurate, and on a rough surface heights vary."""
-    roughness = site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), ROUGH_REACH_PX)
-    return roughness / (1.0 + (scale_px / _BLUNT_PX) ** 2)

@@ -129,7 +129,6 @@ def solve_pose(
     camera_matrix: Array,
     options: PoseOptions | None = None,
     *,
-    weights: Array | None = None,
     prior: AttitudePrior | None = None,
     start: PoseStart | None = None,
 ) -> PoseStats | None:
@@ -140,7 +139,6 @@ def solve_pose(
         points_px: (N, 2) undistorted pixels (x, y).
         camera_matrix: (3, 3) pinhole intrinsics.
         options: Tolerances; the defaults suit frames of a few hundred pixels.
-        weights: (N,) relative inverse variances of the image points; None is 1 for all.
         prior: Attitude for the refinement, which separates tilt from displacement at a small field of view; it is
             dropped if markedly more matches agree without it.
         start: Start of the refinement; None searches for an initial pose.
@@ -154,12 +152,12 @@ def solve_pose(
         DtypeError: An array is not of real numbers.
     """
     options = options or PoseOptions()
-    points_m, points_px, K, weights = _checked(points_m, points_px, camera_matrix, weights)
-    known = np.flatnonzero(np.isfinite(points_m).all(1) & np.isfinite(points_px).all(1) & (weights > 0))
+    points_m, points_px, K = _checked(points_m, points_px, camera_matrix)
+    known = np.flatnonzero(np.isfinite(points_m).all(1) & np.isfinite(points_px).all(1))
     if len(known) < MIN_INLIERS or _spread(points_px[known].T) < options.min_spread_px:
         return None
     origin = points_m[known].mean(0)
-    problem = _problem((points_m[known] - origin).T, points_px[known].T, K, weights[known], options, prior)
+    problem = _problem((points_m[known] - origin).T, points_px[known].T, K, options, prior)
     fit = _fit(problem) if start is None else _fit_from(problem, start, origin)
     if fit is not None and prior is not None:
         problem, fit = _without_wrong_prior(problem, fit)
@@ -178,15 +176,12 @@ def solve_pose(
     return _stats(fit, origin, covariance, known, len(points_m), log10_nfa, log10_tried)
 
 
-def _problem(
-    points: Array, pixels: Array, K: Array, weights: Array, options: PoseOptions, prior: AttitudePrior | None
-) -> Problem:
+def _problem(points: Array, pixels: Array, K: Array, options: PoseOptions, prior: AttitudePrior | None) -> Problem:
     """The problem of points (3, N) about their mean and pixels (2, N)."""
     return Problem(
         points=points,
         pixels=pixels,
         K=K,
-        weights=weights,
         attitude=None if prior is None else prior.rotation,
         precision=np.zeros((3, 3)) if prior is None else prior.precision,
         tolerance_px=options.reprojection_px,
@@ -217,12 +212,11 @@ def _stats(
     )
 
 
-def _checked(points_m: Array, points_px: Array, camera_matrix: Array, weights: Array | None) -> tuple[Array, ...]:
+def _checked(points_m: Array, points_px: Array, camera_matrix: Array) -> tuple[Array, ...]:
     count = len(points_m)
-    weights = np.ones(count) if weights is None else weights
-    expected = {"points_m": (count, 3), "points_px": (count, 2), "camera_matrix": (3, 3), "weights": (count,)}
+    expected = {"points_m": (count, 3), "points_px": (count, 2), "camera_matrix": (3, 3)}
     out = []
-    for (name, shape), values in zip(expected.items(), (points_m, points_px, camera_matrix, weights), strict=True):
+    for (name, shape), values in zip(expected.items(), (points_m, points_px, camera_matrix), strict=True):
         array = np.asarray(values)
         if array.shape != shape:
             raise ShapeError(f"{name}: expected {shape}, got {array.shape}")
@@ -353,6 +347,6 @@ def _same(R: Array, other: Array) -> bool:
 
 def _cost(problem: Problem, R: Array, view: Reprojection, variance: float, options: PoseOptions) -> float:
     """Return chi-square of all matches, each bounded at the threshold, and of the prior."""
-    cost = float(problem.weights @ np.minimum(view.squared, options.reprojection_px**2)) / variance
+    cost = float(np.minimum(view.squared, options.reprojection_px**2).sum()) / variance
     turn = turn_from_attitude(problem, R)
     return cost + float(turn @ problem.precision @ turn)
