@@ -22,7 +22,7 @@ from engine.matching.pose import PoseStart
 from engine.matching.query import Query
 from engine.matching.relief import ground_relief
 from engine.matching.views import MapView, TelemetryHypothesis, map_px_per_pixel, slant_m
-from engine.matching.votes import Vote, similarity, vote
+from engine.matching.votes import Vote, rotation, vote
 from engine.options import PAPER_SCALE, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device, Picture, as_float, on_host, to_device
@@ -177,10 +177,10 @@ def _voted(
     found = vote(photo_px - middle, map_px, radius_px, distinct_px)
     if found is None:
         return matched
-    nadir = similarity(found.turn_deg, found.scale) @ (-photo.offset_px - middle) + found.shift_px
+    nadir = rotation(found.turn_deg) @ (-photo.offset_px - middle) + found.shift_px
     nadir_px = site.full_from_level(nadir, level)
     turned = replace(attitude, heading_deg=wrap_heading_deg(attitude.heading_deg + found.turn_deg))
-    up_m = site.ground_at(nadir_px) + height_m * found.scale
+    up_m = site.ground_at(nadir_px) + height_m
     start = PoseStart(
         query.camera.enu_from_camera(turned).T,
         np.array([*site.enu_from_pixel(nadir_px), up_m]),
