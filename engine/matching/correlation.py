@@ -32,7 +32,6 @@ _COARSER = (0, 1, 2)  # levels above the frame's own that may be matched if time
 MIN_SIDE_PX = 24
 """Least side of a template on a coarser level."""
 _EVERY_PLACE = "every place of a wide window"  # a step
-_GROUND_SHARE = 0.3  # of the height: the ground fitted by a plane, or the spread of the prior if that is wider
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,8 @@ class Correlator:
         Args:
             pose: the height and heading to align it by.
             level: of the pyramid.
-            nadir_px: (2,) where to look up its ground; None takes the prior's place, or level ground.
+            nadir_px: (2,) where to look up the ground of an oblique frame; None takes
+                the prior's place, or level ground.
         """
         query, options = self.query, self.options
         attitude, height = pose.known_attitude, pose.known_height_m
@@ -88,10 +88,6 @@ class Correlator:
         if is_oblique(query, attitude):
             return self._align_oblique(pose, level, nadir_px)
         view = view_of(query.camera, attitude, height, jacobian)
-        if view is not None:
-            slope = self._slope(view, height, level, nadir_px)
-            if slope.any():
-                view = view_of(query.camera, attitude, height, jacobian, slope) or view
         if view is None:
             return query.refuse_tilted(attitude, METHOD)
         rows, columns = query.site.level_shape(level)
@@ -129,16 +125,6 @@ class Correlator:
         view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))
         enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
         return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, enhanced)
-
-    def _slope(self, view: GroundView, height_m: float, level: int, nadir_px: Array | None) -> Array:
-        """Rise (2,) of the ground per pixel of the level, over a wider area if the prior is vaguer."""
-        query = self.query
-        reach_m, place = _GROUND_SHARE * height_m, nadir_px
-        if place is None and query.prior is not None:
-            reach_m, place = max(reach_m, SPREAD_SIGMAS * query.prior.sigma_m), query.prior_px
-        if place is None:
-            return np.zeros(2)
-        return query.site.ground_plane(place + view.center_px * 2.0**level, reach_m)[1] * 2.0**level
 
     def window(self, aligned: Aligned) -> Window | None:
         """The adaptive window in full-resolution map pixels; the whole map without a prior."""
