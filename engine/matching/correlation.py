@@ -82,7 +82,7 @@ class Correlator:
             nadir_px: (2,) where to look up the ground of an oblique frame; None takes
                 the prior's place, or level ground.
         """
-        query, options = self.query, self.options
+        query = self.query
         attitude, height = pose.known_attitude, pose.known_height_m
         jacobian = query.jacobian * 2.0**level
         if is_oblique(query, attitude):
@@ -97,7 +97,7 @@ class Correlator:
         if patch is None:
             detail = "the frame covers fewer than 8 x 8 pixels of the map"
             return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
-        enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
+        enhanced = enhance(patch.gray)
         return Aligned(pose, level, jacobian, view, patch, enhanced)
 
     def nowhere(self, aligned: Aligned) -> list[NDArray[np.uint8]]:
@@ -114,7 +114,7 @@ class Correlator:
 
     def _align_oblique(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
         """An oblique frame drawn over the ground's relief; its view is that of the correlated part."""
-        query, options = self.query, self.options
+        query = self.query
         attitude, height = pose.known_attitude, pose.known_height_m
         place = query.prior_px if nadir_px is None else nadir_px
         patch = oblique_patch(query, attitude, height, level, place)
@@ -123,7 +123,7 @@ class Correlator:
         size = np.array(patch.gray.shape[::-1], np.float64)
         extent = (float(size[0]), float(size[1]))
         view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))
-        enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
+        enhanced = enhance(patch.gray)
         return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, enhanced)
 
     def window(self, aligned: Aligned) -> Window | None:
@@ -197,9 +197,8 @@ class Correlator:
         return coarse_to_fine.peak(region.search, template, exclusion_px, min_overlap=MIN_VALID_SHARE, stop=stop)
 
     def _has_coarse_levels(self, region: Region) -> bool:
-        """Whether to score places at half resolution: on the CPU, if pixels are centred on 0 like nodata."""
-        on_cpu = isinstance(region.search.image, np.ndarray)
-        return on_cpu and not self.options.exhaustive and (region.valid is None or self.is_centred)
+        """Whether to score places at half resolution: on the CPU."""
+        return isinstance(region.search.image, np.ndarray) and not self.options.exhaustive
 
     def _of_every_place(self, region: Region, template: NDArray[np.float32], exclusion_px: float) -> Peak:
         if region.valid is not None:
@@ -210,11 +209,6 @@ class Correlator:
     def exclusion_px(self, level: int) -> float:
         """Distance within which a rival is the peak itself, in pixels of a level."""
         return self.options.exclusion_m / (self.query.site.gsd_m_per_px * 2.0**level)
-
-    @property
-    def is_centred(self) -> bool:
-        """Whether enhanced pixels are centred on 0, the value of nodata on a coarse level."""
-        return self.options.score != "grey" and self.options.enhance_radius_px > 0
 
     def surface(self, aligned: Aligned, window: Window) -> tuple[Picture, Array] | None:
         """The whole surface on which :meth:`search` finds its peak, for reports.

@@ -104,13 +104,13 @@ def _null_score(
         rival_score: score of the peak's best rival; certainly lower scores are ignored.
         matters: whether the peak is accepted without it; if not, the best score of an early stop suffices.
     """
-    options, best = correlator.options, -1.0
+    best = -1.0
     quick = EarlyStop(
         is_clear=lambda peak: max(peak.score, peak.second_score) <= rival_score,
         is_hopeless=lambda _: not matters,
     )
     for patch in correlator.nowhere(aligned):
-        enhanced = enhance(patch, radius_px=options.enhance_radius_px, score=options.score)
+        enhanced = enhance(patch)
         rival = correlator.search(replace(aligned, template=enhanced), window, quick)
         best = best if rival is None else max(best, rival.score)
     return best
