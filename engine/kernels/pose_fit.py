@@ -59,14 +59,15 @@ def reproject(points, pixels, matrix, rotation, center):
     return tangents, projected, squared
 
 
-@compiled("(f8[::1, :], f8[::1, :], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, i8, f8[:, ::1], f8[::1], f8)")
-def fit_pose(points, pixels, matrix, attitude, precision, tolerance_px, least, rotation, center, slack):
+@compiled("(f8[::1, :], f8[::1, :], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8, i8, f8[:, ::1], f8[::1], f8)")
+def fit_pose(points, pixels, matrix, weights, attitude, precision, tolerance_px, least, rotation, center, slack):
     """Gauss-Newton with Tukey's biweight; each step updates the inliers and their variance.
 
     Args:
         points: (3, N) of the map.
         pixels: (2, N) of the picture.
         matrix: (3, 3) pinhole.
+        weights: (N,) relative inverse variances.
         attitude: (3, 3) known rotation.
         precision: (3, 3) inverse covariance of its angles, 0 if unknown.
         tolerance_px: of an inlier.
@@ -84,7 +85,7 @@ def fit_pose(points, pixels, matrix, attitude, precision, tolerance_px, least, r
     variance, freedom, found = reach / 9.0, np.inf, True
     rotation, center = rotation.copy(), center.copy()
     delta, angles, covariance = np.empty(6), np.empty(3), np.empty((6, 6))
-    inliers, information = np.empty(pixels.shape[1], np.bool_), np.zeros((6, 6))
+    inliers, information = np.empty(weights.size, np.bool_), np.zeros((6, 6))
     tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
     count = _mark_within(squared, reach, inliers)
     for _ in range(MAX_STEPS):
@@ -93,7 +94,7 @@ def fit_pose(points, pixels, matrix, attitude, precision, tolerance_px, least, r
             break
         gain, noise = biweight_factors(0.5 * reach / variance)
         scale = noise * student(freedom) * variance
-        normal, gradient = normal_equations(tangents, projected, squared, pixels, matrix, reach, scale)
+        normal, gradient = normal_equations(tangents, projected, squared, pixels, matrix, weights, reach, scale)
         found = _invert(normal, precision, covariance)
         if not found:
             break
@@ -116,9 +117,9 @@ def fit_pose(points, pixels, matrix, attitude, precision, tolerance_px, least, r
         tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
         # The trace is the number of parameters that the matches determine; the prior determines the rest.
         freedom, mean = 2.0 * count - determined, 0.0
-        for n in range(squared.size):
+        for n in range(weights.size):
             if inliers[n]:
-                mean += squared[n]
+                mean += weights[n] * squared[n]
         variance = variance_px2(mean / freedom, tolerance_px)
         count = _mark_within(squared, square, inliers)
         reach = max(square, _REACH_SIGMAS**2 * variance)
@@ -128,16 +129,16 @@ def fit_pose(points, pixels, matrix, attitude, precision, tolerance_px, least, r
 
 
 @compiled()
-def normal_equations(tangents, projected, squared, pixels, matrix, reach, variance):
+def normal_equations(tangents, projected, squared, pixels, matrix, weights, reach, variance):
     """J^T W J (6, 6) and -J^T W r (6,), W over the variance, for a step of the centre and of the rotation.
 
     In the camera's axes, with x = R (X - C), R <- exp([w]) R and C <- C + R^T c:  dx = -c + w x x,  and the pixel
     is K x / z.
     """
     normal, gradient, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
-    for n in range(squared.size):
+    for n in range(weights.size):
         agreement = max(1.0 - squared[n] / reach, 0.0)
-        weight = agreement * agreement / variance
+        weight = weights[n] * agreement * agreement / variance
         if weight <= 0.0:
             continue
         u, v, near = tangents[0, n], tangents[1, n], tangents[2, n]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from engine.features import Features, Matches, match, sift
 from engine.geo import wrap_heading_deg
 from engine.maps.landmarks import MIN_CONTRAST, LandmarkMap, Landmarks, as_picture
+from engine.maps.samples import ROUGH_REACH_PX
 from engine.matching.align import Orthophoto, orthorectify
 from engine.matching.pose import PoseStart
 from engine.matching.query import Query
@@ -49,6 +50,7 @@ class Matched:
         view: the part of the map.
         points_px: (M, 2) pixels of the frame.
         points_m: (M, 3) metres on the ground.
+        weights: (M,) relative inverse variances of the pixels.
         tolerance_px: largest reprojection distance in the frame at which a match agrees with a pose.
         start: the pose with the most votes; None if there was no vote.
         vote: the winning translation; None if there was no vote.
@@ -57,6 +59,7 @@ class Matched:
     view: MapView
     points_px: Array
     points_m: Array
+    weights: Array
     tolerance_px: float
     start: PoseStart | None = None
     vote: Vote | None = None
@@ -119,8 +122,9 @@ def _by_orthophoto(
     else:
         photo_px, map_px = source.find(query, as_picture(photo.gray, query.device), photo.valid, view)
     ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
+    weights = _weights(query.site, ground_m)
     per_px = 2.0**view.level / map_px_per_pixel(query, height_m)  # frame pixels per pixel of the level
-    matched = Matched(view, photo.to_frame(photo_px), ground_m, options.tolerance_px * max(per_px, 1.0))
+    matched = Matched(view, photo.to_frame(photo_px), ground_m, weights, options.tolerance_px * max(per_px, 1.0))
     with query.scheduler.stage("vote"):
         return _voted(query, options, matched, photo, photo_px, map_px, attitude, height_m)
 
@@ -235,7 +239,9 @@ def _by_frame(
                 max_scale_factor=None if hypothesis.height_m is None else _MAX_SCALE_FACTOR,
             )
             xy_px, index = _matched(features, found)
-            matched.append(Matched(view, reduced.full(xy_px), known.points_m[index], _frame_tolerance_px(options)))
+            points_px, points_m = reduced.full(xy_px), known.points_m[index]
+            weights = _weights(query.site, points_m)
+            matched.append(Matched(view, points_px, points_m, weights, _frame_tolerance_px(options)))
     return matched
 
 
@@ -246,7 +252,8 @@ def _by_reduced(query: Query, finder: PointFinder, options: SiftOptions, views: 
     for view in views:
         points_px, map_px = finder.find(query, reduced.picture, valid, view)
         ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
-        matched.append(Matched(view, reduced.full(points_px), ground_m, _frame_tolerance_px(options)))
+        weights = _weights(query.site, ground_m)
+        matched.append(Matched(view, reduced.full(points_px), ground_m, weights, _frame_tolerance_px(options)))
     return matched
 
 
@@ -275,3 +282,8 @@ def _map_features(
 def lifted(site: OrthoMap, map_px: Array) -> Array:
     """(N, 3) east, north and the height of the surface at pixels (N, 2) of the map."""
     return np.column_stack([site.enu_from_pixel(map_px), site.surface_at(map_px)])
+
+
+def _weights(site: OrthoMap, points_m: Array) -> Array:
+    """Weights (N,) of matches: on a rough surface heights vary."""
+    return site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), ROUGH_REACH_PX)

@@ -163,7 +163,9 @@ class FeatureMatcher:
         query, options = self.query, self.options
         pose = replace(options.pose, reprojection_px=found.tolerance_px)
         matrix = query.camera.matrix
-        solve = partial(solve_pose, found.points_m, found.points_px, matrix, pose, start=found.start)
+        solve = partial(
+            solve_pose, found.points_m, found.points_px, matrix, pose, weights=found.weights, start=found.start
+        )
         if not options.use_attitude:
             return solve()
         errors = query.errors(options.errors)

@@ -40,6 +40,7 @@ class Problem:
         points: (3, N) map points in metres, about their mean.
         pixels: (2, N) undistorted.
         K: (3, 3) pinhole intrinsics.
+        weights: (N,) relative inverse variances of the pixels.
         attitude: (3, 3) rotation of the prior, or None.
         precision: (3, 3) inverse covariance of its angles about the camera's axes in 1/rad^2, 0 without one.
         tolerance_px: A match agrees if it reprojects at most this far off.
@@ -49,6 +50,7 @@ class Problem:
     points: Array
     pixels: Array
     K: Array
+    weights: Array
     attitude: Array | None
     precision: Array
     tolerance_px: float
@@ -159,7 +161,7 @@ def gauss_newton(problem: Problem, R: Array, center: Array, *, slack: float = 1.
     rotation = np.ascontiguousarray(R)  # the loops are compiled for one memory layout
     attitude = rotation if problem.attitude is None else np.ascontiguousarray(problem.attitude)
     found, rotation, center, tangents, projected, squared, inliers, information, variance = fit_pose(
-        problem.points, problem.pixels, problem.K, attitude, problem.precision,
+        problem.points, problem.pixels, problem.K, problem.weights, attitude, problem.precision,
         problem.tolerance_px, problem.min_inliers, rotation, center, slack,
     )  # fmt: skip
     if not found:

@@ -128,6 +128,7 @@ def solve_pose(
     camera_matrix: Array,
     options: PoseOptions | None = None,
     *,
+    weights: Array | None = None,
     prior: AttitudePrior | None = None,
     start: PoseStart | None = None,
 ) -> PoseStats | None:
@@ -138,6 +139,7 @@ def solve_pose(
         points_px: (N, 2) undistorted pixels (x, y).
         camera_matrix: (3, 3) pinhole intrinsics.
         options: Tolerances; the defaults suit frames of a few hundred pixels.
+        weights: (N,) relative inverse variances of the image points; None is 1 for all.
         prior: Attitude for the refinement, which separates tilt from displacement at a small field of view; it is
             dropped if markedly more matches agree without it.
         start: Start of the refinement; None searches for an initial pose.
@@ -151,12 +153,12 @@ def solve_pose(
         DtypeError: An array is not of real numbers.
     """
     options = options or PoseOptions()
-    points_m, points_px, K = _checked(points_m, points_px, camera_matrix)
-    known = np.flatnonzero(np.isfinite(points_m).all(1) & np.isfinite(points_px).all(1))
+    points_m, points_px, K, weights = _checked(points_m, points_px, camera_matrix, weights)
+    known = np.flatnonzero(np.isfinite(points_m).all(1) & np.isfinite(points_px).all(1) & (weights > 0))
     if len(known) < MIN_INLIERS or _spread(points_px[known].T) < options.min_spread_px:
         return None
     origin = points_m[known].mean(0)
-    problem = _problem((points_m[known] - origin).T, points_px[known].T, K, options, prior)
+    problem = _problem((points_m[known] - origin).T, points_px[known].T, K, weights[known], options, prior)
     fit = _fit(problem) if start is None else _fit_from(problem, start, origin)
     if fit is not None and prior is not None:
         problem, fit = _without_wrong_prior(problem, fit)
@@ -175,12 +177,15 @@ def solve_pose(
     return _stats(fit, origin, covariance, known, len(points_m), log10_nfa, log10_tried)
 
 
-def _problem(points: Array, pixels: Array, K: Array, options: PoseOptions, prior: AttitudePrior | None) -> Problem:
+def _problem(
+    points: Array, pixels: Array, K: Array, weights: Array, options: PoseOptions, prior: AttitudePrior | None
+) -> Problem:
     """The problem of points (3, N) about their mean and pixels (2, N)."""
     return Problem(
         points=points,
         pixels=pixels,
         K=K,
+        weights=weights,
         attitude=None if prior is None else prior.rotation,
         precision=np.zeros((3, 3)) if prior is None else prior.precision,
         tolerance_px=options.reprojection_px,
@@ -211,11 +216,12 @@ def _stats(
     )
 
 
-def _checked(points_m: Array, points_px: Array, camera_matrix: Array) -> tuple[Array, ...]:
+def _checked(points_m: Array, points_px: Array, camera_matrix: Array, weights: Array | None) -> tuple[Array, ...]:
     count = len(points_m)
-    expected = {"points_m": (count, 3), "points_px": (count, 2), "camera_matrix": (3, 3)}
+    weights = np.ones(count) if weights is None else weights
+    expected = {"points_m": (count, 3), "points_px": (count, 2), "camera_matrix": (3, 3), "weights": (count,)}
     out = []
-    for (name, shape), values in zip(expected.items(), (points_m, points_px, camera_matrix), strict=True):
+    for (name, shape), values in zip(expected.items(), (points_m, points_px, camera_matrix, weights), strict=True):
         array = np.asarray(values)
         if array.shape != shape:
             raise ShapeError(f"{name}: expected {shape}, got {array.shape}")
@@ -343,6 +349,6 @@ def _same(R: Array, other: Array) -> bool:
 
 def _cost(problem: Problem, R: Array, view: Reprojection, variance: float, options: PoseOptions) -> float:
     """Return chi-square of all matches, each bounded at the threshold, and of the prior."""
-    cost = float(np.minimum(view.squared, options.reprojection_px**2).sum()) / variance
+    cost = float(problem.weights @ np.minimum(view.squared, options.reprojection_px**2)) / variance
     turn = turn_from_attitude(problem, R)
     return cost + float(turn @ problem.precision @ turn)

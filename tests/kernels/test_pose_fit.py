@@ -34,9 +34,9 @@ def test_pixels_are_those_of_opencv_and_points_behind_are_far_off(points):
 def test_normal_equations_are_those_of_finite_differences(points):
     rng = np.random.default_rng(2)
     pixels = pixels_of(points, ROTATION, CENTER) + rng.normal(0, 2.0, (2, points.shape[1]))
-    reach, variance = 12.0, 1.7
+    weights, reach, variance = rng.uniform(0.5, 2.0, points.shape[1]), 12.0, 1.7
     view = reproject(points, pixels, MATRIX, ROTATION, CENTER)
-    normal, gradient = normal_equations(*view, pixels, MATRIX, reach, variance)
+    normal, gradient = normal_equations(*view, pixels, MATRIX, weights, reach, variance)
 
     def projected(step):
         rotation = cv2.Rodrigues(step[3:])[0] @ ROTATION
@@ -45,7 +45,7 @@ def test_normal_equations_are_those_of_finite_differences(points):
     steps = 1e-5 * np.eye(6)
     jacobian = np.stack([(projected(s) - projected(-s)) / 2e-5 for s in steps], axis=1)
     agreement = np.maximum(1.0 - view[2] / reach, 0.0) ** 2
-    weighted = np.tile(agreement / variance, 2)
+    weighted = np.tile(weights * agreement / variance, 2)
     assert 0 < np.count_nonzero(agreement) < len(agreement)
     np.testing.assert_allclose(normal, (jacobian.T * weighted) @ jacobian, rtol=1e-5, atol=1e-3)
     np.testing.assert_allclose(

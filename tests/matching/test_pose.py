@@ -95,10 +95,25 @@ def test_unusable_matches_are_ignored():
     s = scene(np.random.default_rng(7), 40)
     s.points_m[3] = np.nan
     s.points_px[5, 0] = np.inf
+    weights = np.ones(40)
+    weights[8] = 0
     s.points_m[11] = 2.0 * s.center_m - s.points_m[11]  # behind the camera, on the same line of sight
-    pose = solved(s)
-    assert np.flatnonzero(~pose.inliers).tolist() == [3, 5, 11]
+    pose = solved(s, weights=weights)
+    assert np.flatnonzero(~pose.inliers).tolist() == [3, 5, 8, 11]
     np.testing.assert_allclose(pose.center_m, s.center_m, atol=1e-5)
+
+
+def test_weights_follow_the_better_points():
+    rng = np.random.default_rng(8)
+    errors: dict[bool, list[float]] = {True: [], False: []}
+    for _ in range(40):
+        s = scene(rng, 60)
+        sigma = np.where(np.arange(60) < 20, 0.05, 0.9)
+        s.points_px += rng.normal(size=(60, 2)) * sigma[:, None]
+        for weighted, values in errors.items():
+            pose = solved(s, weights=0.25 / sigma**2 if weighted else None)
+            values.append(float(np.sum((pose.center_m - s.center_m) ** 2)))
+    assert np.mean(errors[True]) < 0.2 * np.mean(errors[False])
 
 
 # Its covariance.
@@ -281,6 +296,7 @@ USUAL = {
         (solve_pose, {"points_m": np.zeros((8, 2))}, ShapeError, r"points_m: expected \(8, 3\), got \(8, 2\)"),
         (solve_pose, {"points_px": np.zeros((7, 2))}, ShapeError, r"points_px: expected \(8, 2\), got \(7, 2\)"),
         (solve_pose, {"camera_matrix": np.eye(4)}, ShapeError, "camera_matrix"),
+        (solve_pose, {"weights": np.ones(3)}, ShapeError, "weights"),
         (solve_pose, {"points_px": np.zeros((8, 2), complex)}, DtypeError, "points_px: expected real numbers"),
         (AttitudePrior, {"rotation": np.eye(2)}, ShapeError, "rotation"),
         (AttitudePrior, {"axes": np.zeros(3)}, ShapeError, r"axes: expected \(3, 3\), got \(3,\)"),
