@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 from engine.errors import OptionError
 from engine.geo import chi_square_of
-from engine.kernels.scores import check_score
 from engine.learned.pairs import PairMatcher
 from engine.sift import BACKENDS
 from engine.values import CHANCE, MAX_SIGMA_M, RISK, GridPose, check, check_choice, check_positive
@@ -90,16 +89,12 @@ class NccOptions:
     """Settings of the NCC method.
 
     Attributes:
-        score: the correlated quantity: "grey", "local", "gradient" or "mixed", see ``docs/scores.md``.
-        enhance_radius_px: neighbourhood of the local normalisation; 0 leaves it out. "grey" has none.
         exhaustive: score every place of the window at full resolution.
         refine: refine the pose densely after the peak.
         exclusion_m: rivals nearer than this are the peak itself.
         errors: assumed errors of the telemetry and the map.
     """
 
-    score: str = "local"
-    enhance_radius_px: int = 8
     exhaustive: bool = False
     refine: bool = True
     exclusion_m: float = 6.0
@@ -107,8 +102,6 @@ class NccOptions:
 
     def __post_init__(self) -> None:
         check_positive(self, "exclusion_m")
-        check_score(self.score)
-        check(self, "enhance_radius_px", "0 or more", lambda radius: radius >= 0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

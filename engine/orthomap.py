@@ -303,33 +303,21 @@ class OrthoMap(Georeference):
         return np.where(np.isnan(heights), self.ground_m, heights)
 
     def ground_at(self, xy_px: ArrayLike) -> float:
-        """Level of the bare ground at one pixel, see :meth:`ground_plane`.
-
-        Args:
-            xy_px: (2,) pixel of the map.
-
-        Returns:
-            Metres in the surface's datum.
-        """
-        return self.ground_plane(xy_px, GROUND_REACH_M)[0]
-
-    def ground_plane(self, xy_px: ArrayLike, reach_m: float) -> tuple[float, Array]:
-        """The bare ground about one pixel: a plane by quantile regression, with a fifth of the surface below it.
+        """Level of the bare ground at one pixel: of a plane with a fifth of the surface below it.
 
         This puts it below roofs and crowns but, unlike a plain percentile, not below the middle of a slope.
 
         Args:
             xy_px: (2,) pixel of the map.
-            reach_m: half the side of the square that is fitted.
 
         Returns:
-            The level at the pixel in the surface's datum, and the slope (2,) in metres up per pixel x and y:
-            ``ground_m`` and 0 if less than half of the square is known, 0.0 and 0 without a surface.
+            Metres in the surface's datum; ``ground_m`` if less than half of the square is known, 0.0 without a
+            surface.
         """
-        found = None
+        level_m = None
         if self._surface is not None:
-            found = self._surface.ground_plane(np.asarray(xy_px, np.float64), reach_m / self.gsd_m_per_px)
-        return found or (self.ground_m, np.zeros(2))
+            level_m = self._surface.ground_at(np.asarray(xy_px, np.float64), GROUND_REACH_M / self.gsd_m_per_px)
+        return self.ground_m if level_m is None else level_m
 
     def roughness_weight_at(self, xy_px: ArrayLike, reach_px: float) -> Array:
         """Weight of pixels by the roughness of the surface: 1 on level ground, less at walls, edges and crowns.

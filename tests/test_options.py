@@ -38,13 +38,11 @@ def test_numbers_are_above_0(options, name, value):
         *((AssumedErrors, "height_share", value, "a number from 0 up") for value in (-1e-9, math.nan, math.inf)),
         *((LiveOptions, name, 60_001, "at most 60000") for name in ("deadline_ms", "patience_ms")),
         (NccOptions, "exclusion_m", math.nan, "a number above 0"),
-        (NccOptions, "enhance_radius_px", -1, "0 or more"),
         (SiftOptions, "scale", 0.0, "above 0 and at most 1"),
         (SiftOptions, "max_keypoints", 3, "4 or more"), (SiftOptions, "max_height_m", math.inf, "a finite number"),
         (SiftOptions, "max_height_m", 0.5, "above 1"),
         *((SiftOptions, "upsample", value, "1 or 2") for value in (0, 3)),
         *((SiftOptions, name, -1, "above 0") for name in ("keypoints_per_px", "tolerance_px")),
-        (NccOptions, "score", "census", "one of grey, local, gradient, mixed"),
         *((PoseOptions, name, value, "a positive number") for name, value in (
             ("reprojection_px", 0), ("distinct_px", -1))),
         (LearnedOptions, "max_keypoints", 1, ".+"), (LearnedOptions, "max_picture_px", 10, ".+"),

@@ -19,7 +19,6 @@ from engine.kernels.sums import check_finite
 from engine.runtime.threads import in_parallel, own_array
 
 FloatImage = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 _Block = tuple[tuple[slice, slice], NDArray[np.floating]]  # where its scores lie, and its transform
 
 # A float32 transform has an error of about 1e-7 of the window's norm in every numerator, which is divided by the
@@ -27,8 +26,7 @@ _Block = tuple[tuple[slice, slice], NDArray[np.floating]]  # where its scores li
 _FLOAT32_NORM_RATIO = 16.0
 # Transforms of longer sides leave the cache, and cost twice as much per pixel.
 _CACHED_SIDE = 1152
-MAX_BLOCKS = 16
-"""Into which a surface is divided along one axis."""
+_MAX_BLOCKS = 16  # into which a surface is divided along one axis
 _USES_IPP = hasattr(cv2, "ipp") and bool(cv2.ipp.useIPP())
 
 
@@ -53,9 +51,7 @@ def ncc_surface(search: FloatImage, templates: FloatImage, *, zero_mean: bool) -
     return out
 
 
-def write_surfaces(
-    out: FloatImage, window: FloatImage, templates: FloatImage, *, zero_mean: bool, asked: Mask | None = None
-) -> None:
+def write_surfaces(out: FloatImage, window: FloatImage, templates: FloatImage, *, zero_mean: bool) -> None:
     """Write the scores of all templates in one window.
 
     Args:
@@ -63,7 +59,6 @@ def write_surfaces(
         window: (H, W), contiguous.
         templates: (T, h, w), contiguous.
         zero_mean: subtract the means first.
-        asked: (H-h+1, W-w+1) bool; the scores are 0 elsewhere. None is everywhere.
 
     Raises:
         OptionError: NaN or infinity.
@@ -73,8 +68,6 @@ def write_surfaces(
     check_finite("search", math.isfinite(energy))
     check_finite("templates", math.isfinite(sum(energy for _, energy in models)))
     inverse_norms = surface_loops.inverse_norms(window, mean, energy, *templates.shape[1:], zero_mean)
-    if asked is not None:
-        inverse_norms[~asked] = 0.0
     correlate(out, window, mean, inverse_norms, [model for model, _ in models])
 
 
@@ -151,7 +144,7 @@ def correlate(
 @lru_cache(maxsize=1024)
 def _division(count: int, model: int) -> tuple[int, int]:
     """Number and side of the blocks along an axis that give ``count`` scores at the least cost."""
-    sides = [fast_side(-(-count // n) + model - 1) for n in range(1, MAX_BLOCKS + 1)]
+    sides = [fast_side(-(-count // n) + model - 1) for n in range(1, _MAX_BLOCKS + 1)]
     costs = [n * side * (1 if side <= _CACHED_SIDE else 2) for n, side in enumerate(sides, 1)]
     best = costs.index(min(costs))
     return -(-count // (sides[best] - model + 1)), sides[best]

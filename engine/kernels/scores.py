@@ -1,4 +1,4 @@
-"""The scores: which quantity of frame and map is correlated, the paper's "enhance" step."""
+"""What is correlated: grey levels by the paper's "enhance" step, and structure."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.kernels.sums import MIDDLE_GREY
 
 FloatImage = NDArray[np.float32]
 
-SCORES = ("grey", "local", "gradient", "mixed")
+RADIUS_PX = 8
+"""Of the local normalisation: neighbourhoods are boxes of 2 x 8 + 1 pixels."""
 # Added to the local variance, in squared grey levels, so that sensor noise on flat ground is not amplified.
 _NOISE_VARIANCE = 4.0
 
@@ -19,55 +19,33 @@ _EDGE_SCALE_PX, _STRUCTURE_SCALE_PX = 1.0, 1.5  # of the gradients, and of the s
 _STRUCTURE_NOISE = 20.0  # squared grey levels, so that sensor noise on flat ground has no orientation
 
 
-def check_score(score: str) -> None:
-    """Raise OptionError if no score has this name."""
-    if score not in SCORES:
-        raise OptionError(f"score: expected one of {', '.join(SCORES)}, got {score!r}")
-
-
 def enhance(
-    gray: NDArray[np.uint8], *, radius_px: int = 8, score: str = "local", valid: NDArray[np.bool_] | None = None
+    gray: NDArray[np.uint8], *, radius_px: int = RADIUS_PX, valid: NDArray[np.bool_] | None = None
 ) -> FloatImage:
-    """The paper's "enhance" step: computes the quantity to correlate, the same for frame and map.
+    """The paper's "enhance" step, the same for frame and map: robust to shadows, haze and exposure.
 
-    The picture is first smoothed by the binomial 1-2-1, since aliasing of sampled edges biases correlation peaks
-    towards whole pixels. ``docs/scores.md`` compares the scores.
-
-    - "local": each pixel less its neighbourhood's mean, over its standard deviation, which is robust to shadows,
-      haze and exposure.
-    - "gradient": the same of the gradient's magnitude, which is invariant to the sign of a contrast.
-    - "mixed": the sum of both.
-    - "grey": the smoothed grey levels less middle grey.
+    Each pixel less its neighbourhood's mean, over its standard deviation. The picture is first smoothed by the
+    binomial 1-2-1, since aliasing of sampled edges biases correlation peaks towards whole pixels.
 
     Args:
         gray: (H, W).
-        radius_px: neighbourhoods are boxes of 2 radius_px + 1 pixels; 0 is without normalisation.
-        score: one of :data:`SCORES`.
+        radius_px: neighbourhoods are boxes of 2 radius_px + 1 pixels.
         valid: (H, W) bool; pixels where it is False are ignored and 0 in the result.
 
     Returns:
         (H, W) float32.
 
     Raises:
-        OptionError: the radius is negative, or no score has this name.
+        OptionError: the radius is below 1.
     """
-    if radius_px < 0:
-        raise OptionError(f"radius_px: expected 0 or more, got {radius_px}")
-    check_score(score)
+    if radius_px < 1:
+        raise OptionError(f"radius_px: expected 1 or more, got {radius_px}")
     weight = None if valid is None else valid.astype(np.float32)
-    smooth = _smoothed(gray, weight)
-    if score == "grey":
-        return _masked(smooth.astype(np.float32) - MIDDLE_GREY, weight)
-    if score == "local":
-        return _normalised(smooth, radius_px, weight)
-    # No gradient is taken across the border of the valid area.
-    inner = None if weight is None else cv2.erode(weight, np.ones((3, 3), np.uint8))
-    gradient = _normalised(_gradient_magnitude(smooth), radius_px, inner)
-    return gradient if score == "gradient" else gradient + _normalised(smooth, radius_px, weight)
+    return _normalised(_smoothed(gray, weight), radius_px, weight)
 
 
 def orientation(
-    gray: NDArray[np.uint8], *, radius_px: int = 8, valid: NDArray[np.bool_] | None = None
+    gray: NDArray[np.uint8], *, radius_px: int = RADIUS_PX, valid: NDArray[np.bool_] | None = None
 ) -> FloatImage:
     """Which way edges run, and how clearly, as two channels: cosine and sine of the doubled angle.
 
@@ -109,17 +87,8 @@ def _smoothed(gray: NDArray[np.uint8], weight: FloatImage | None) -> NDArray[np.
     return np.asarray(cv2.GaussianBlur(gray * weight, (3, 3), 0) / share)
 
 
-def _gradient_magnitude(picture: NDArray[np.uint8] | FloatImage) -> FloatImage:
-    """Grey levels per pixel, by central differences."""
-    across = cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
-    down = cv2.Sobel(picture, cv2.CV_32F, 0, 1, ksize=1, scale=0.5)
-    return np.asarray(cv2.magnitude(across, down))
-
-
 def _normalised(picture: NDArray[np.uint8] | FloatImage, radius_px: int, weight: FloatImage | None) -> FloatImage:
     """Each pixel less the mean of its neighbourhood, over its standard deviation, weighted."""
-    if radius_px == 0:
-        return _masked(picture.astype(np.float32), weight)
     if weight is None and picture.dtype == np.uint8:
         from engine.kernels import local_normalisation  # numba takes a while to import
 

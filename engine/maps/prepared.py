@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels.scores import enhance
+from engine.kernels.scores import RADIUS_PX, enhance
 from engine.kernels.search_levels import MAX_HALVINGS
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, tiles_under, widened, within
@@ -53,15 +53,13 @@ class PreparedMap:
     Args:
         site: the map.
         device: of the regions.
-        radius_px: of the local normalisation, see :func:`engine.kernels.scores.enhance`.
-        score: see :func:`engine.kernels.scores.enhance`.
 
     Attributes:
         regions: prepared so far, by window and level; the least recently used are evicted.
     """
 
-    def __init__(self, site: OrthoMap, device: Device, radius_px: int, score: str = "local") -> None:
-        self._site, self._device, self._radius_px, self._score = site, device, radius_px, score
+    def __init__(self, site: OrthoMap, device: Device) -> None:
+        self._site, self._device = site, device
         self.regions = RecentlyUsed(self._prepare, self._evictable_px, MAX_REGION_PX)
 
     def cut(self, window: Window, level: int) -> Region:
@@ -108,35 +106,30 @@ class PreparedMap:
         return 0 if (window.height_px, window.width_px) == self._site.level_shape(level) else window.area_px
 
     def _prepare(self, window: Window, level: int) -> Region:
-        picture, mask = enhanced_part(self._site, self._radius_px, self._score, window, level)
+        picture, mask = enhanced_part(self._site, window, level)
         image = to_device(picture, self._device)
         if mask is None:
             return Region(window, prepare(image), None)
         return Region(window, prepare(image, valid=mask), to_device(mask, self._device), mask)
 
 
-def enhanced_part(
-    site: OrthoMap, radius_px: int, score: str, window: Window, level: int
-) -> tuple[FloatImage, NDArray[np.bool_] | None]:
+def enhanced_part(site: OrthoMap, window: Window, level: int) -> tuple[FloatImage, NDArray[np.bool_] | None]:
     """A window of a level enhanced with the neighbourhood beyond it, so that windows join seamlessly.
 
     Args:
         site: the map.
-        radius_px: of the local normalisation, see :func:`engine.kernels.scores.enhance`.
-        score: see :func:`engine.kernels.scores.enhance`.
         window: in pixels of the level, inside it.
         level: of the map's pyramid.
 
     Returns:
         (H, W) float32, and (H, W) bool, False on nodata; None if all pixels are valid.
     """
-    margin_px = radius_px + 2  # reach of the box, plus one for the gradient and one for the smoothing
-    wide = widened(window, margin_px, site.level_shape(level))
+    wide = widened(window, RADIUS_PX + 1, site.level_shape(level))
     mask: NDArray[np.bool_] | None = None
     if not site.fully_valid:
         mask = site.valid(wide, level)
         mask = None if mask.all() else mask
-    picture = enhance(site.gray(wide, level), radius_px=radius_px, score=score, valid=mask)
+    picture = enhance(site.gray(wide, level), valid=mask)
     inner = within(window, wide)
     own = None if mask is None or mask[inner].all() else np.ascontiguousarray(mask[inner])
     return np.ascontiguousarray(picture[inner]), own

@@ -31,15 +31,13 @@ class SampleMap:
 
     Args:
         site: the map.
-        radius_px: of the local normalisation, see :func:`engine.kernels.scores.enhance`.
-        score: see :func:`engine.kernels.scores.enhance`.
 
     Attributes:
         cells: sampled so far, by window and level; the least recently used are evicted.
     """
 
-    def __init__(self, site: OrthoMap, radius_px: int, score: str = "local") -> None:
-        self._site, self._radius_px, self._score = site, radius_px, score
+    def __init__(self, site: OrthoMap) -> None:
+        self._site = site
         self.cells = RecentlyUsed(self._sampled, lambda key, _: int(key[0].area_px), COARSE_LIMIT_PX)
 
     def find(self, window: Window, level: int, max_samples: int = MAX_SAMPLES) -> Samples:
@@ -83,7 +81,7 @@ class SampleMap:
 
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
         """Samples of a cell, row by row, and the number of their rows and columns."""
-        picture, mask = enhanced_part(self._site, self._radius_px, self._score, cell, level)
+        picture, mask = enhanced_part(self._site, cell, level)
         across, down = (cv2.Sobel(picture, cv2.CV_32F, i, 1 - i, ksize=1, scale=0.5) for i in (1, 0))
         shape = (picture.shape[0] // BLOCK_PX, picture.shape[1] // BLOCK_PX)
         rows, columns = _steepest(cv2.magnitude(across, down), shape)

@@ -117,24 +117,21 @@ class SurfaceModel:
         found = _bilinear(heights, flat) if isinstance(heights, np.ndarray) else heights.sample(flat)
         return found.reshape(at.shape[:-1])
 
-    def ground_plane(self, map_xy: Array, reach_px: float) -> tuple[float, Array] | None:
-        """The plane with a fifth of the surface below it in a square about one map pixel (2,).
+    def ground_at(self, map_xy: Array, reach_px: float) -> float | None:
+        """Level of the plane with a fifth of the surface below it in a square about one map pixel.
 
         Args:
             map_xy: (2,) the square's middle.
             reach_px: half its side.
 
         Returns:
-            The plane's level at the middle and its slope (2,) in metres up per map pixel x and y; None if less
-            than half of the square is known.
+            Metres at the middle; None if less than half of the square is known.
         """
         from engine.kernels.lower_plane import lower_plane  # numba takes a while to import
 
         heights_m = self.sample(map_xy + _LATTICE * reach_px)
         plane, known = lower_plane(_LATTICE, heights_m, GROUND_PERCENT / 100.0, _ON_PLANE_M, _ROUNDS)
-        if 2 * known < len(_LATTICE):
-            return None
-        return float(plane[0]), plane[1:] / reach_px
+        return None if 2 * known < len(_LATTICE) else float(plane[0])
 
     @property
     def range_m(self) -> tuple[float, float]:

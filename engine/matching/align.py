@@ -81,10 +81,8 @@ class GroundView:
     area_px: float
 
 
-def view_of(
-    camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: Array, slope_m_per_px: Array | None = None
-) -> GroundView | None:
-    """The camera's view of a plane ``height_m`` below it, level or sloped.
+def view_of(camera: Camera, attitude: Attitude, height_m: float, enu_jacobian: Array) -> GroundView | None:
+    """The camera's view of a level plane ``height_m`` below it.
 
     Equation 2 (scale) and equation 3 (rotation) are the special case of a level camera: the homography contains
     s = h / (f gsd), psi - psi_m, and the tilt. The Jacobian includes scale and meridian convergence of the map.
@@ -92,28 +90,21 @@ def view_of(
     Args:
         camera: pinhole (the frame is undistorted).
         attitude: of the body.
-        height_m: above the plane, along the vertical.
+        height_m: above the plane.
         enu_jacobian: (2, 2) metres east and north per map pixel x and y.
-        slope_m_per_px: (2,) rise of the plane per map pixel x and y; None is level.
 
     Returns:
-        GroundView | None: None if a ray of a corner exceeds :data:`MAX_RAY_DEG` or does not meet the plane.
+        GroundView | None: None if a ray of a corner exceeds :data:`MAX_RAY_DEG`.
     """
     enu_from_camera = camera.enu_from_camera(attitude)
     rays = camera.frame_rays @ enu_from_camera.T
     down = -rays[:, 2] / np.sqrt((rays * rays).sum(axis=1))
     if down.min() < MIN_DOWN:
         return None
-    slope = np.zeros(2) if slope_m_per_px is None else slope_m_per_px
-    px_from_enu = inverse_2x2(enu_jacobian)
-    approach = rays[:, :2] @ (slope @ px_from_enu) - rays[:, 2]  # of each ray, along the plane's normal
-    if approach.min() <= 0.0:
-        return None
-    ground_m = rays[:, :2] * (height_m / approach)[:, None]
-    ground_px = ground_m @ px_from_enu.T
+    ground_px = rays[:, :2] * (height_m / -rays[:, 2])[:, None] @ inverse_2x2(enu_jacobian).T
     extent = np.ptp(ground_px[:4], axis=0)
     plane = np.zeros((3, 3))  # map pixels about the nadir to east, north, up of the ground below the camera
-    plane[:2, :2], plane[2, :2], plane[2, 2] = enu_jacobian, slope, -height_m
+    plane[:2, :2], plane[2, 2] = enu_jacobian, -height_m
     return GroundView(
         camera.matrix @ enu_from_camera.T @ plane,
         ground_px[4],

@@ -32,7 +32,6 @@ _COARSER = (0, 1, 2)  # levels above the frame's own that may be matched if time
 MIN_SIDE_PX = 24
 """Least side of a template on a coarser level."""
 _EVERY_PLACE = "every place of a wide window"  # a step
-_GROUND_SHARE = 0.3  # of the height: the ground fitted by a plane, or the spread of the prior if that is wider
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,18 +79,15 @@ class Correlator:
         Args:
             pose: the height and heading to align it by.
             level: of the pyramid.
-            nadir_px: (2,) where to look up its ground; None takes the prior's place, or level ground.
+            nadir_px: (2,) where to look up the ground of an oblique frame; None takes
+                the prior's place, or level ground.
         """
-        query, options = self.query, self.options
+        query = self.query
         attitude, height = pose.known_attitude, pose.known_height_m
         jacobian = query.jacobian * 2.0**level
         if is_oblique(query, attitude):
             return self._align_oblique(pose, level, nadir_px)
         view = view_of(query.camera, attitude, height, jacobian)
-        if view is not None:
-            slope = self._slope(view, height, level, nadir_px)
-            if slope.any():
-                view = view_of(query.camera, attitude, height, jacobian, slope) or view
         if view is None:
             return query.refuse_tilted(attitude, METHOD)
         rows, columns = query.site.level_shape(level)
@@ -101,7 +97,7 @@ class Correlator:
         if patch is None:
             detail = "the frame covers fewer than 8 x 8 pixels of the map"
             return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
-        enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
+        enhanced = enhance(patch.gray)
         return Aligned(pose, level, jacobian, view, patch, enhanced)
 
     def nowhere(self, aligned: Aligned) -> list[NDArray[np.uint8]]:
@@ -118,7 +114,7 @@ class Correlator:
 
     def _align_oblique(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
         """An oblique frame drawn over the ground's relief; its view is that of the correlated part."""
-        query, options = self.query, self.options
+        query = self.query
         attitude, height = pose.known_attitude, pose.known_height_m
         place = query.prior_px if nadir_px is None else nadir_px
         patch = oblique_patch(query, attitude, height, level, place)
@@ -127,18 +123,8 @@ class Correlator:
         size = np.array(patch.gray.shape[::-1], np.float64)
         extent = (float(size[0]), float(size[1]))
         view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))
-        enhanced = enhance(patch.gray, radius_px=options.enhance_radius_px, score=options.score)
+        enhanced = enhance(patch.gray)
         return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, enhanced)
-
-    def _slope(self, view: GroundView, height_m: float, level: int, nadir_px: Array | None) -> Array:
-        """Rise (2,) of the ground per pixel of the level, over a wider area if the prior is vaguer."""
-        query = self.query
-        reach_m, place = _GROUND_SHARE * height_m, nadir_px
-        if place is None and query.prior is not None:
-            reach_m, place = max(reach_m, SPREAD_SIGMAS * query.prior.sigma_m), query.prior_px
-        if place is None:
-            return np.zeros(2)
-        return query.site.ground_plane(place + view.center_px * 2.0**level, reach_m)[1] * 2.0**level
 
     def window(self, aligned: Aligned) -> Window | None:
         """The adaptive window in full-resolution map pixels; the whole map without a prior."""
@@ -211,9 +197,8 @@ class Correlator:
         return coarse_to_fine.peak(region.search, template, exclusion_px, min_overlap=MIN_VALID_SHARE, stop=stop)
 
     def _has_coarse_levels(self, region: Region) -> bool:
-        """Whether to score places at half resolution: on the CPU, if pixels are centred on 0 like nodata."""
-        on_cpu = isinstance(region.search.image, np.ndarray)
-        return on_cpu and not self.options.exhaustive and (region.valid is None or self.is_centred)
+        """Whether to score places at half resolution: on the CPU."""
+        return isinstance(region.search.image, np.ndarray) and not self.options.exhaustive
 
     def _of_every_place(self, region: Region, template: NDArray[np.float32], exclusion_px: float) -> Peak:
         if region.valid is not None:
@@ -224,11 +209,6 @@ class Correlator:
     def exclusion_px(self, level: int) -> float:
         """Distance within which a rival is the peak itself, in pixels of a level."""
         return self.options.exclusion_m / (self.query.site.gsd_m_per_px * 2.0**level)
-
-    @property
-    def is_centred(self) -> bool:
-        """Whether enhanced pixels are centred on 0, the value of nodata on a coarse level."""
-        return self.options.score != "grey" and self.options.enhance_radius_px > 0
 
     def surface(self, aligned: Aligned, window: Window) -> tuple[Picture, Array] | None:
         """The whole surface on which :meth:`search` finds its peak, for reports.

@@ -23,7 +23,7 @@ from engine.matching.pose import PoseStart
 from engine.matching.query import Query
 from engine.matching.relief import ground_relief
 from engine.matching.views import MapView, TelemetryHypothesis, map_px_per_pixel, slant_m
-from engine.matching.votes import Vote, similarity, vote
+from engine.matching.votes import Vote, rotation, vote
 from engine.options import PAPER_SCALE, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device, Picture, as_float, on_host, to_device
@@ -34,7 +34,6 @@ if TYPE_CHECKING:  # it loads torch
 
 Array = NDArray[np.float64]
 
-_BLUNT_PX = 1.6  # scale at which a keypoint's position variance is twice a small one's
 MAX_KEYPOINTS = 1000
 """Of the largest orthophoto."""
 _MAP_DENSITY = 1.5  # landmarks per pixel over the frame's keypoints per pixel
@@ -119,12 +118,11 @@ def _by_orthophoto(
     if photo is None:
         return None
     if isinstance(source, LandmarkMap):
-        photo_px, map_px, scale_px = _feature_pairs(query, source, photo, view, options)
+        photo_px, map_px = _feature_pairs(query, source, photo, view, options)
     else:
         photo_px, map_px = source.find(query, as_picture(photo.gray, query.device), photo.valid, view)
-        scale_px = np.zeros(len(photo_px))
     ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
-    weights = _weights(query.site, ground_m, scale_px)
+    weights = _weights(query.site, ground_m)
     per_px = 2.0**view.level / map_px_per_pixel(query, height_m)  # frame pixels per pixel of the level
     matched = Matched(view, photo.to_frame(photo_px), ground_m, weights, options.tolerance_px * max(per_px, 1.0))
     with query.scheduler.stage("vote"):
@@ -133,8 +131,8 @@ def _by_orthophoto(
 
 def _feature_pairs(
     query: Query, landmarks: LandmarkMap, photo: Orthophoto, view: MapView, options: SiftOptions
-) -> tuple[Array, Array, Array]:
-    """Matched features: (M, 2) pixels of the orthophoto, (M, 2) of the level, and (M,) their scales."""
+) -> tuple[Array, Array]:
+    """Matched features: (M, 2) pixels of the orthophoto, and (M, 2) of the level."""
     with query.scheduler.stage("frame features"):
         shown_px = int(np.count_nonzero(photo.valid))
         keypoints = max(options.max_keypoints, min(round(shown_px * options.keypoints_per_px), MAX_KEYPOINTS))
@@ -153,15 +151,14 @@ def _feature_pairs(
         known = landmarks.find(view.crop, view.level, upright=True, per_px=per_px)
     with query.scheduler.stage("match"):
         found = match(features, known.features, ratio=_VOTE_RATIO, max_scale_factor=_MAX_SCALE_FACTOR)
-        photo_px, scale_px, index = _matched(features, found)
-        return photo_px.astype(np.float64), known.xy_px[index].astype(np.float64), scale_px
+        photo_px, index = _matched(features, found)
+        return photo_px.astype(np.float64), known.xy_px[index].astype(np.float64)
 
 
-def _matched(features: Features, found: Matches) -> tuple[NDArray[np.float32], Array, NDArray[np.int64]]:
-    """Accepted pairs: (M, 2) feature pixels, (M,) their scales, (M,) indices on the map."""
-    columns = (features.xy_px[0], features.scale_px[0], found.valid[0], found.train_index[0])
-    xy_px, scale_px, valid, index = map(on_host, columns)
-    return xy_px[valid], scale_px[valid].astype(np.float64), index[valid]
+def _matched(features: Features, found: Matches) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Accepted pairs: (M, 2) feature pixels, (M,) indices on the map."""
+    xy_px, valid, index = map(on_host, (features.xy_px[0], found.valid[0], found.train_index[0]))
+    return xy_px[valid], index[valid]
 
 
 def _voted(
@@ -184,10 +181,10 @@ def _voted(
     found = vote(photo_px - middle, map_px, radius_px, distinct_px)
     if found is None:
         return matched
-    nadir = similarity(found.turn_deg, found.scale) @ (-photo.offset_px - middle) + found.shift_px
+    nadir = rotation(found.turn_deg) @ (-photo.offset_px - middle) + found.shift_px
     nadir_px = site.full_from_level(nadir, level)
     turned = replace(attitude, heading_deg=wrap_heading_deg(attitude.heading_deg + found.turn_deg))
-    up_m = site.ground_at(nadir_px) + height_m * found.scale
+    up_m = site.ground_at(nadir_px) + height_m
     start = PoseStart(
         query.camera.enu_from_camera(turned).T,
         np.array([*site.enu_from_pixel(nadir_px), up_m]),
@@ -241,9 +238,9 @@ def _by_frame(
                 scale=1.0 / view.pixel_ratio,
                 max_scale_factor=None if hypothesis.height_m is None else _MAX_SCALE_FACTOR,
             )
-            xy_px, scale_px, index = _matched(features, found)
+            xy_px, index = _matched(features, found)
             points_px, points_m = reduced.full(xy_px), known.points_m[index]
-            weights = _weights(query.site, points_m, scale_px)
+            weights = _weights(query.site, points_m)
             matched.append(Matched(view, points_px, points_m, weights, _frame_tolerance_px(options)))
     return matched
 
@@ -255,7 +252,7 @@ def _by_reduced(query: Query, finder: PointFinder, options: SiftOptions, views: 
     for view in views:
         points_px, map_px = finder.find(query, reduced.picture, valid, view)
         ground_m = lifted(query.site, query.site.full_from_level(map_px, view.level))
-        weights = _weights(query.site, ground_m, np.zeros(len(ground_m)))
+        weights = _weights(query.site, ground_m)
         matched.append(Matched(view, reduced.full(points_px), ground_m, weights, _frame_tolerance_px(options)))
     return matched
 
@@ -287,7 +284,6 @@ def lifted(site: OrthoMap, map_px: Array) -> Array:
     return np.column_stack([site.enu_from_pixel(map_px), site.surface_at(map_px)])
 
 
-def _weights(site: OrthoMap, points_m: Array, scale_px: Array) -> Array:
-    """Weights (N,) of matches: large keypoints are less accurate, and on a rough surface heights vary."""
-    roughness = site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), ROUGH_REACH_PX)
-    return roughness / (1.0 + (scale_px / _BLUNT_PX) ** 2)
+def _weights(site: OrthoMap, points_m: Array) -> Array:
+    """Weights (N,) of matches: on a rough surface heights vary."""
+    return site.roughness_weight_at(site.pixel_from_enu(points_m[:, :2]), ROUGH_REACH_PX)

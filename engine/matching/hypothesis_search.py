@@ -203,7 +203,7 @@ def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.floa
         own = to_device(templates, correlator.query.device)
         for several in surfaces(region.search, own, group=group):
             yield from several
-    elif region.search.counts is not None and correlator.is_centred:
+    elif region.search.counts is not None:
         yield from surfaces_over_nodata(region.search, templates, min_overlap=MIN_VALID_SHARE, group=group)
     else:
         for first in range(0, len(templates), group):

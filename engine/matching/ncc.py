@@ -56,9 +56,7 @@ class Ncc(Method):
 
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         self.options = options.ncc
-        enhancement = self.options.enhance_radius_px, self.options.score
-        self.prepared = PreparedMap(site, device, *enhancement)
-        self.samples = SampleMap(site, *enhancement)
+        self.prepared, self.samples = PreparedMap(site, device), SampleMap(site)
 
     @property
     def cache_counters(self) -> dict[str, int]:

@@ -9,7 +9,6 @@ from engine.kernels.scores import enhance
 from engine.matching.candidates import PeakCandidate
 from engine.matching.correlation import METHOD, Aligned, Correlator
 from engine.matching.covariance import (
-    misalignment_covariance_px2,
     ncc_covariance_m2,
     peak_covariance_px,
     score_sigma,
@@ -84,10 +83,10 @@ def places_in(aligned: Aligned, window: Window) -> float:
 
 def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
     """The candidate compared with its frame upside down and mirrored, which show what chance reaches."""
-    options, aligned, rival_score, best = correlator.options, found.aligned, found.peak.second_score, -1.0
+    aligned, rival_score, best = found.aligned, found.peak.second_score, -1.0
     quick = EarlyStop(lambda peak: max(peak.score, peak.second_score) <= rival_score, lambda _: False)
     for patch in correlator.nowhere(aligned):
-        enhanced = enhance(patch, radius_px=options.enhance_radius_px, score=options.score)
+        enhanced = enhance(patch)
         rival = correlator.search(replace(aligned, template=enhanced), found.fix.window, quick)
         best = best if rival is None else max(best, rival.score)
     null = surprise_of(best, score_sigma(aligned.template.size))
@@ -101,7 +100,6 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
     errors = query.errors(correlator.options.errors)
     rows, columns = aligned.template.shape
     peak_px2 = peak_covariance_px(peak, rows * columns)
-    peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), pose.known_height_m, errors)
     covariance = ncc_covariance_m2(peak_px2, pose, query.camera, aligned.jacobian, errors)
     return query.fix(
         METHOD,

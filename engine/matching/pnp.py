@@ -26,7 +26,6 @@ Mask = NDArray[np.bool_]
 Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
 
 _MAX_SAMPLES = 1000  # that RANSAC draws
-_PAIRS = 24  # pairs of matches that give candidate centres if the attitude is known
 SLACK = 2.0
 """Factor on the tolerance at the start, for the error of a known attitude or of a pose that fits roughly."""
 # Of the correlation matrix; below it half of the digits are lost, and some direction is not determined.
@@ -123,35 +122,6 @@ def ransac(problem: Problem) -> Start | None:
         return None
     R = cv2.Rodrigues(rotvec)[0]
     return R, -R.T @ t[:, 0]
-
-
-def refine_from_attitude(problem: Problem) -> Fit | None:
-    """Return the pose near the known attitude, or None unless more than half of the matches are its inliers.
-
-    Two matches and the attitude determine the centre. A majority needs no further search: no other pose can have
-    one.
-    """
-    if problem.attitude is None:
-        return None
-    R, count = problem.attitude, problem.pixels.shape[1]
-    pairs = np.random.default_rng(0).integers(0, count, (2, _PAIRS))
-    x = R @ problem.points
-    rays = np.linalg.inv(problem.K) @ np.concatenate([problem.pixels, np.ones((1, count))])
-    # x = c + z ray with ray = (., ., 1): x gives the difference of the depths; x and y give the first depth.
-    one, two = pairs
-    deeper = x[2, one] - x[2, two]
-    offset, across = (x[:, one] - x[:, two] - deeper * rays[:, two])[:2], (rays[:, one] - rays[:, two])[:2]
-    depth = np.sum(offset * across, axis=0) / np.maximum(np.sum(across * across, axis=0), 1e-12)
-    centers = x[:, one] - depth * rays[:, one]
-    seen = x[:, None, :] - centers[:, :, None]
-    residual = problem.K[:2, :2] @ (seen[:2] / np.maximum(seen[2], 1e-9)).reshape(2, -1)
-    residual = residual.reshape(2, _PAIRS, count) + (problem.K[:2, 2:] - problem.pixels)[:, None, :]
-    near = np.sum(residual * residual, axis=0) <= (SLACK * problem.tolerance_px) ** 2
-    best = int(np.argmax(np.count_nonzero(near, axis=1)))
-    if 2 * np.count_nonzero(near[best]) <= count:
-        return None
-    fit = gauss_newton(problem, R, R.T @ centers[:, best], slack=SLACK)
-    return fit if fit is not None and 2 * np.count_nonzero(fit.inliers) > count else None
 
 
 # ----------------------------------------------------------------------------------------------------- refinement

@@ -30,7 +30,6 @@ from engine.matching.pnp import (
     gauss_newton,
     match_covariance,
     ransac,
-    refine_from_attitude,
     reproject,
     turn_from_attitude,
 )
@@ -241,9 +240,6 @@ def _spread(points: Array) -> float:
 
 
 def _fit(problem: Problem) -> Fit | None:
-    fit = refine_from_attitude(problem)
-    if fit is not None:
-        return fit
     start = ransac(problem)
     return None if start is None else gauss_newton(problem, *start)
 

@@ -21,7 +21,7 @@ from engine.kernels.dense import (
     covariance_of,
     refine,
 )
-from engine.kernels.scores import enhance
+from engine.kernels.scores import RADIUS_PX, enhance
 from engine.maps.grids import window_about
 from engine.maps.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
 from engine.matching.agreement import agree_in_height, are_consistent
@@ -339,12 +339,11 @@ class Refinement:
         """The frame at the resolution of a level, enhanced like the map, once for all attempts."""
         if level in self.pictures:
             return self.pictures[level]
-        query, options = self.query, self.options
+        query = self.query
         scale = height_m / query.camera.focal_px / (query.site.gsd_m_per_px * 2.0**level)
         gray, smaller = shrink(query.gray, scale)
         scale /= math.sqrt(smaller[0, 0] * smaller[1, 1])
-        radius_px = max(1, round(options.enhance_radius_px / scale)) if options.enhance_radius_px else 0
-        enhanced = enhance(gray, radius_px=radius_px, score=options.score)
+        enhanced = enhance(gray, radius_px=max(1, round(RADIUS_PX / scale)))
         self.pictures[level] = EnhancedFrame(enhanced, smaller @ query.camera.matrix)
         return self.pictures[level]
 

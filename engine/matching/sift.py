@@ -64,7 +64,7 @@ class Sift(Method):
         )
         self._enhancement = replace(options.ncc, errors=options.sift.errors)
         if samples is None:
-            samples = SampleMap(site, options.ncc.enhance_radius_px, options.ncc.score)
+            samples = SampleMap(site)
         self.samples = samples
 
     @property

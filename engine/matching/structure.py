@@ -68,15 +68,14 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
 def _templates(correlator: Correlator, aligned: Aligned) -> FloatImage:
     """Channels (3, T, h, w) of the frame and of the null-hypothesis templates."""
     patches = [aligned.patch.gray, *correlator.nowhere(aligned)]
-    radius_px = correlator.options.enhance_radius_px
-    return np.stack([_channels(patch, radius_px, None) for patch in patches], axis=1)
+    return np.stack([_channels(patch, None) for patch in patches], axis=1)
 
 
 def _scores(
     correlator: Correlator, aligned: Aligned, window: Window, templates: FloatImage
 ) -> tuple[FloatImage, Window] | None:
     """Scores (T, H', W') of templates by all channels, and where they begin; None if these do not fit."""
-    query, options = correlator.query, correlator.options
+    query = correlator.query
     crop = level_crop(query.site, window, aligned.level)
     height, width = aligned.template.shape
     if crop.width_px < width + 2 or crop.height_px < height + 2:
@@ -85,7 +84,7 @@ def _scores(
     if not query.site.fully_valid:
         valid = query.site.valid(crop, aligned.level)
         valid = None if valid.all() else valid
-    search = _channels(gray, options.enhance_radius_px, valid)
+    search = _channels(gray, valid)
     scores = on_host(ncc(to_device(search, query.device), to_device(templates, query.device)).mean(0))
     if valid is not None:
         # Nodata is 0 in all channels, near their mean, and so hardly lowers places that are mostly on the map.
@@ -98,6 +97,6 @@ def _share_on_map(valid: NDArray[np.bool_], height: int, width: int) -> NDArray[
     return np.asarray(box_sum(counts(valid), height, width) / (height * width), np.float64)
 
 
-def _channels(gray: NDArray[np.uint8], radius_px: int, valid: NDArray[np.bool_] | None) -> FloatImage:
+def _channels(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None) -> FloatImage:
     """Grey levels and both orientation channels, (3, H, W)."""
-    return np.concatenate([enhance(gray, radius_px=radius_px, valid=valid)[None], orientation(gray, valid=valid)])
+    return np.concatenate([enhance(gray, valid=valid)[None], orientation(gray, valid=valid)])

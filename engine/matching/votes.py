@@ -1,12 +1,11 @@
 """Vote for a translation: find the matches between orthophoto and map that agree, among mostly wrong ones.
 
 Every match votes for a position of the orthophoto. Right ones nearly agree, wrong ones scatter: the densest place
-wins even if nine in ten are wrong. Small turns and scale changes are tried as well.
+wins even if nine in ten are wrong. Small turns are tried as well.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -17,8 +16,6 @@ Array = NDArray[np.float64]
 
 TURNS_DEG = (0.0, -6.0, 6.0)
 """Turns of an orthophoto to try, since a heading may be wrong."""
-SCALES = (1.0, 0.93, 1.075)
-"""Scales to try, since a height may be wrong."""
 _RIVAL_RADII = 3.0  # from the best translation; closer votes may be its own, scattered by an unknown tilt
 
 
@@ -28,16 +25,14 @@ class Vote:
 
     Attributes:
         turn_deg: of the orthophoto about its middle, from +x towards +y.
-        scale: of the orthophoto about its middle.
         voters: (M,) bool, the matches that agree.
-        shift_px: (2,) from the orthophoto, turned and scaled, to the map.
+        shift_px: (2,) from the orthophoto, turned, to the map.
         surprise: -log of the probability that as many wrong matches agree on one translation.
         rival_surprise: the same of the best translation elsewhere.
         tried: how many translations were compared.
     """
 
     turn_deg: float
-    scale: float
     voters: NDArray[np.bool_]
     shift_px: Array
     surprise: float
@@ -59,30 +54,30 @@ def vote(photo_px: Array, map_px: Array, radius_px: float, distinct_px: float) -
     """
     from engine.kernels import clusters  # numba takes a while to import
 
-    best: tuple[int, float, float, NDArray[np.bool_], Array] | None = None
-    for turn_deg, scale in itertools.product(TURNS_DEG, SCALES):
-        shifts = map_px - photo_px @ similarity(turn_deg, scale).T
+    best: tuple[int, float, NDArray[np.bool_], Array] | None = None
+    for turn_deg in TURNS_DEG:
+        shifts = map_px - photo_px @ rotation(turn_deg).T
         voters = clusters.densest(shifts, radius_px)
         count = int(np.count_nonzero(voters))
         if count and (best is None or count > best[0]):
-            best = (count, turn_deg, scale, voters, shifts)
+            best = (count, turn_deg, voters, shifts)
         if 2 * count > len(map_px):
             break  # a majority needs no further search
     if best is None:
         return None
-    _, turn_deg, scale, voters, shifts = best
+    _, turn_deg, voters, shifts = best
     shift_px = shifts[voters].mean(axis=0)
     apart = shifts - shift_px
     elsewhere = np.einsum("ij,ij->i", apart, apart) > (_RIVAL_RADII * radius_px) ** 2
     rivals = np.flatnonzero(elsewhere)[clusters.densest(shifts[elsewhere], radius_px)]
-    placed_px = photo_px @ similarity(turn_deg, scale).T + shift_px
+    placed_px = photo_px @ rotation(turn_deg).T + shift_px
     extent = np.ptp(map_px - placed_px, axis=0) + 2.0 * radius_px
     by_chance = chance_of_agreeing(placed_px.T, map_px.T, voters, radius_px, float(extent.prod()))
     surprise, rival_surprise = (
         _surprise(photo_px[agreeing], len(map_px), by_chance, distinct_px) for agreeing in (voters, rivals)
     )
-    tried = len(map_px) * len(TURNS_DEG) * len(SCALES)
-    return Vote(turn_deg, scale, voters, shift_px, surprise, rival_surprise, tried)
+    tried = len(map_px) * len(TURNS_DEG)
+    return Vote(turn_deg, voters, shift_px, surprise, rival_surprise, tried)
 
 
 def chance_of_agreeing(
@@ -132,7 +127,7 @@ def _binomial_surprise(n: int, k: int, p: float) -> float:
     return n * (q * math.log(q / p) + ((1.0 - q) * math.log((1.0 - q) / (1.0 - p)) if q < 1.0 else 0.0))
 
 
-def similarity(turn_deg: float, scale: float) -> Array:
-    """(2, 2) matrix that turns from +x towards +y and scales."""
+def rotation(turn_deg: float) -> Array:
+    """(2, 2) matrix that turns from +x towards +y."""
     turn = math.radians(turn_deg)
-    return scale * np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    return np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])

@@ -12,7 +12,6 @@ import numpy as np
 from engine.budget import Budget, Deadline
 from engine.matching.covariance import map_sigma_of
 from engine.matching.evidence import SEARCHED, needed_nats, probability
-from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
 from engine.navigation.motion import (
     Array,
     FrameClock,
@@ -92,7 +91,6 @@ class Navigator:
         self._pictures = odometry_of(matcher) if o.odometry else None
         self._motion: GroundMotion | None = None  # up to the newest frame
         self._repeats = Repeats()
-        self._map_offset = MapOffsetEstimator()
         self._start = None if start is None else position_of(start, matcher.site)
         self._moments: deque[_Moment] = deque()  # of the last late_s
         self._accepted: _Accepted | None = None
@@ -152,11 +150,6 @@ class Navigator:
         return self._motion
 
     @property
-    def map_offset(self) -> MapOffset | None:
-        """The map's offset from the priors of :meth:`update`; it moves no fix. None without priors."""
-        return self._map_offset.offset
-
-    @property
     def calibration(self) -> Calibration:
         """Estimated errors of the telemetry's attitude, clock and height, with their uncertainties."""
         return self._errors.calibration
@@ -198,8 +191,6 @@ class Navigator:
             given = None if prior is None else position_of(prior, self._matcher.site)
             match = self._match(result, frame, moment.ways.seen, searched, given, is_about_given=is_given)
             result = self._judge(match, moment, late=late)
-            if isinstance(result, Fix) and given is not None:
-                self._map_offset.add(result, given, moment.time_s)
         elif not late and result.reason is not Reason.LATE:  # a lack of time is no evidence about the position
             self._refusals += 1
             self._moments[-1] = replace(moment, tracks=moment.tracks.missed())

@@ -29,7 +29,6 @@ _NO_RATES_DPS: Array = np.zeros(3)  # if they are unknown
 _FIRST_SHARE = 0.07  # error of the height before a picture measured it
 _WALK = np.array([0.2, 0.2, 0.5, 1e-3, 0.01])  # standard deviations of the states' change in one second
 _REFINED_DEG, _FEATURES_DEG = 0.6, 2.0  # standard deviations of a measured attitude, refined or by features alone
-_SCATTER_SHARE = 0.2  # weight of a new difference in the mean square
 _MAX_INTERVAL_S = 0.5  # between frames; over longer ones the turn rates are unknown
 _MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
 _MAX_LAG_DEG = 180.0  # timestamps in a wrong unit make rates of any size
@@ -89,12 +88,10 @@ class _Seen:
     Attributes:
         off_deg: (3,) roll, pitch and heading less the telemetry's.
         sigma_deg: standard deviation of each.
-        is_on_known_ground: whether it is on a surface model.
     """
 
     off_deg: Array
     sigma_deg: float
-    is_on_known_ground: bool
 
 
 class TelemetryErrors:
@@ -112,7 +109,6 @@ class TelemetryErrors:
             [o.tilt_bias_deg, o.tilt_bias_deg, o.heading_bias_deg, _FIRST_SHARE, o.attitude_lag_s]
         )
         self._mean, self._covariance = np.zeros(5), np.diag(self._first**2)
-        self._scatter_deg2 = np.zeros(3)  # mean square of recent differences in excess of the expected
         self._attitudes = self._heights = 0  # fixes that measured it
         self._time_s: float | None = None
         self._stamp_ns: int | None = None
@@ -203,7 +199,7 @@ class TelemetryErrors:
         if self._attitudes >= MIN_FRAMES:
             is_off = np.abs(self._mean[_ANGLES]) > _MIN_SIGMAS * np.array([tilt_deg, tilt_deg, heading_deg])
             off = is_off.astype(np.float64)
-            wider_deg2 = wider_deg2 + variance[_ANGLES] * off + self._scatter_deg2
+            wider_deg2 = wider_deg2 + variance[_ANGLES] * off
         wider_deg2 = np.minimum(wider_deg2, _MAX_LAG_DEG**2)
         if not wider_deg2.any():
             return frame
@@ -232,21 +228,21 @@ class TelemetryErrors:
         Args:
             fix: an accepted fix. One without a height did not measure its attitude.
             ground_m: height of the ground below it; None if the ground is assumed flat, where a slope looks like a
-                tilt: only the lag is learnt then, from turns.
+                tilt: nothing is learnt then.
         """
         self._settling = max(self._settling - 1, 0)
         if self._searched:  # earlier estimates were wrong
             self._searched = False
             self.forget()
         seen, known = fix.attitude, self._angles_deg
-        if fix.up_m is None:
+        if fix.up_m is None or ground_m is None:
             return
         if seen is not None and known is not None and abs(seen.pitch_deg) <= _MAX_PITCH_DEG:
             apart = np.array([seen.roll_deg, seen.pitch_deg, seen.heading_deg]) - known
             off = np.array([math.remainder(angle, 360.0) for angle in apart.tolist()])
             sigma_deg = _REFINED_DEG if fix.stage in ("refined", "verified") else _FEATURES_DEG
-            self._seen = _Seen(off, sigma_deg, ground_m is not None)
-        if ground_m is not None and self._height_m is not None:
+            self._seen = _Seen(off, sigma_deg)
+        if self._height_m is not None:
             share = (fix.up_m - ground_m) / self._height_m - 1.0
             noise_m2 = float(fix.covariance_m2[2, 2]) + self._assumed.height_sigma_m(self._height_m) ** 2
             self._update(np.array([share]), np.eye(5)[[_HEIGHT]], np.array([noise_m2 / self._height_m**2]))
@@ -268,19 +264,15 @@ class TelemetryErrors:
         design = np.zeros((3, 5))
         design[:, _ANGLES], design[:, _LAG] = np.eye(3), rates_dps
         noise_deg2 = seen.sigma_deg**2 + (rates_dps * self._jitter_s) ** 2
-        excess = self._update(seen.off_deg, design, noise_deg2, only_lag=not seen.is_on_known_ground)
-        if seen.is_on_known_ground:
-            if self._attitudes:
-                beyond_deg2 = np.clip(excess, 0.0, self._first[_ANGLES] ** 2)
-                self._scatter_deg2 += _SCATTER_SHARE * (beyond_deg2 - self._scatter_deg2)
-            self._attitudes += 1
+        self._update(seen.off_deg, design, noise_deg2)
+        self._attitudes += 1
 
     def forget(self) -> None:
         """Forget what was learnt, but for the lag: it came from a wrong position, or no longer holds."""
         lag_s, lag_s2 = self._mean[_LAG], self._covariance[_LAG, _LAG]
         self._mean, self._covariance = np.zeros(5), np.diag(self._first**2)
         self._mean[_LAG], self._covariance[_LAG, _LAG] = lag_s, lag_s2
-        self._scatter_deg2, self._attitudes, self._heights, self._seen = np.zeros(3), 0, 0, None
+        self._attitudes, self._heights, self._seen = 0, 0, None
 
     def _follow(self, frame: Frame, time_s: float) -> None:
         """Take the newest frame: learn from the last one's fix, let the states walk, compute the turn."""
@@ -304,18 +296,15 @@ class TelemetryErrors:
         steps = [math.remainder(float(step), 360.0) for step in angles_deg - self._angles_deg]
         return _Turn(np.array(steps), interval_s)
 
-    def _update(self, measured: Array, design: Array, noise: Array, *, only_lag: bool = False) -> Array:
-        """A Kalman update (Schmidt's if only the lag is learnt); by how much squares exceed the expected."""
+    def _update(self, measured: Array, design: Array, noise: Array) -> None:
+        """A Kalman update."""
         total = design @ self._covariance @ design.T + np.diag(noise)
         most = SPREAD_SIGMAS * np.sqrt(np.diag(total))  # one fix may be wrong
         off = np.clip(measured - design @ self._mean, -most, most)
         gain = self._covariance @ design.T @ np.linalg.inv(total)
-        if only_lag:
-            gain[:_LAG] = 0.0
         self._mean = self._mean + gain @ off
         left = np.eye(5) - gain @ design
         self._covariance = left @ self._covariance @ left.T + (gain * noise) @ gain.T
-        return np.asarray(off**2 - np.diag(total))
 
 
 def considered(fix: Fix, frame: Frame, shown: Frame, camera: Camera | None) -> Fix:

@@ -66,7 +66,7 @@ def measure_self_match(plan: AuditPlan) -> Iterator[SelfMatchStatistics]:
 
     A large map is read on demand, using one core.
     """
-    prepared = PreparedMap(plan.site, CPU, NCC.enhance_radius_px, NCC.score)
+    prepared = PreparedMap(plan.site, CPU)
     noise, centers_px = _noise(plan.shape), plan.centers_px[plan.audited]
 
     def measured(index: int) -> SelfMatchStatistics:
@@ -130,7 +130,7 @@ def _templates(gray: Gray, noise: Pictures) -> Pictures:
     """(T, h, w) enhanced: the patch unchanged, shaken, and changed (draws)."""
 
     def enhanced(picture: Gray) -> Pictures:
-        return enhance(picture, radius_px=NCC.enhance_radius_px, score=NCC.score)
+        return enhance(picture)
 
     part = _SHAKE_PX / (max(gray.shape) / 2.0)
     shaken = cv2.GaussianBlur(_perturbed(gray, math.degrees(part), 1.0 + part, 0.0), (0, 0), _SHAKE_BLUR_PX)

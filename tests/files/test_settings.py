@@ -64,7 +64,7 @@ def test_values_arrive(path):
         ("[ncc]\nzebra = 1", "ncc.zebra: not a setting; expected one of score, "),
         ('[ncc]\nexclusion_m = "wide"', "ncc.exclusion_m: expected a number, got 'wide'"),
         ("[ncc]\nexclusion_m = 0.0", "ncc.exclusion_m: expected a number above 0, got 0.0"),
-        ("[ncc]\nenhance_radius_px = 2.5", "ncc.enhance_radius_px: expected a whole number, got 2.5"),
+        ("[sift]\nupsample = 2.5", "sift.upsample: expected a whole number, got 2.5"),
         ("[ncc]\nrefine = 1", "ncc.refine: expected true or false, got 1"),
         ("[ncc]\nerrors = 3", "ncc.errors: expected a table, got 3"),
         ("[ncc.errors]\nmap_m = -1", "ncc.errors.map_m: expected a number above 0, got -1.0"),

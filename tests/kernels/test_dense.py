@@ -149,9 +149,9 @@ def test_samples_share_a_cell_within_an_eighth_of_the_picture(scene, camera):
 
 def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground):
     site = ground.flat_site
-    prepared = PreparedMap(site, torch.device("cpu"), radius_px=12)
+    prepared = PreparedMap(site, torch.device("cpu"))
     window = Window(100, 120, 200, 160)
-    found = SampleMap(site, 12).find(window, 0)
+    found = SampleMap(site).find(window, 0)
     picture = prepared.cut(whole(site), 0).search.image
     for axis, step in enumerate(np.eye(2) * site.gsd_m_per_px):
         at = [site.pixel_from_enu(found.points_m[:, :2] + sign * step) for sign in (1, -1)]
@@ -272,7 +272,7 @@ def test_rough_ground_counts_less(ground):
     heights = np.zeros(ground.gray.shape, np.float32)
     heights[200:260, 200:260] = 12.0
     site = ground.map_of(surface_m=heights)
-    samples = SampleMap(site, 8).find(Window(160, 160, 140, 140), 0)
+    samples = SampleMap(site).find(Window(160, 160, 140, 140), 0)
     x, y = site.pixel_from_enu(samples.points_m[:, :2]).T
     wall = (np.minimum(abs(x - 199.5), abs(x - 259.5)) < 1.0) & (y > 203) & (y < 256)
     level = (np.abs(x - 230) > 34) | (np.abs(y - 230) > 34)

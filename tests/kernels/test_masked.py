@@ -110,15 +110,10 @@ def by_whole_windows(window, valid, templates, min_overlap):
     return masked_tensors.ncc_surface(*tensors, min_overlap=min_overlap)[0].numpy()
 
 
-@pytest.mark.parametrize("divisions", [(1,), (3,), (16,), None], ids=["whole", "in 3", "in 16", "small"])
 @pytest.mark.parametrize("min_overlap", [0.3001, 0.8999])
 @pytest.mark.parametrize("kind", MASKS)
 @pytest.mark.parametrize(("size", "model"), [((230, 317), (48, 61)), ((400, 260), (21, 20)), ((97, 90), (90, 90))])
-def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, model, divisions, monkeypatch):
-    """Windows that count as small are neither divided nor scored in two ways."""
-    if divisions is not None:
-        monkeypatch.setattr(masked_blocks, "_SMALL_PX", 0)
-        monkeypatch.setattr(masked_blocks, "_divisions", lambda places: divisions)
+def test_scores_are_those_of_the_whole_windows_sums(kind, min_overlap, size, model):
     window, valid, templates = drawn(kind, size, model)
     window, templates = (values.astype(np.float32).astype(np.float64) for values in (window, templates))
     expected = by_whole_windows(window, valid, templates, min_overlap)

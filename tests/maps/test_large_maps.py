@@ -153,7 +153,7 @@ def test_a_surface_read_by_tiles_is_the_surface_in_memory(tmp_path, gray, sim_to
     expected = np.where(heights == kept.ground_m, tiled.ground_m, heights)  # its own for what is unknown
     # What is in memory is interpolated by a compiled loop.
     np.testing.assert_allclose(tiled.surface_at(xy), expected, rtol=1e-14, atol=0.0)
-    planes = [site.ground_plane([150.0, 100.0], 30.0)[0] for site in (tiled, kept)]
+    planes = [site.ground_at([150.0, 100.0]) for site in (tiled, kept)]
     assert planes[0] == pytest.approx(planes[1], rel=1e-12)
     assert tiled.ground_m == pytest.approx(kept.ground_m, abs=1.0)
 

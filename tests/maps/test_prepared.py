@@ -5,14 +5,13 @@ import pytest
 import torch
 
 from engine import OrthoMap
-from engine.kernels.scores import SCORES, enhance
+from engine.kernels.scores import enhance
 from engine.maps import prepared
 from engine.maps.prepared import PreparedMap, Region
 from engine.ncc_fft import prepare
 from engine.values import Window
 from tests.support.threads import called_at_once
 
-RADIUS_PX = 8
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])
 WINDOWS = [
     Window(0, 0, 200, 190), Window(100, 120, 150, 133), Window(127, 127, 2, 2), Window(301, 255, 99, 145),
@@ -53,19 +52,18 @@ def levels_of(search):
 
 # A cell without nodata is smoothed in whole grey levels, which moves an enhanced pixel by some hundredths of its
 # neighbourhood's deviation.
-ROUNDED = {"grey": 0.6, "local": 0.05, "gradient": 0.1, "mixed": 0.1}
+ROUNDED = 0.05
 
 
-@pytest.mark.parametrize("score", SCORES)
 @pytest.mark.parametrize("masked", [False, True], ids=["whole", "nodata"])
 @pytest.mark.parametrize("window", WINDOWS, ids=str)
-def test_cells_join_without_a_seam(gray, holes, window, masked, score, monkeypatch, by_cells):
+def test_cells_join_without_a_seam(gray, holes, window, masked, monkeypatch, by_cells):
     site = site_of(gray, holes if masked else None)
-    pieces = PreparedMap(site, CPU, RADIUS_PX, score).cut(window, 0)
+    pieces = PreparedMap(site, CPU).cut(window, 0)
     monkeypatch.setattr(prepared, "WHOLE_LEVEL_PX", 1 << 23)
-    whole = PreparedMap(site, CPU, RADIUS_PX, score).cut(window, 0)
+    whole = PreparedMap(site, CPU).cut(window, 0)
     assert pieces.window == whole.window
-    tolerance = ROUNDED[score] if masked else 2e-5  # running sums in float32 begin elsewhere
+    tolerance = ROUNDED if masked else 2e-5  # running sums in float32 begin elsewhere
     for part, full in zip(levels_of(pieces.search), levels_of(whole.search), strict=False):
         np.testing.assert_allclose(part.image, full.image, rtol=0, atol=tolerance)
     np.testing.assert_array_equal(pieces.valid, whole.valid)
@@ -75,8 +73,8 @@ def test_cells_join_without_a_seam(gray, holes, window, masked, score, monkeypat
 def test_a_cut_is_the_enhanced_level_from_the_multiple_of_eight_before_it(gray, level):
     site = site_of(gray)
     rows, columns = site.level_shape(level)
-    picture = enhance(site.gray(Window(0, 0, columns, rows), level), radius_px=RADIUS_PX)
-    maps = PreparedMap(site, CPU, RADIUS_PX)
+    picture = enhance(site.gray(Window(0, 0, columns, rows), level))
+    maps = PreparedMap(site, CPU)
     for x, y, width, height in ((0, 0, columns, rows), (13, 31, 60, 50), (16, 24, 41, 33), (columns - 5, 7, 5, 5)):
         cut = maps.cut(Window(x, y, width, height), level)
         x0, y0 = x // 8 * 8, y // 8 * 8
@@ -87,7 +85,7 @@ def test_a_cut_is_the_enhanced_level_from_the_multiple_of_eight_before_it(gray, 
 
 
 def test_masks_are_cut_with_the_picture_and_left_out_where_all_is_map(gray, holes):
-    maps = PreparedMap(site_of(gray, holes), CPU, RADIUS_PX)
+    maps = PreparedMap(site_of(gray, holes), CPU)
     clear = maps.cut(Window(40, 240, 150, 100), 0)
     assert clear.valid is None
     across = maps.cut(Window(203, 101, 160, 160), 0)
@@ -101,13 +99,13 @@ def test_nodata_does_not_reach_into_the_map(gray, holes):
     """The grey value under nodata is without meaning; no valid pixel may depend on it."""
     other = gray.copy()
     other[~holes] = 255 - other[~holes]
-    cuts = [PreparedMap(site_of(g, holes), CPU, RADIUS_PX).cut(Window(0, 0, 550, 400), 0) for g in (gray, other)]
+    cuts = [PreparedMap(site_of(g, holes), CPU).cut(Window(0, 0, 550, 400), 0) for g in (gray, other)]
     np.testing.assert_array_equal(cuts[0].search.image, cuts[1].search.image)
 
 
 def test_memory_stays_within_its_bound_and_what_was_given_up_comes_back_the_same(gray, monkeypatch, by_cells):
     monkeypatch.setattr(prepared, "MAX_REGION_PX", 3 * 128 * 128)
-    maps = PreparedMap(site_of(gray), CPU, RADIUS_PX)
+    maps = PreparedMap(site_of(gray), CPU)
     first = maps.cut(Window(10, 10, 60, 60), 0)
     for y in range(0, 300, 50):
         for x in range(0, 450, 50):
@@ -122,7 +120,7 @@ def test_memory_stays_within_its_bound_and_what_was_given_up_comes_back_the_same
 
 def test_a_level_that_is_small_is_prepared_once_and_kept(gray, monkeypatch):
     monkeypatch.setattr(prepared, "MAX_REGION_PX", 1)
-    maps = PreparedMap(site_of(gray), CPU, RADIUS_PX)
+    maps = PreparedMap(site_of(gray), CPU)
     for _ in range(2):
         for level in (0, 1, 2):
             maps.cut(Window(8, 8, 40, 40), level)
@@ -136,7 +134,7 @@ def test_several_threads_may_cut_at_once(gray, monkeypatch, by_cells):
     monkeypatch.setattr(prepared, "MAX_REGION_PX", 128 * 128)
     search = prepare(torch.zeros(400, 550))
     monkeypatch.setattr(PreparedMap, "_prepare", lambda _, window, level: Region(window, search, None))
-    maps = PreparedMap(site_of(gray), CPU, RADIUS_PX)
+    maps = PreparedMap(site_of(gray), CPU)
     places = np.random.default_rng(0).integers(0, 400 - 64, (4000, 2)).tolist()
     cuts = called_at_once(lambda place: maps.cut(Window(*place, 64, 64), 0), places)
     assert all(cut.window.x0 == x & -8 for cut, (x, _) in zip(cuts, places, strict=True))

@@ -18,7 +18,7 @@ def make_map(height_px, width_px):
     """Samples of a rough map whose levels all count as large, and the map."""
     gray = np.random.default_rng(1).integers(0, 256, (height_px, width_px), dtype=np.uint8)
     site = OrthoMap.from_arrays(gray, AFFINE, "EPSG:32633", surface_m=np.zeros(gray.shape, np.float32))
-    return SampleMap(site, 8), site
+    return SampleMap(site), site
 
 
 @pytest.fixture

@@ -206,7 +206,7 @@ def apart_m(one, other):
 
 
 # Copies to the host per frame once the map is prepared: the peak; and of pairs pixels, scales, which count, whose.
-DOWNLOADS = {("ncc", "auto"): 1, ("sift", "kornia"): 4, ("sift", "auto"): 0, ("auto", "kornia"): 5}
+DOWNLOADS = {("ncc", "auto"): 1, ("sift", "kornia"): 3, ("sift", "auto"): 0, ("auto", "kornia"): 4}
 METRES = {"ncc": 1e-6, "sift": 1e-2, "auto": 1e-6}
 
 

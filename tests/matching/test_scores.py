@@ -1,18 +1,15 @@
-"""Scores and structure: each is what its line says, respects nodata, finds its place where it is meant to."""
+"""Enhanced grey levels and structure: each is what its line says, respects nodata, finds its place."""
 
 import math
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from engine import Frame, MatcherOptions, NoFix, OptionError, SceneMatcher
-from engine.kernels.scores import SCORES, enhance, orientation
-from engine.options import NccOptions
+from engine import Frame, NoFix, OptionError, SceneMatcher
+from engine.kernels.scores import enhance, orientation
 from tests.support.fixes import px_off
-from tests.support.paths import ROOT
 
 CPU = torch.device("cpu")
 NADIR = np.array([310.0, 305.0])
@@ -30,48 +27,31 @@ def binomial(gray):
     return (tall[:, :-2] + 2 * tall[:, 1:-1] + tall[:, 2:]) / 16
 
 
-# What each score is
-
-
-def test_grey_is_the_smoothed_picture_about_middle_grey():
-    gray = noise()
-    np.testing.assert_allclose(enhance(gray, score="grey"), binomial(gray) - 128, atol=0.51)
-
-
-def test_local_without_a_neighbourhood_only_smooths():
-    gray = np.random.default_rng(2).integers(0, 256, (9, 7)).astype(np.uint8)
-    np.testing.assert_allclose(enhance(gray, radius_px=0), binomial(gray), atol=0.51)
-    with pytest.raises(OptionError, match=r"^radius_px: expected 0 or more, got -1"):
-        enhance(gray, radius_px=-1)
+# What is correlated
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize(("score", "off"), [("local", 0.05), ("gradient", 0.1)])
-def test_a_score_is_its_normalisation_as_written(score, off, masked):
-    """Of the smoothed picture, or of its gradient's magnitude by central differences."""
+def test_a_pixel_is_normalised_by_its_neighbourhood(masked):
+    """Of the smoothed picture."""
     gray = noise()
     smooth = binomial(gray)
-    picture = smooth if score == "local" else np.hypot(*np.gradient(smooth))
     valid = np.ones(gray.shape, bool) if masked else None
-    enhanced = enhance(gray, radius_px=3, score=score, valid=valid)
+    enhanced = enhance(gray, radius_px=3, valid=valid)
     for y, x in ((10, 10), (20, 33), (50, 44)):
-        box = picture[y - 3 : y + 4, x - 3 : x + 4]
-        expected = (picture[y, x] - box.mean()) / math.sqrt(box.var() + 4.0)
-        assert enhanced[y, x] == pytest.approx(expected, abs=off)  # smoothed to whole grey levels
+        box = smooth[y - 3 : y + 4, x - 3 : x + 4]
+        expected = (smooth[y, x] - box.mean()) / math.sqrt(box.var() + 4.0)
+        assert enhanced[y, x] == pytest.approx(expected, abs=0.05)  # smoothed to whole grey levels
 
 
-def test_mixed_is_the_sum_of_local_and_gradient():
-    gray, valid = noise(), noise(seed=1) > 20
-    for mask in (None, valid):
-        both = enhance(gray, score="local", valid=mask) + enhance(gray, score="gradient", valid=mask)
-        np.testing.assert_allclose(enhance(gray, score="mixed", valid=mask), both, atol=1e-6)
+def test_a_neighbourhood_without_a_pixel_is_refused():
+    with pytest.raises(OptionError, match=r"^radius_px: expected 1 or more, got 0"):
+        enhance(noise(), radius_px=0)
 
 
-@pytest.mark.parametrize("score", SCORES)
-def test_flat_ground_stays_flat_and_finite(score):
+def test_flat_ground_stays_flat_and_finite():
     for level in (0, 17, 255):
-        assert np.ptp(enhance(np.full((30, 31), level, np.uint8), score=score)) < 0.02
-    assert not enhance(np.full((30, 31), 80, np.uint8), score=score, valid=np.zeros((30, 31), bool)).any()
+        assert np.ptp(enhance(np.full((30, 31), level, np.uint8))) < 0.02
+    assert not enhance(np.full((30, 31), 80, np.uint8), valid=np.zeros((30, 31), bool)).any()
 
 
 # Orientation
@@ -107,59 +87,44 @@ def test_what_is_not_valid_has_no_orientation_and_is_not_seen(ground):
 # Nodata
 
 
-@pytest.mark.parametrize("score", SCORES)
-@pytest.mark.parametrize("radius_px", [0, 5])
-def test_what_is_not_valid_is_not_seen(score, radius_px):
+def test_what_is_not_valid_is_not_seen():
     gray = noise()
     valid = np.ones(gray.shape, bool)
     valid[:, 40:] = False
     valid[5:9, 5:8] = False
     black, white = np.where(valid, gray, 0).astype(np.uint8), np.where(valid, gray, 255).astype(np.uint8)
-    first, second = (enhance(g, radius_px=radius_px, score=score, valid=valid) for g in (black, white))
+    first, second = (enhance(g, radius_px=5, valid=valid) for g in (black, white))
     np.testing.assert_allclose(first, second, rtol=1e-6, atol=1e-6)  # a few roundings of float32
     assert not first[~valid].any()
-    far = np.s_[20:, : 40 - radius_px - 2]
-    whole = enhance(gray, radius_px=radius_px, score=score)
-    np.testing.assert_allclose(first[far], whole[far], atol=1.6 if radius_px == 0 or score == "grey" else 0.2)
-
-
-@pytest.mark.parametrize("score", ["gradient", "mixed"])
-def test_the_edge_of_nodata_is_no_edge_on_the_ground(score):
-    """Flat bright ground beside nodata: a gradient taken across would be the strongest of all."""
-    valid = np.ones((40, 40), bool)
-    valid[:, 20:] = False
-    assert np.abs(enhance(np.where(valid, 230, 0).astype(np.uint8), score=score, valid=valid)).max() < 1e-2
+    far = np.s_[20:, :33]
+    np.testing.assert_allclose(first[far], enhance(gray, radius_px=5)[far], atol=0.2)
 
 
 # Finding a place
 
 
-def matcher_of(ground, camera, score):
-    return SceneMatcher(ground.site, camera, "ncc", "cpu", MatcherOptions(ncc=NccOptions(score=score)))
+def matcher_of(ground, camera):
+    return SceneMatcher(ground.site, camera, "ncc", "cpu")
 
 
-@pytest.mark.parametrize("score", SCORES)
-def test_every_score_finds_its_place(ground, camera, score):
-    matcher = matcher_of(ground, camera, score)
+def test_a_frame_finds_its_place(ground, camera):
     frame = ground.frame(camera, NADIR, roll_deg=-5.0, pitch_deg=4.0, heading_deg=200.0)
     for prior in (ground.prior(NADIR), None):
-        assert px_off(matcher.locate(frame, prior), NADIR) < PIXELS
+        assert px_off(matcher_of(ground, camera).locate(frame, prior), NADIR) < PIXELS
 
 
-@pytest.mark.parametrize("score", ["local", "gradient", "mixed"])
-def test_a_frame_that_is_darker_to_one_side_is_found(ground, camera, score):
+def test_a_frame_that_is_darker_to_one_side_is_found(ground, camera):
     image = ground.picture(camera, NADIR, 150.0)
     shaded = np.rint(image * np.linspace(0.25, 1.0, image.shape[1])).astype(np.uint8)
     frame = Frame(shaded, 0, 150.0, 0.0, 0.0, 0.0)
-    assert px_off(matcher_of(ground, camera, score).locate(frame, ground.prior(NADIR)), NADIR) < PIXELS
+    assert px_off(matcher_of(ground, camera).locate(frame, ground.prior(NADIR)), NADIR) < PIXELS
 
 
-def test_a_frame_whose_tones_are_turned_round_is_found_by_its_gradient_or_structure(ground, camera):
+def test_a_frame_whose_tones_are_turned_round_is_found_by_its_structure(ground, camera):
     inverted = Frame(255 - ground.picture(camera, NADIR, 150.0), 0, 150.0, 0.0, 0.0, 0.0)
-    for score in ("gradient", "local"):
-        found = matcher_of(ground, camera, score).locate(inverted, ground.prior(NADIR))
-        assert px_off(found, NADIR) < PIXELS
-        assert ("structure" in found.timings.stages_ms) == (score == "local")
+    found = matcher_of(ground, camera).locate(inverted, ground.prior(NADIR))
+    assert px_off(found, NADIR) < PIXELS
+    assert "structure" in found.timings.stages_ms
 
 
 def test_a_frame_of_which_half_the_tones_are_turned_round_is_found_by_structure(ground, camera):
@@ -168,7 +133,7 @@ def test_a_frame_of_which_half_the_tones_are_turned_round_is_found_by_structure(
     rows, columns = (np.arange(n) // 40 for n in image.shape[:2])
     swapped = (rows[:, None] + columns) % 2 == 0
     image[swapped] = 255 - image[swapped]
-    matcher = SceneMatcher(ground.site, camera, "ncc", "cpu")
+    matcher = matcher_of(ground, camera)
     result = matcher.locate(Frame(image, 0, 150.0, 0.0, 0.0, 0.0), ground.prior(NADIR))
     assert px_off(result, NADIR) < 2.0
     assert "structure" in result.timings.stages_ms
@@ -193,15 +158,3 @@ def test_no_heading_makes_another_place_look_right(ground, camera, heading_deg):
     frame = ground.frame(camera, NADIR, 150.0, heading_deg=40.0)
     mirrored = replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), heading_deg=heading_deg)
     assert isinstance(SceneMatcher(ground.site, camera, "ncc", "cpu").locate(mirrored, ground.prior(NADIR)), NoFix)
-
-
-# The page
-
-
-def test_the_page_lists_every_score_and_measures_it():
-    page = (ROOT / "docs" / "scores.md").read_text(encoding="utf-8")
-    measured = (ROOT / "docs" / "results" / "scores.md").read_text(encoding="utf-8")
-    assert re.findall(r'^\| `"(\w+)"` \|', page, re.MULTILINE) == list(SCORES)
-    head, _, *rows = [line.strip("|").split("|") for line in measured.splitlines() if line.startswith("|")]
-    assert [cell.strip(' `"') for cell in head[1:]] == list(SCORES)
-    assert all(len(row) == len(head) and all(re.search(r"\d", cell) for cell in row[1:]) for row in rows)

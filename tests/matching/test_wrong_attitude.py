@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from engine import Fix, NoFix, Reason, SceneMatcher
+from engine.geo import chi_square_of
 from engine.matching.evidence import Evidence, probability
 from engine.matching.ncc import Ncc
 from engine.matching.refinement import Refined, Refinement
 from engine.runtime.scheduler import OutOfTime
+from engine.values import CHANCE
 
 NADIR = np.array([310.0, 305.0])
 TRUE = {"roll_deg": 4.0, "pitch_deg": -3.0, "heading_deg": 20.0}
@@ -44,7 +46,8 @@ WRONG = [
 def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, matchers, camera, method, stated):
     frame = replace(ground.frame(camera, NADIR, 150.0, **TRUE), **stated)
     fix = matchers[method].locate(frame, ground.prior(NADIR))
-    assert np.hypot(*ground.off_m(fix, NADIR)) < min(1.0, 3.0 * fix.sigma_m)
+    assert np.hypot(*ground.off_m(fix, NADIR)) < 1.0
+    assert ground.chi_square(fix, NADIR) < chi_square_of(CHANCE, 2)
     assert abs(fix.attitude.roll_deg - TRUE["roll_deg"]) < 0.5
     assert abs(fix.attitude.pitch_deg - TRUE["pitch_deg"]) < 0.5
 

@@ -142,7 +142,7 @@ def test_without_stamp_or_attitude_there_is_no_rate(changes):
         *(({name: None}, False, True, 0.0) for name in ANGLES),
         ({"height_agl_m": None}, True, False, 0.1),
         ({"measured": False}, False, False, 0.0),  # a fix that did not measure its height
-        ({"ground_m": None}, False, False, 0.1),  # over ground that is taken for flat
+        ({"ground_m": None}, False, False, 0.0),  # over ground that is taken for flat
     ],
 )
 def test_what_is_not_known_of_a_frame_or_its_fix_teaches_nothing(missing, attitude, height, lag_s):
@@ -184,12 +184,6 @@ def test_one_wild_attitude_moves_it_by_little():
     known = errors.calibration.attitude
     assert max(abs(known.roll_deg), abs(known.pitch_deg)) < 0.5
     assert abs(known.heading_deg) < 1.0
-
-
-def test_differences_that_scatter_widen_the_errors():
-    widths = [flown(noise_deg=d)[0].without_errors(CALM).tilt_sigma_deg or ASSUMED.tilt_deg for d in (0.3, 3.0)]
-    assert widths[0] < 0.7
-    assert widths[1] > 0.8  # at most hypot(0.37, 1), by the bias's own sigma
 
 
 @pytest.mark.parametrize(("stage", "noise_deg"), [("refined", 0.6), ("fine", 2.0)])

@@ -1,4 +1,4 @@
-"""The map's own error: one for all fixes of a map, and what another source says of it in flight."""
+"""The map's own error: one for all fixes of a map."""
 
 import math
 
@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 
 from engine import Fix, Navigator, Prior, Window
-from engine.geo import LocalFrame
-from engine.navigation.map_offset import MapOffset, MapOffsetEstimator
-from engine.navigation.motion import PositionEstimate
 from tests.support.fixes import a_fix
 from tests.support.matchers import ScriptedMatcher, a_site, at, flown
 
@@ -53,33 +50,3 @@ def test_a_position_of_another_source_is_searched_with_the_maps_error(is_start):
     start, given = (known, None) if is_start else (None, known)
     assert isinstance(Navigator(matcher, start).update(at(0.0, STILL), given), Fix)
     assert matcher.priors[0].sigma_m == pytest.approx(3.0, rel=1e-3)
-
-
-def test_the_offset_is_estimated_in_flight_and_moves_no_fix():
-    rng = np.random.default_rng(1)
-    places = rng.normal([2.0, -1.0], 0.3, (300, 2))
-    given = [Prior(east_m=float(e), north_m=float(n), sigma_m=0.5) for e, n in places]
-    run = fly([(0.0, 0.0)] * 300, given)
-    assert all(isinstance(result, Fix) and result.east_m == 0.0 for result in run.results)
-    offset = run.navigator.map_offset
-    sigma_m = np.sqrt(np.diag(offset.covariance_m2))
-    assert (np.abs(offset.en_m - [2.0, -1.0]) < 3.0 * sigma_m).all()
-    assert sigma_m.min() > 0.1  # five minutes count as some six differences
-    assert sigma_m.max() < 0.5
-
-
-def test_without_another_source_nothing_is_known_of_the_offset():
-    assert fly([(0.0, 0.0)] * 3).navigator.map_offset is None
-    estimator = MapOffsetEstimator()
-    estimator.add(fix_at(0.0, 0.0, map_sigma_m=0.0), PositionEstimate(np.ones(2), 1.0), 0.0)
-    assert estimator.offset is None
-
-
-def test_a_corrected_fix_is_moved_in_all_its_coordinates():
-    frame = LocalFrame(48.0, 15.0)
-    fix = fix_at(0.0, 0.0)
-    moved = MapOffset(np.array([30.0, -40.0]), 0.04 * np.eye(2)).corrected(fix, frame)
-    assert (moved.east_m, moved.north_m, moved.map_sigma_m) == (30.0, -40.0, 0.0)
-    assert np.allclose(frame.enu_from_geodetic(moved.lat_deg, moved.lon_deg), [30.0, -40.0], atol=1e-6)
-    assert moved.sigma_m == pytest.approx(math.hypot(0.5, 0.2))
-    assert moved.covariance_m2[2, 2] == fix.covariance_m2[2, 2]
