@@ -199,7 +199,10 @@ def run_mavlink_bridge(
     last_fix = LastFix(
         last_fix_file(link.connect, link.system_id, Path(files.map.map).absolute()) if resumes else None
     )
-    matcher = _loaded(files, settings, start, progress, brief=last_fix.prior(speed_mps) is not None)
+    in_flight = last_fix.prior(speed_mps) is not None
+    if in_flight:
+        settings.schedule_this_thread()  # the vehicle waits for its fixes
+    matcher = _loaded(files, settings, start, progress, brief=in_flight)
     site, camera = matcher.site, matcher.camera
     end_on_sigterm()  # before the fork, so that the worker has it from its first instruction
     if supervise:
