@@ -106,7 +106,8 @@ class _CommandSource:
         try:
             self._process: Any = subprocess.Popen(shlex.split(command), stdout=subprocess.PIPE, bufsize=0)
         except (OSError, ValueError, IndexError) as error:
-            raise TelemetryError(f"camera_source: {quoted(command)} cannot be run: {error}") from None
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise TelemetryError(f"camera_source: {quoted(command)} cannot be run: {reason}") from None
         self._buffer, self._arrived_ns = bytearray(), 0
 
     def read(self) -> tuple[Image, int] | None:

@@ -685,6 +685,11 @@ def test_gps_input_stands_beside_a_receiver_as_the_second():
         MavlinkOptions(gps_id=1)
 
 
+def test_a_system_id_that_mavlink_cannot_send_is_refused():
+    with pytest.raises(OptionError, match="system_id: expected 1 to 255, got 256"):
+        MavlinkOptions(system_id=256)
+
+
 def test_the_delay_is_the_one_that_is_given_and_said(tmp_path, capsys):
     words = ["bridge", "mavlink", "--force", "--write-params", str(tmp_path / "x.param")]
     assert main(words) == 0
@@ -875,7 +880,9 @@ def test_a_packet_that_cannot_be_read_does_not_end_the_reading(loop, monkeypatch
         update(message, now_ns)
 
     monkeypatch.setattr(made.bridge.telemetry, "update", fail_thrice)
-    monkeypatch.setattr("scenematch.bridges.mavlink._REOPEN_S", 600.0)  # one record, however far apart the faults are
+    monkeypatch.setattr(
+        "scenematch.bridges.mavlink._REOPEN_S", 600.0
+    )  # one record, however far apart the faults are
     fly(made.bridge, lambda: len(faults) == 3)
     before = len(pilot.of("VISION_POSITION_ESTIMATE"))
     fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before)
