@@ -293,10 +293,11 @@ class MavlinkBridge:
                 if not self.connected:
                     self._on_connected(now_ns)
             elif self._resumed and self.telemetry.heard_ns is None and self._is_of_autopilot(message):
-                # The autopilot of the last fix, heard before its heartbeat, which comes once a second.
+                # The autopilot of the last fix, heard before its heartbeat, which comes once a second. It flies.
                 self._peer = sender
                 self._on_connected(now_ns)
                 self.telemetry.firmware, self.telemetry.heard_ns = MAV_AUTOPILOTS[self._options.firmware], now_ns
+                self.telemetry.armed = True
             if sender != self._peer:
                 continue  # not the vehicle
             if message.get_type() == "COMMAND_LONG":

@@ -1095,7 +1095,7 @@ def test_a_bridge_that_goes_on_waits_for_no_heartbeat(bridge_to, resumed, system
         else:
             with pytest.raises(TimeoutError):
                 line.recv(2048)
-    assert made.bridge.connected == is_connected
+    assert made.bridge.connected == made.bridge.telemetry.armed == is_connected
 
 
 def test_the_navigators_options_decide_what_contradicts_the_track(loop, monkeypatch):
