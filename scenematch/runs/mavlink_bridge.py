@@ -212,7 +212,7 @@ def run_mavlink_bridge(
     start = resumed or start
 
     # Before the link: a bench autopilot takes off as soon as the bridge listens.
-    pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))
+    pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat), settings.scheduling())
     with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(
