@@ -1,4 +1,4 @@
-"""``python -m bench.live.flights.px4 FLIGHT BUILD``: PX4, simulated in hardware (SIH), the bridge and a drawn town.
+"""``python -m bench.live.flights.px4 FLIGHT BUILD``: PX4 with simulated hardware (SIH), the bridge and a town.
 
 BUILD is the folder of a build of PX4 for SITL, with ``bin/px4`` in it, best of ``px4_sitl_sih`` without lockstep.
 The flight is that of :mod:`bench.live.flights.arducopter`, in OFFBOARD; EKF and truth are compared by PX4's own
