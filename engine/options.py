@@ -219,7 +219,7 @@ class NavigatorOptions:
             each other outweigh it.
         late_s: how much older than the newest frame a frame may be.
         attitude_lag_s: standard deviation of the attitude telemetry's delay before images have measured it.
-        attitude_jitter_s: standard deviation of one frame's delay about the mean delay.
+        attitude_jitter_s: standard deviation of one frame's delay about the mean delay, in attitude and position.
         tilt_bias_deg: standard deviation of a lasting error in roll and in pitch before images have measured it.
         heading_bias_deg: the same for the heading.
         healthy_s: age of the last fix up to which the navigator calls itself healthy.

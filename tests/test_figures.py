@@ -48,8 +48,9 @@ FIGURES = {  # page: claim: results page, heading and words of each row that sta
         "0.24 m RMS off in simulation": [("mavlink.md", "PX4 SITL", "| `odometry`, 5 min |")],
         "by `global_position_sensor` 1.4 m": [("mavlink.md", "PX4 SITL", "| `global_position_sensor`, 1")],
         "some 0.1 s": [("vehicle.md", "The unit of systemd", "| worker killed |")],
-        "takes 3.2 s by NCC and 6.2 s by `auto`":
-            [("mavlink.md", "Flights with faults", "| NCC | 5.0", "| `auto` | 9.0")],
+        "takes 2 to 3 s to its first fix":
+            [("mavlink.md", "Flights with faults", "| bridge, NCC |", "| bridge, `auto` |")],
+        "3 to 6 s without": [("mavlink.md", "Flights with faults", "| bridge, NCC |", "| bridge, `auto` |")],
     },
     "docs/odometry.md": {
         "Drift over 5 s without a match was 2 m per 100 m":

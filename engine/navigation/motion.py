@@ -160,6 +160,7 @@ class FrameClock:
         if begin_mps is not None:
             mean_mps, changes = 0.5 * (begin_mps + end_mps), 12.0
         between_m2 = self._options.acceleration_mps2**2 * interval_s**3 / changes  # of a walk between known ends
+        between_m2 += 2.0 * self._options.attitude_jitter_s**2 * float(mean_mps @ mean_mps)  # both stamps are off
         return Step(mean_mps * interval_s, begin_mps, end_mps, self.sigma_mps(frame), between_m2)
 
     def sigma_mps(self, frame: Frame) -> float:

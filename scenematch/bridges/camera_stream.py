@@ -14,6 +14,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Generator
+from functools import partial
 from typing import Any
 
 import cv2
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
+from engine.runtime.realtime import Realtime, start_thread
 from scenematch.files.tables import quoted
 
 __all__ = ["CameraStream", "capture"]
@@ -106,7 +108,8 @@ class _CommandSource:
         try:
             self._process: Any = subprocess.Popen(shlex.split(command), stdout=subprocess.PIPE, bufsize=0)
         except (OSError, ValueError, IndexError) as error:
-            raise TelemetryError(f"camera_source: {quoted(command)} cannot be run: {error}") from None
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise TelemetryError(f"camera_source: {quoted(command)} cannot be run: {reason}") from None
         self._buffer, self._arrived_ns = bytearray(), 0
 
     def read(self) -> tuple[Image, int] | None:
@@ -145,13 +148,14 @@ class CameraStream:
 
     Args:
         source: number, URL, SDP file or ``exec:COMMAND``.
+        realtime: scheduling of the reader, whose delay makes every stamp late; None is normal.
 
     Raises:
         TelemetryError: it cannot be opened now. After later failures it is reopened, and they are logged.
     """
 
-    def __init__(self, source: str) -> None:
-        self._name = source
+    def __init__(self, source: str, realtime: Realtime | None = None) -> None:
+        self._name, self._realtime = source, realtime
         self._changed = threading.Condition()
         self._newest: tuple[Image, int] | None = None
         self._last: Image | None = None
@@ -213,10 +217,8 @@ class CameraStream:
 
     def _start(self, source: _OpenCvSource | _CommandSource) -> None:
         self._source, self._has_started = source, False
-        self._thread = threading.Thread(
-            target=self._read, args=(source, self._number), name="scenematch-camera", daemon=True
-        )
-        self._thread.start()
+        read = partial(self._read, source, self._number)
+        self._thread = start_thread(read, "scenematch-camera", self._realtime)
 
     def _read(self, source: _OpenCvSource | _CommandSource, number: int) -> None:
         try:
@@ -232,12 +234,15 @@ class CameraStream:
             source.close()
 
 
-def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Generator[tuple[Image, int] | None, None, None]:
+def capture(
+    source: str, *, exposure_to_grab_ms: float = 0.0, realtime: Realtime | None = None
+) -> Generator[tuple[Image, int] | None, None, None]:
     """Capture pictures from a camera or stream forever.
 
     Args:
         source: see :class:`CameraStream`; a file of pictures starts again when it ends.
         exposure_to_grab_ms: camera latency, from exposure to arrival.
+        realtime: see :class:`CameraStream`.
 
     Yields:
         Picture and capture time; None if no new one came for half a second. A picture identical to the last does
@@ -246,7 +251,7 @@ def capture(source: str, *, exposure_to_grab_ms: float = 0.0) -> Generator[tuple
     Raises:
         TelemetryError: the camera or stream cannot be opened at first, or a command ends before its first picture.
     """
-    stream = CameraStream(source)
+    stream = CameraStream(source, realtime)
     try:
         while True:
             picture = stream.next(_IDLE_S)

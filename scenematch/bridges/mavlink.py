@@ -30,7 +30,7 @@ from scenematch.bridges.mavlink_in import HANDLED_MESSAGES, MAV_AUTOPILOTS, Mavl
 from scenematch.bridges.mavlink_requests import AutopilotRequests
 from scenematch.bridges.mavlink_status import MavlinkCounters, MavlinkStatus
 from scenematch.bridges.notices import INFO, Notice, PilotNotices
-from scenematch.bridges.packets import PacketDecoder, PacketEncoder
+from scenematch.bridges.packets import AUTOPILOT_COMPONENT, PacketDecoder, PacketEncoder
 from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
@@ -67,7 +67,7 @@ class MavlinkBridge:
             sent.
         site: the map; None checks the first fixes against neither the start nor a receiver.
         resumed: whether ``start`` is the last fix sent to this autopilot, by an earlier bridge: the next one must
-            agree with it, and does not wait for the autopilot's report on its receiver.
+            agree with it, waits neither for a heartbeat nor for the autopilot's report on its receiver.
         gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None for a fixed camera.
         key: 32-byte key of MAVLink signing; None sends and accepts unsigned packets.
         watch: called with every answer; must return quickly.
@@ -292,14 +292,24 @@ class MavlinkBridge:
                 self._peer = sender
                 if not self.connected:
                     self._on_connected(now_ns)
+            elif self._resumed and self.telemetry.heard_ns is None and self._is_of_autopilot(message):
+                # The autopilot of the last fix, heard before its heartbeat, which comes once a second. It flies.
+                self._peer = sender
+                self._on_connected(now_ns)
+                self.telemetry.firmware, self.telemetry.heard_ns = MAV_AUTOPILOTS[self._options.firmware], now_ns
+                self.telemetry.armed = True
             if sender != self._peer:
-                continue  # only a heartbeat identifies the vehicle
+                continue  # not the vehicle
             if message.get_type() == "COMMAND_LONG":
                 self._obey(message)
                 continue
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                 self._send(mavlink_out.timesync_message(time.monotonic_ns(), message.ts1))
             self.telemetry.update(message, now_ns)
+
+    def _is_of_autopilot(self, message: Any) -> bool:
+        source = message.get_srcSystem(), message.get_srcComponent()
+        return source == (self._options.system_id, AUTOPILOT_COMPONENT)
 
     def _obey(self, message: Any) -> None:
         """Handle an operator's command to trust the fixes that contradict the track."""

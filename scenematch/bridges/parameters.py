@@ -51,6 +51,8 @@ class MavlinkOptions:
 
     def __post_init__(self) -> None:
         check_positive(self, "max_sigma_m")
+        if not 1 <= self.system_id <= 255:
+            raise OptionError(f"system_id: expected 1 to 255, got {self.system_id}")
         if not 2 <= self.component_id <= 255:
             raise OptionError(f"component_id: expected 2 to 255 (1 is the autopilot), got {self.component_id}")
         if self.firmware not in MESSAGES:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from engine.camera import Camera
 from engine.errors import OptionError
+from engine.runtime.realtime import Realtime
 from scenematch.bridges.pictures import CapturedImage, capture, replay
 from scenematch.files.flight import open_flight
 from scenematch.files.frames import VIDEO_SUFFIXES
@@ -81,14 +82,17 @@ class BridgeFiles:
         flight = open_flight(self.frames, self.telemetry)
         return self.camera.load(flight.source, flight.names, progress=progress)
 
-    def pictures(self, wait: Callable[[], None] | None = None) -> Generator[CapturedImage | None, None, None]:
+    def pictures(
+        self, wait: Callable[[], None] | None = None, realtime: Realtime | None = None
+    ) -> Generator[CapturedImage | None, None, None]:
         """Pictures as they are captured; None if the camera delivers none for a while.
 
-        A replay begins when ``wait`` returns.
+        A replay begins when ``wait`` returns; ``realtime`` schedules the thread that reads a camera.
         """
         if self.frames is not None:
             telemetry = None if self.telemetry is None else Path(self.telemetry)
             rate_hz = self.rate_hz or 10.0
             return replay(Path(self.frames), telemetry, rate_hz=rate_hz, every=self.every, wait=wait)
         assert self.camera_source is not None  # one of the two is given
-        return capture(self.camera_source, exposure_to_grab_ms=self.exposure_to_grab_ms or 0.0)
+        grab_ms = self.exposure_to_grab_ms or 0.0
+        return capture(self.camera_source, exposure_to_grab_ms=grab_ms, realtime=realtime)

@@ -199,7 +199,10 @@ def run_mavlink_bridge(
     last_fix = LastFix(
         last_fix_file(link.connect, link.system_id, Path(files.map.map).absolute()) if resumes else None
     )
-    matcher = _loaded(files, settings, start, progress, brief=last_fix.prior(speed_mps) is not None)
+    in_flight = last_fix.prior(speed_mps) is not None
+    if in_flight:
+        settings.schedule_this_thread()  # the vehicle waits for its fixes
+    matcher = _loaded(files, settings, start, progress, brief=in_flight)
     site, camera = matcher.site, matcher.camera
     end_on_sigterm()  # before the fork, so that the worker has it from its first instruction
     if supervise:
@@ -209,7 +212,7 @@ def run_mavlink_bridge(
     start = resumed or start
 
     # Before the link: a bench autopilot takes off as soon as the bridge listens.
-    pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat))
+    pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat), settings.scheduling())
     with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
         try:
             bridge = MavlinkBridge(

@@ -685,6 +685,11 @@ def test_gps_input_stands_beside_a_receiver_as_the_second():
         MavlinkOptions(gps_id=1)
 
 
+def test_a_system_id_that_mavlink_cannot_send_is_refused():
+    with pytest.raises(OptionError, match="system_id: expected 1 to 255, got 256"):
+        MavlinkOptions(system_id=256)
+
+
 def test_the_delay_is_the_one_that_is_given_and_said(tmp_path, capsys):
     words = ["bridge", "mavlink", "--force", "--write-params", str(tmp_path / "x.param")]
     assert main(words) == 0
@@ -1069,6 +1074,26 @@ def test_the_first_fixes_are_held_against_the_receiver(loop, given, off_m, is_se
     else:
         fly(made.bridge, lambda: made.bridge.status.withheld.get("receiver not heard yet", 0) > 5)
         assert not pilot.of("VISION_POSITION_ESTIMATE")
+
+
+@pytest.mark.parametrize(
+    ("resumed", "system_id", "is_connected"), [(True, 1, True), (False, 1, False), (True, 255, False)]
+)
+def test_a_bridge_that_goes_on_waits_for_no_heartbeat(bridge_to, resumed, system_id, is_connected):
+    made = bridge_to(start=AT_THE_ORIGIN, resumed=resumed)
+    sender = autopilot(system=system_id)
+    confirm = mavlink.MAVLink_command_long_message(1, BRIDGE_COMPONENT, CONFIRM_COMMAND, 0, *[0.0] * 7)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+        line.connect(("127.0.0.1", made.port))
+        line.settimeout(0.5)
+        for message in (mavlink.MAVLink_attitude_message(5_000, 0, 0, 0, 0, 0, 0), confirm):
+            line.send(message.pack(sender))
+        if is_connected:
+            assert line.recv(2048)  # requests
+        else:
+            with pytest.raises(TimeoutError):
+                line.recv(2048)
+    assert made.bridge.connected == made.bridge.telemetry.armed == is_connected
 
 
 def test_the_navigators_options_decide_what_contradicts_the_track(loop, monkeypatch):

@@ -45,9 +45,13 @@ def assert_prior(prior, east, north, sigma, moved=None):
 # Prediction
 
 
-def drift_m(*legs_s, sigma_mps=0.5):
-    """How far a velocity leads astray: its error lasts, and it changes by 3 m/s2 between its samples."""
-    return math.hypot(sigma_mps * sum(legs_s), *(math.sqrt(3.0**2 * leg_s**3 / 12.0) for leg_s in legs_s))
+def drift_m(*legs_s, sigma_mps=0.5, speeds_mps=None):
+    """How far a velocity leads astray: its error lasts, and it changes by 3 m/s2 between its samples.
+
+    At a speed, the stamps of both ends are off by 30 ms each, too.
+    """
+    walks_m = [math.sqrt(3.0**2 * leg_s**3 / 12.0) for leg_s in legs_s]
+    return math.hypot(sigma_mps * sum(legs_s), *walks_m, *(math.sqrt(2.0) * 0.03 * v for v in speeds_mps or ()))
 
 
 def test_it_predicts_with_the_last_fixes_where_the_telemetry_has_no_velocity():
@@ -66,7 +70,8 @@ def test_dead_reckoning_adds_up_over_refusals():
     velocities = [(4.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)]
     run = flown((10.0, 20.0), None, None, None, velocity=velocities)
     _, first, second, third = run.priors
-    sigmas_m = [math.hypot(1.0, drift_m(*[1.0] * legs)) for legs in (1, 2, 3)]
+    speeds_mps = 4.0, math.hypot(4.0, 2.0), math.hypot(2.0, 4.0)
+    sigmas_m = [math.hypot(1.0, drift_m(*[1.0] * n, speeds_mps=speeds_mps[:n])) for n in (1, 2, 3)]
     assert_prior(first, 14.0, 20.0, sigmas_m[0], moved=(4.0, 0.0))
     assert_prior(second, 18.0, 22.0, sigmas_m[1] * math.sqrt(2.0), moved=(4.0, 2.0))
     assert_prior(third, 20.0, 26.0, sigmas_m[2] * 2.0, moved=(2.0, 4.0))
@@ -76,7 +81,7 @@ def test_dead_reckoning_adds_up_over_refusals():
 def test_frames_without_stamps_are_an_interval_apart():
     options = NavigatorOptions(default_interval_s=0.5)
     run = flown((10.0, 20.0), None, seconds=[None, None], velocity=(8.0, 0.0), options=options)
-    assert_prior(run.priors[1], 14.0, 20.0, math.hypot(1.0, drift_m(0.5)))
+    assert_prior(run.priors[1], 14.0, 20.0, math.hypot(1.0, drift_m(0.5, speeds_mps=[8.0])))
 
 
 def test_a_start_that_leads_nowhere_widens_and_is_left_in_turns():
@@ -105,7 +110,7 @@ def test_a_match_of_the_whole_map_is_believed_once_others_agree():
     run = flown(*answers, start=None, velocity=(4.0, 0.0), confidence=0.99)
     assert run.ends == ["low_score", *["unconfirmed"] * 3, "fix", "low_score"]
     assert run.priors[:2] == [None, None]
-    assert_prior(run.priors[2], 104.0, 0.0, math.hypot(1.0, drift_m(1.0)))
+    assert_prior(run.priors[2], 104.0, 0.0, math.hypot(1.0, drift_m(1.0, speeds_mps=[4.0])))
     assert run.priors[5].east_m == pytest.approx(116.0, abs=0.2)
     assert (run.states[-1], run.navigator.reset_count) == ("COASTING", 0)
 
@@ -259,7 +264,8 @@ def test_a_late_frame_is_matched_where_the_vehicle_was_and_moves_nothing_back():
     places = (10.0, 20.0), (14.0, 20.0), (12.2, 20.0), None
     run = flown(*places, seconds=[1.0, 2.0, 1.5, 3.0], velocity=(4.0, 0.0))
     assert run.fixed == [0, 1, 2]
-    assert_prior(run.priors[2], 12.0, 20.0, math.hypot(1.0, 0.25, 0.5 * math.sqrt(1.5)), moved=(0.0, 0.0))
+    sigma_m = math.hypot(1.0, 0.25, 0.5 * math.sqrt(1.5), 0.03 * 4.0)  # of half the way, and of the stamps
+    assert_prior(run.priors[2], 12.0, 20.0, sigma_m, moved=(0.0, 0.0))
     newest = run.predictions[2]
     assert_prior(run.priors[3], newest.east_m + 4.0, 20.0, pytest.approx(math.hypot(1.0, drift_m(1.0)), rel=0.1))
 

@@ -15,18 +15,20 @@ import math
 import sys
 import time
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.quaternion import QuaternionBase
 
 from bench.live.flights.recorded import recorded
 from bench.live.standin import State
 from engine.geo import Array, LocalFrame
 
+_STATES = ("SIM_STATE", "HIL_STATE_QUATERNION")  # of ArduPilot and of PX4
 SIZE = (640, 400)
 """Of the pictures; 852 x 480 of the video leave 106 and 40 pixels on either side."""
 
@@ -78,7 +80,12 @@ class Footage:
 
 
 def state_of(message: Any, place: LocalFrame, ground_alt_m: float) -> State:
-    """The vehicle of a SIM_STATE about a place."""
+    """The vehicle of a SIM_STATE (ArduPilot) or HIL_STATE_QUATERNION (PX4) about a place."""
+    if message.get_type() == "HIL_STATE_QUATERNION":
+        east_m, north_m = place.enu_from_geodetic(message.lat * 1e-7, message.lon * 1e-7)[:2]
+        angles = [math.degrees(angle) for angle in QuaternionBase(message.attitude_quaternion).euler]
+        height_m = max(message.alt * 1e-3 - ground_alt_m, 0.5)
+        return State(float(east_m), float(north_m), height_m, *angles, message.vy * 1e-2, message.vx * 1e-2)
     east_m, north_m = place.enu_from_geodetic(message.lat_int * 1e-7, message.lon_int * 1e-7)[:2]
     angles = [math.degrees(angle) for angle in (message.roll, message.pitch, message.yaw)]
     return State(
@@ -86,24 +93,40 @@ def state_of(message: Any, place: LocalFrame, ground_alt_m: float) -> State:
     )
 
 
-def film(footage: Footage, link: Any, out: BinaryIO, rate_hz: float, delay_s: float, ground_alt_m: float) -> None:
-    """Write pictures until nobody reads them, each ``delay_s`` after the state that it shows has come."""
+class View(Protocol):
+    """What a vehicle's camera sees."""
+
+    place: LocalFrame
+
+    def picture(self, vehicle: State) -> NDArray[np.uint8]:
+        """(H, W, 3) BGR."""
+
+
+def film(view: View, link: Any, out: BinaryIO, rate_hz: float, delay_s: float, ground_alt_m: float) -> None:
+    """Write pictures until nobody reads them, each ``delay_s`` after the state that it shows has come.
+
+    A picture that this machine did not draw by then is left out: its age would be unknown.
+    """
     due_s = 0.0
     while True:
-        message = link.recv_match(type=["HEARTBEAT", "SIM_STATE"], blocking=True)
+        message = link.recv_match(type=["HEARTBEAT", *_STATES], blocking=True)
         now_s = time.monotonic()
         if message.get_type() == "HEARTBEAT":
-            interval = (mavlink.MAVLINK_MSG_ID_SIM_STATE, 20_000, 0, 0, 0, 0, 0)
-            link.mav.command_long_send(1, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *interval)
+            for number in (mavlink.MAVLINK_MSG_ID_SIM_STATE, mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION):
+                interval = (number, 20_000, 0, 0, 0, 0, 0)
+                link.mav.command_long_send(1, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *interval)
             continue
         if now_s < due_s:
             continue
+        while (newer := link.recv_match(type=_STATES)) is not None:  # what came while the last one was drawn
+            message = newer
         due_s = now_s + 1.0 / rate_hz - 0.01
-        picture = footage.picture(state_of(message, footage.place, ground_alt_m))
+        picture = view.picture(state_of(message, view.place, ground_alt_m))
         jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
-        time.sleep(max(0.0, now_s + delay_s - time.monotonic()))
-        out.write(jpeg)
-        out.flush()
+        if (wait_s := now_s + delay_s - time.monotonic()) >= 0.0:
+            time.sleep(wait_s)
+            out.write(jpeg)
+            out.flush()
 
 
 def main() -> None:

@@ -1,0 +1,257 @@
+"""``python -m bench.live.flights.arducopter FLIGHT SITL``: ArduCopter's simulator, the bridge and a drawn town.
+
+SITL is the program ``arducopter`` in its source tree, of which it takes the default parameters. It climbs on GNSS,
+selects the fixes, switches the receiver off and flies the course of :mod:`bench.live.flights.fly` for so long, in
+wind; with ``--faults`` the bridge is killed and the camera covered, frozen and shifted meanwhile. What the EKF and
+the fixes were off is from SITL's own log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from pymavlink import mavutil
+
+from bench.live.bridge_counts import free_port
+from bench.live.flights.faults import Fault
+from bench.live.flights.fly import FAR_M, FLIGHT_S, RATE_HZ, Bridge
+from bench.live.flights.recorded import recorded
+from bench.live.flights.sitl import RATES_HZ, Motion, Pilot, take_off
+from engine.geo import LocalFrame
+from scenematch.runs.simulation import write_flight
+from scenematch.simulator import plan_flight
+
+DELAY_MS = 80.0
+FAULTS = (
+    Fault("bridge killed", 30.0, 3.0),
+    Fault("worker killed", 60.0),
+    Fault("camera covered", 90.0, 10.0),
+    Fault("picture frozen", 130.0, 6.0),
+    Fault("camera covered", 165.0, 20.0),
+    Fault("bridge killed", 215.0, 15.0),
+    Fault("map shifted", 270.0, 20.0),
+)
+_AFTER_S = 30.0  # from the last fault to the end
+_SOURCE_SET_2, _GNSS_OFF = (mavutil.mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2.0), ("SIM_GPS1_ENABLE", 0.0)
+Track = NDArray[np.float64]
+"""(N, 3) seconds since the simulator's start, metres east and north."""
+
+
+class SitlBridge(Bridge):
+    """The bridge with the camera over the town."""
+
+    def __init__(
+        self, folder: Path, port: int, method: str, message: str, *, realtime: bool, firmware: str = "ardupilot"
+    ) -> None:
+        self._firmware = firmware
+        self._settings = [f"input.exposure_to_grab_ms={DELAY_MS}", *["bridge.realtime=true"] * realtime]
+        self._pipe, self.fault_file = folder / "camera", folder / "fault"
+        super().__init__(folder, port, method, message)
+
+    def start(self) -> None:
+        """Start it in its own process group."""
+        self._command[self._command.index("--camera-source") + 1] = f"exec:cat {self._pipe}"
+        while self._settings:
+            self._command += ["--settings", self._settings.pop(), "--firmware", self._firmware]
+        super().start()
+
+
+class LoggedPilot(Pilot):
+    """A pilot that knows the simulator's time, which falls behind this machine's if that is loaded."""
+
+    def __init__(self, link: Any, place: LocalFrame) -> None:
+        super().__init__(link, place)
+        self.times_s: list[tuple[float, float]] = []  # of this machine's monotonic clock, and the simulator's
+
+    def take(self, message: Any) -> None:
+        """Note what a message says, and when."""
+        if message.get_type() == "GLOBAL_POSITION_INT":
+            self.times_s.append((time.monotonic(), message.time_boot_ms * 1e-3))
+        super().take(message)
+
+
+@contextlib.contextmanager
+def simulator(
+    sitl: Path, folder: Path, place: LocalFrame, port: int, message: str, wind_mps: float
+) -> Iterator[Path]:
+    """SITL with fresh parameters, and the camera; yields the folder of SITL's logs."""
+    run, pipe, fault_file = folder / "sitl", folder / "camera", folder / "fault"
+    run.mkdir(exist_ok=True)
+    fault_file.unlink(missing_ok=True)
+    pipe.unlink(missing_ok=True)
+    os.mkfifo(pipe)
+    for log in (run / "logs").glob("*.BIN"):
+        log.unlink()
+    settings = ["parameters.takeoff=gnss", f"mavlink.message={message}", "parameters.delay_ms=100"]
+    command = [sys.executable, "-m", "scenematch", "bridge", "mavlink", "--force"]
+    written = [part for setting in settings for part in ("--settings", setting)]
+    subprocess.run([*command, *written, "--write-params", str(run / "scenematch.param")], check=True)
+    (run / "world.parm").write_text(
+        f"SIM_WIND_SPD {wind_mps}\nSIM_WIND_DIR 210\nLOG_DISARMED 1\n", encoding="ascii"
+    )
+    defaults = [sitl.parents[3] / "Tools/autotest/default_params/copter.parm", "scenematch.param", "world.parm"]
+    ports = [f"--serial{k}=udpclient:127.0.0.1:{number}" for k, number in enumerate((port, 14551, 14552))]
+    home = f"{place.lat_deg:.7f},{place.lon_deg:.7f},0,0"
+    arguments = ["-S", "-w", "--model", "quad", "--speedup", "1", "--home", home, *ports]
+    camera = [sys.executable, "-m", "bench.live.flights.town_camera", folder, pipe, fault_file]
+    with (run / "sitl.log").open("w") as log, contextlib.ExitStack() as world:
+        parameters = ["--defaults", ",".join(map(str, defaults))]
+        for command, where in (([*camera, "--delay-ms", DELAY_MS], None), ([sitl, *arguments, *parameters], run)):
+            started = ["chrt", "--rr", "1", *map(str, command)]  # what flies does not wait for other work
+            process = subprocess.Popen(started, cwd=where, stdout=log, stderr=log)
+            world.callback(process.wait)
+            world.callback(process.kill)
+        yield run / "logs"
+
+
+def fly(
+    pilot: LoggedPilot, motion: Motion, duration_s: float, bridge: SitlBridge, faults: tuple[Fault, ...]
+) -> float:
+    """Fly the course over and over; enter GUIDED again where a failsafe took over.
+
+    Returns:
+        The simulator's time at which the receiver was switched off.
+    """
+    for message_id, rate_hz in RATES_HZ.items():
+        pilot.command(mavutil.mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
+    take_off(pilot, motion(0.0).height_m)
+    if not pilot.listen(60.0, lambda: any("fixes begin" in text for text in pilot.texts)):
+        raise SystemExit("no fixes within a minute")
+    pilot.command(*_SOURCE_SET_2)
+    pilot.listen(10.0)
+    pilot.link.param_set_send(*_GNSS_OFF)
+    pilot.part, begin, asked = "course", time.monotonic(), 0.0
+    begin_s = pilot.times_s[-1][1]
+    due = sorted([(f.begin_s, False, f) for f in faults] + [(f.end_s, True, f) for f in faults if f.seconds],
+                 key=lambda event: event[0])  # fmt: skip
+    while (gone_s := time.monotonic() - begin) < duration_s:
+        while due and due[0][0] <= gone_s:
+            _, is_over, fault = due.pop(0)
+            pilot.say(f"{fault.name} {'over' if is_over else 'begins'}")
+            change(bridge, fault, is_over=is_over)
+        if pilot.mode != "GUIDED" and time.monotonic() - asked > 1.0:
+            asked = time.monotonic()
+            pilot.link.set_mode("GUIDED")
+        pilot.go_to(motion(gone_s % FLIGHT_S))
+        pilot.listen(0.1)
+    return begin_s
+
+
+def change(bridge: SitlBridge, fault: Fault, *, is_over: bool) -> None:
+    """Begin or end a fault."""
+    if fault.kind == "bridge killed":
+        bridge.start() if is_over else bridge.kill()
+    elif fault.kind == "worker killed":
+        bridge.kill_worker()
+    else:
+        bridge.fault_file.write_text("" if is_over else fault.kind, encoding="ascii")
+
+
+def read_log(log: Path, pilot: LoggedPilot) -> tuple[Track, Track, Track]:
+    """The truth, the EKF and the fixes by their time of capture, of SITL's log."""
+    place, (here_s, there_s) = pilot.place, np.array(pilot.times_s).T
+    lead_s = sliding_window_view(np.pad(there_s - here_s, 50, mode="edge"), 101).max(axis=1)  # of the quickest
+    reader = mavutil.mavlink_connection(str(log))
+    tracks: dict[str, list[tuple[float, float, float]]] = {"SIM": [], "POS": [], "VISP": []}
+    origin = place
+    while (row := reader.recv_match(type=["SIM", "POS", "VISP", "ORGN"])) is not None:
+        kind = row.get_type()
+        if kind == "ORGN":
+            origin = LocalFrame(row.Lat, row.Lng) if row.Type == 0 else origin
+        elif kind == "VISP" and not row.Ign:  # without a position it says only that the camera works
+            lat_deg, lon_deg = origin.geodetic_from_enu(row.PY, row.PX)
+            captured_s = row.RTimeUS * 1e-6
+            captured_s += float(np.interp(captured_s, here_s, lead_s))
+            tracks[kind].append((captured_s, *_metres(place, lat_deg, lon_deg)))
+        elif kind != "VISP":
+            tracks[kind].append((row.TimeUS * 1e-6, *_metres(place, row.Lat, row.Lng)))
+    return tuple(np.array(tracks[kind]).reshape(-1, 3) for kind in ("SIM", "POS", "VISP"))  # type: ignore[return-value]
+
+
+def _metres(place: LocalFrame, lat_deg: Any, lon_deg: Any) -> tuple[float, float]:
+    east_m, north_m = place.enu_from_geodetic(lat_deg, lon_deg)[:2]
+    return float(east_m), float(north_m)
+
+
+def off_m(truth: Track, track: Track) -> NDArray[np.float64]:
+    """How far a track is from the truth at its times."""
+    true = np.column_stack([np.interp(track[:, 0], truth[:, 0], truth[:, k]) for k in (1, 2)])
+    return np.asarray(np.hypot(*(track[:, 1:] - true).T))
+
+
+def report(log: Path, pilot: LoggedPilot, begin_s: float, duration_s: float, faults: tuple[Fault, ...]) -> str:
+    """A table of the flight without GNSS, and one of its faults."""
+    truth, ekf, fixes = (t[(t[:, 0] > begin_s) & (t[:, 0] < begin_s + duration_s)] for t in read_log(log, pilot))
+    ekf_m, fixes_m = off_m(truth, ekf), off_m(truth, fixes)
+    rms = [float(np.sqrt((v**2).mean())) for v in (ekf_m, fixes_m)]
+    gaps_s = np.diff([begin_s, *fixes[:, 0], begin_s + duration_s])
+    lines = [
+        "| EKF to truth, RMS and worst | fixes | fixes to truth, RMS and worst | beyond 5 m | longest gap |",
+        "|---|---|---|---|---|",
+        f"| {rms[0]:.2f}, {ekf_m.max():.2f} m | {len(fixes)} | {rms[1]:.2f}, {fixes_m.max():.2f} m "
+        f"| {(fixes_m > FAR_M).sum()} | {gaps_s.max():.1f} s |",
+    ]
+    for row, off in zip(fixes[fixes_m > FAR_M], fixes_m[fixes_m > FAR_M], strict=True):
+        lines.append(f"\n{off:.1f} m off, {row[0] - begin_s:.1f} s after the receiver's end")
+    if not faults:
+        return "\n".join(lines)
+    titles = ("fault", "EKF to truth meanwhile, worst", "first fix after its end", "off by")
+    lines += ["", f"| {' | '.join(titles)} |", "|---|---|---|---|"]
+    for fault, until in zip(faults, [*[f.begin_s for f in faults[1:]], duration_s], strict=True):
+        during = (ekf[:, 0] >= begin_s + fault.begin_s) & (ekf[:, 0] < begin_s + until)
+        after = np.flatnonzero((fixes[:, 0] > begin_s + fault.end_s) & (fixes[:, 0] < begin_s + until))
+        first_s = fixes[after, 0] - begin_s - fault.end_s
+        row = f"{first_s[0]:.2f} s | {fixes_m[after[0]]:.2f} m" if len(after) else "none |"
+        lines.append(f"| {fault.name} | {ekf_m[during].max():.2f} m | {row} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Fly, and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("flight", type=Path)
+    parser.add_argument("sitl", type=Path, help="arducopter, in build/sitl/bin of ArduPilot")
+    parser.add_argument("--method", choices=("auto", "ncc"), default="auto")
+    parser.add_argument("--message", default="vision_position_estimate")
+    parser.add_argument("--wind-mps", type=float, default=5.0)
+    parser.add_argument("--seconds", type=float, default=300.0, help="without GNSS")
+    parser.add_argument("--faults", action="store_true")
+    parser.add_argument("--realtime", action="store_true", help="bridge.realtime")
+    arguments = parser.parse_args()
+    folder, before = arguments.flight.absolute(), os.getloadavg()[0]
+    if not folder.exists():
+        write_flight(folder, plan_flight(1, frames=round(FLIGHT_S * RATE_HZ), rate_hz=RATE_HZ))
+    motion, place, _ = recorded(folder)
+    faults = FAULTS if arguments.faults else ()
+    seconds = faults[-1].end_s + _AFTER_S if faults else arguments.seconds
+    port = free_port()
+    with (
+        simulator(arguments.sitl.absolute(), folder, place, port, arguments.message, arguments.wind_mps) as logs,
+        contextlib.ExitStack() as stack,
+    ):
+        bridge = SitlBridge(folder, port, arguments.method, arguments.message, realtime=arguments.realtime)
+        stack.callback(bridge.kill)
+        link = mavutil.mavlink_connection("udpin:127.0.0.1:14552", source_system=255)
+        link.wait_heartbeat()
+        pilot = LoggedPilot(link, place)
+        begin_s = fly(pilot, motion, seconds, bridge, faults)
+        pilot.listen(2.0)
+    load = f"load {before:.1f} before, {os.getloadavg()[0]:.1f} after, {os.cpu_count()} cores"
+    what = f"{arguments.method}, {arguments.message}, wind {arguments.wind_mps:g} m/s"
+    print(f"{what}, {time.strftime('%Y-%m-%d')}, {load}\n")
+    print(report(max(logs.glob("*.BIN")), pilot, begin_s, seconds, faults))
+
+
+if __name__ == "__main__":
+    main()
