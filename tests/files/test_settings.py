@@ -61,7 +61,7 @@ def test_values_arrive(path):
         ("methud = 'ncc'", "methud: not a setting; did you mean method?"),
         ("[ncc]\nexclusoin_m = 1", "ncc.exclusoin_m: not a setting; did you mean exclusion_m?"),
         ("[ncc.errors]\nmpa_m = 4", "ncc.errors.mpa_m: not a setting; did you mean map_m?"),
-        ("[ncc]\nzebra = 1", "ncc.zebra: not a setting; expected one of score, "),
+        ("[ncc]\nzebra = 1", "ncc.zebra: not a setting; expected one of "),
         ('[ncc]\nexclusion_m = "wide"', "ncc.exclusion_m: expected a number, got 'wide'"),
         ("[ncc]\nexclusion_m = 0.0", "ncc.exclusion_m: expected a number above 0, got 0.0"),
         ("[sift]\nupsample = 2.5", "sift.upsample: expected a whole number, got 2.5"),
