@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from engine.matching.agreement import agree_in_height, agree_in_place, offset_between_m
 from engine.matching.candidates import Candidate
+from engine.matching.evidence import is_beyond_doubt
 from engine.matching.explanation import Explanation
 from engine.matching.ladder import Answer, is_accepted, is_late
 from engine.matching.method import Method
@@ -73,6 +74,8 @@ class Auto(Method):
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
         first = self.ncc.locate(query, widely=False)  # SIFT finds the heading by itself
+        if isinstance(first, Candidate) and _is_settled(first, query):
+            return first
         agrees = None
         if is_accepted(first, query) and not first.fix.rests_on_attitude:
             # Few features follow the telemetry's attitude, and so does a fix that no picture refined.
@@ -102,6 +105,11 @@ class Auto(Method):
     def explain(self, query: Query, window: Window) -> Explanation:
         """As NCC does."""
         return self.ncc.explain(query, window)
+
+
+def _is_settled(first: Candidate, query: Query) -> bool:
+    """Whether the picture confirmed the whole pose, and its place is beyond doubt."""
+    return first.fix.stage == "refined" and is_beyond_doubt(first.evidence.nats, query.risk)
 
 
 def _nats(candidate: Candidate) -> float:

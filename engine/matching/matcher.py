@@ -59,8 +59,8 @@ class SceneMatcher:
         site: the map.
         camera: as calibrated, with its distortion; frames are undistorted by a lookup computed once.
         method: "ncc" (needs height and heading), "sift" (needs neither), "auto": NCC if height and heading are
-            known, then SIFT if time remains; if both have a fix it is of one place; or "learned": networks with
-            the weights of ``options.learned``.
+            known, and SIFT if that leaves doubt and time; or "learned": networks with the weights of
+            ``options.learned``.
         device: "cpu", "cuda" or "auto".
         options: settings. The accuracy that the map states overrides theirs.
 

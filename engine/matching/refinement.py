@@ -29,12 +29,11 @@ from engine.matching.align import shrink
 from engine.matching.candidates import PeakCandidate
 from engine.matching.covariance import tilt_covariance
 from engine.matching.evidence import RELIABILITY, surprise_of
-from engine.matching.oblique import is_oblique
 from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.options import NccOptions
 from engine.runtime.scheduler import OutOfTime
-from engine.values import CHANCE, Attitude, Fix, NoFix, Reason, Window
+from engine.values import CHANCE, Attitude, Fix, Window
 
 Array = NDArray[np.float64]
 
@@ -99,14 +98,14 @@ class Refinement:
     doubts_tilt: bool = False
     pictures: dict[int, EnhancedFrame] = field(default_factory=dict, repr=False, compare=False)
 
-    def refine(self, found: PeakCandidate) -> PeakCandidate | NoFix:
-        """The candidate with its whole pose refined and the evidence of that, or one that the picture contradicts.
+    def refine(self, found: PeakCandidate) -> PeakCandidate:
+        """The candidate with its whole pose refined and the evidence of that, or a less certain one.
 
         If the picture hardly confirms the telemetry's attitude over a surface model, the pose is refined again as
         if roll and pitch were hardly known, and the more probable pose counts. If neither has evidence, a wrong
         attitude is as probable as a right one: right poses can be refined in 98 of 100 frames, and attitudes are
-        right in 99 of 100. Without a surface model, or in an oblique frame, relief may be the reason: the fix
-        stays as it is, a known attitude's if the position agrees with the prior.
+        right in 99 of 100. Only a prior then confirms the attitude, and the fix is no more certain than that.
+        Without a surface model relief may be the reason, and the fix stays as it is.
         """
         query, has_tilt, found = self.query, self.query.telemetry.has_tilt, replace(found, by_refinement=True)
         refined = self.refine_pose(found.fix)
@@ -117,9 +116,11 @@ class Refinement:
         best = self._or_doubted(found, own) if has_tilt and query.site.has_surface and not is_clear else own
         if best is not None:
             return best
-        if query.site.has_surface and not is_oblique(query, query.telemetry.known_attitude):
-            return replace(found, is_contradicted=True)
-        return self._unconfirmed(found) if has_tilt and found.promises(query.risk) else found
+        if not found.promises(query.risk):
+            return found
+        if has_tilt:
+            return self._unconfirmed(found)
+        return replace(found, is_contradicted=query.site.has_surface)
 
     def _or_doubted(self, found: PeakCandidate, own: PeakCandidate | None) -> PeakCandidate | None:
         """The candidate refined by a known attitude, or as if that were hardly known; the more probable one."""
@@ -168,18 +169,15 @@ class Refinement:
             return 0.0
         return surprise_of(refined.fix.score, float(chance.std()))
 
-    def _unconfirmed(self, found: PeakCandidate) -> PeakCandidate | NoFix:
-        """A known attitude that the picture does not confirm, if the prior agrees."""
+    def _unconfirmed(self, found: PeakCandidate) -> PeakCandidate:
+        """A known attitude that the picture does not confirm, if the prior agrees with the position."""
         query, fix = self.query, found.fix
-        if query.site.has_surface:
-            fix = with_unconfirmed_tilt(query, fix)
-        off = query.prior_chi_square(fix)
+        off, covariance_m2 = query.prior_chi_square(fix), fix.covariance_m2
+        if query.site.has_surface and query.prior is not None:
+            covariance_m2 = covariance_m2 + query.prior.sigma_m**2 * np.diag([1.0, 1.0, 0.0])
         agrees = off <= chi_square_of(CHANCE, 2) if off is not None else not query.site.has_surface
-        if agrees:
-            return replace(found, fix=replace(fix, stage="unconfirmed"))
-        against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
-        detail = f"the picture does not confirm the attitude, and {against}"
-        return fix.refused(Reason.BAD_POSE, detail)
+        fix = replace(fix, stage="unconfirmed", covariance_m2=covariance_m2)
+        return replace(found, fix=fix) if agrees else replace(found, is_contradicted=True)
 
     def refine_at_once(self, found: PeakCandidate) -> PeakCandidate | None:
         """The candidate refined on the frame's own level; None if the picture does not confirm it."""

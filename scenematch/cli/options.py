@@ -4,7 +4,7 @@ Options:
     surface: Surface model, a GeoTIFF of heights.
     correct: Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.
     start: Where the flight begins (default: the telemetry's first position, or anywhere on the map).
-    method: auto: ncc and sift, each checking the other (default).
+    method: auto: ncc, and sift where that leaves doubt (default).
     device: Device to compute on (default: auto).
     settings: Settings as `doctor --settings` lists them; repeatable.
     out: Output folder to create.

@@ -67,6 +67,7 @@ def test_two_places_that_are_about_as_evident_refuse(told, sift_nats):
 
 def test_few_features_that_disagree_are_not_the_second_opinion(site, camera, frame, prior, monkeypatch):
     """All of them are; a pose of few, a level coarser, is off by more."""
+    monkeypatch.setattr("engine.matching.auto._is_settled", lambda *_: False)
     matcher = SceneMatcher(site, camera, "auto", "cpu")
     expected, few = matcher.locate(frame, prior), Sift.find_few
 
@@ -80,3 +81,10 @@ def test_few_features_that_disagree_are_not_the_second_opinion(site, camera, fra
     result = matcher.locate(frame, prior)
     assert result.stage == expected.stage == "verified"
     assert (result.east_m, result.north_m) == (expected.east_m, expected.north_m)
+
+
+def test_a_refined_fix_beyond_doubt_is_not_matched_a_second_time(site, camera, frame, prior, monkeypatch):
+    monkeypatch.setattr(Sift, "locate", lambda *_: pytest.fail("SIFT was asked"))
+    fix = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)
+    assert (fix.method, fix.stage) == ("ncc", "refined")
+    assert 1.0 - fix.confidence < 1e-11

@@ -220,6 +220,7 @@ def test_a_frame_crosses_once_and_its_fix_is_the_cpus(method, backend, monkeypat
     matcher = SceneMatcher(scene.site, scene.camera, method, "cpu", options)
     expected = [matcher.locate(*pair) for pair in zip(scene.frames, scene.priors, strict=True)]
     monkeypatch.setattr(engine.runtime.device, "resolve", lambda name: DEVICE)
+    monkeypatch.setattr("engine.matching.auto._is_settled", lambda *_: False)  # so that auto asks both methods
     with pretended_device() as crossings:
         matcher = SceneMatcher(scene.site, scene.camera, method, options=options)
         for frame, prior in zip(scene.frames, scene.priors, strict=True):

@@ -84,36 +84,33 @@ def test_a_pose_that_is_hardly_confirmed_gives_way_to_one_that_is(ground, site, 
 
 
 @pytest.mark.parametrize(
-    ("is_oblique", "nats", "refined_nats", "stage", "left"),
+    ("nats", "refined_nats", "stage", "left"),
     [
-        (False, 7.0, 30.0, "refined", 30.0),
-        (False, 7.0, 5.0, None, None),  # chance reaches that as well
-        (False, 7.0, None, None, None),
-        (False, 11.0, 30.0, "refined", 11.0),  # enough: nothing more is measured
-        (False, 11.0, None, None, None),
-        (False, 40.0, None, None, None),  # the place may be right, and the attitude be wrong
-        (True, 7.0, 30.0, "refined", 30.0),
-        (True, 7.0, None, None, None),
-        (True, 11.0, None, "unconfirmed", 11.0),  # it says nothing
+        (7.0, 30.0, "refined", 30.0),
+        (7.0, 5.0, None, None),  # chance reaches that as well
+        (7.0, None, None, None),
+        (11.0, 30.0, "refined", 11.0),  # enough: nothing more is measured
+        (11.0, None, "unconfirmed", 11.0),
     ],
 )
-def test_a_refined_pose_is_evidence_for_the_place_and_a_failure_against_it(
-    ground, site, camera, monkeypatch, is_oblique, nats, refined_nats, stage, left
+def test_a_refined_pose_is_evidence_for_the_place_and_without_it_only_the_prior_confirms_the_attitude(
+    ground, site, camera, monkeypatch, nats, refined_nats, stage, left
 ):
-    """The usual risk asks for 9.2 nats: less is made up for, and a little more is not enough where it fails."""
+    """The usual risk asks for 9.2 nats."""
     monkeypatch.setattr(Ncc, "find", weakened(nats))
     monkeypatch.setattr(Ncc, "match_structure", lambda *_: None)
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
     found = (lambda _, fix: None) if refined_nats is None else lambda _, fix: refined(fix, 0.9)
     monkeypatch.setattr(Refinement, "refine_pose", found)
     monkeypatch.setattr(Refinement, "surprise_of", lambda *_: (refined_nats or 0.0) + math.log(1000.0))
-    monkeypatch.setattr("engine.matching.refinement.is_oblique", lambda *_: is_oblique)
     frame = ground.frame(camera, NADIR, 150.0, **TRUE)
-    answer = SceneMatcher(site, camera, "ncc", "cpu").locate(frame, ground.prior(NADIR))
+    prior = ground.prior(NADIR)
+    answer = SceneMatcher(site, camera, "ncc", "cpu").locate(frame, prior)
     if stage is None:
         assert isinstance(answer, NoFix)
         return
     assert answer.stage == stage
+    assert (answer.sigma_m > prior.sigma_m) == (stage == "unconfirmed")
     assert answer.confidence == pytest.approx(probability(left), rel=1e-9)
 
 
