@@ -25,7 +25,7 @@ from engine.values import Fix, Window
 
 
 class Auto(Method):
-    """NCC if height and heading are known, then SIFT if time remains; two fixes must be of one place.
+    """NCC if height and heading are known, and SIFT if that leaves doubt and time; their places are weighed.
 
     Args:
         site: the map.
@@ -67,14 +67,14 @@ class Auto(Method):
             self.ncc.warmup_search(query)
 
     def locate(self, query: Query) -> Answer:
-        """What both propose: SIFT checks NCC's fix, or looks where NCC has none.
+        """NCC's fix if the picture settles it, else what both propose.
 
-        It runs last, so that it never takes time from NCC.
+        SIFT runs last, so that it never takes time from NCC.
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
         first = self.ncc.locate(query, widely=False)  # SIFT finds the heading by itself
-        if isinstance(first, Candidate) and _is_settled(first, query):
+        if is_accepted(first, query) and _is_settled(first, query):
             return first
         agrees = None
         if is_accepted(first, query) and not first.fix.rests_on_attitude:
@@ -94,9 +94,10 @@ class Auto(Method):
         both = [each for each in (first, second) if is_accepted(each, query)]
         offset_m = offset_between_m(first.fix, second.fix)
         is_near = float(np.hypot(*offset_m)) < self.ncc.options.exclusion_m
-        if len(both) < 2 or not (is_near or agree_in_place(first.fix, second.fix)):
+        is_one_place = is_near or agree_in_place(first.fix, second.fix)
+        if len(both) < 2 or not is_one_place:
             best = max(both or [first, second], key=_nats)
-            return best.against([first, second])
+            return best if is_one_place else best.against([first, second])
         if not _agree(first.fix, second.fix):
             return replace(second, fix=_vaguer(second.fix, offset_m))
         greater, best = max(both, key=_nats).evidence, min(both, key=lambda each: each.fix.sigma_m)

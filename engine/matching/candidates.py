@@ -32,17 +32,17 @@ class Candidate(ABC):
     evidence: Evidence
 
     @property
-    def is_possible(self) -> bool:
+    def counts(self) -> bool:
         """Whether its evidence counts at all."""
         return True
 
     def promises(self, risk: float) -> bool:
         """Whether it suffices unless the null hypothesis, if that is not tested yet, does as well."""
-        return self.is_possible and self.evidence.promises(risk)
+        return self.counts and self.evidence.promises(risk)
 
     def suffices(self, risk: float) -> bool:
         """Whether its fix may be handed out: it is wrong with at most this probability."""
-        return self.is_possible and self.evidence.suffices(risk)
+        return self.counts and self.evidence.suffices(risk)
 
     def refusal(self, risk: float) -> Refusal:
         """Why it does not suffice for this risk."""
@@ -58,11 +58,9 @@ class Candidate(ABC):
     def against(self, others: Iterable[Candidate]) -> Self:
         """The candidate with the evidence for any other place against it."""
         rivals = [
-            other.evidence.nats
-            for other in others
-            if other.is_possible and not agree_in_place(other.fix, self.fix)
+            other.evidence.nats for other in others if other.counts and not agree_in_place(other.fix, self.fix)
         ]
-        return self.weighed(replace(self.evidence, elsewhere=max([0.0, *rivals])))
+        return self.weighed(replace(self.evidence, elsewhere=max([self.evidence.elsewhere, *rivals])))
 
     def weighed(self, evidence: Evidence) -> Self:
         """The candidate by other evidence."""
@@ -110,7 +108,7 @@ class PeakCandidate(Candidate):
         return bool(self.peak.curvature.any())
 
     @property
-    def is_possible(self) -> bool:
+    def counts(self) -> bool:
         """Whether its evidence counts: not a slope's, nor a fitted score until structure confirms the place."""
         return self.is_inside and not self.is_contradicted and (self.by_structure or not self.is_fitted)
 
@@ -119,21 +117,20 @@ class PeakCandidate(Candidate):
         if not self.is_inside:
             return Reason.AMBIGUOUS, f"NCC {score:.3f} still rises at the window's edge"
         sigmas, rival = (math.sqrt(2.0 * surprise) for surprise in (evidence.surprise, evidence.chance))
-        if replace(evidence, rival=0.0, null=0.0, prior_chi_square=None).nats < needed_nats(risk):
+        if replace(evidence, rival=0.0, null=0.0, elsewhere=0.0, prior_chi_square=None).nats < needed_nats(risk):
             needed = math.sqrt(2.0 * (math.log(evidence.tried) + needed_nats(risk)))
             among = f"{needed:.1f} are needed among {evidence.tried:,.0f} places"
             return Reason.LOW_SCORE, f"best NCC {score:.3f}, {sigmas:.1f} sigmas may be chance: {among}"
-        figures = f"NCC {sigmas:.1f} sigmas, rival at {rival:.1f}, {self._from_prior}"
-        if self.is_contradicted and evidence.promises(risk):
+        which = "mirrored frame" if evidence.null > evidence.rival else "rival"
+        figures = f"NCC {sigmas:.1f} sigmas, {which} at {rival:.1f}, {self._from_prior}"
+        if not evidence.promises(risk):
+            return Reason.AMBIGUOUS, f"{self._wrong(risk)} ({figures})"
+        if self.is_contradicted:
             return Reason.BAD_POSE, f"the picture does not confirm roll and pitch there ({figures})"
-        if evidence.promises(risk):
-            confirmed = (
-                "confirmed by the structure about the place"
-                if self.by_search
-                else "compared with its mirror image"
-            )
-            return Reason.UNCONFIRMED, f"found but not yet {confirmed} ({figures})"
-        return Reason.AMBIGUOUS, f"{self._wrong(risk)} ({figures})"
+        if self.by_search:
+            doubt = "found by a search, not confirmed by the structure about the place"
+            return Reason.UNCONFIRMED, f"{doubt} ({figures})"
+        return Reason.LATE, f"no time was left to compare it with the mirrored frame ({figures})"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,8 +3,8 @@
 Evidence, in nats, is log p(match | the frame was taken there) - log p(match | it was taken elsewhere, by chance).
 Independent evidence adds up, and a fix is accepted if its probability of being wrong is at most the allowed risk.
 Chance is measured on the frame itself: by pairs of its own matches that are known to be wrong, by the best rival
-elsewhere and, in doubt, by the mirrored frame, which shows no place on Earth. Only what a refinement is worth was
-measured once for all.
+elsewhere, by the refined pose moved to places about it and, in doubt, by the mirrored frame, which shows no place
+on Earth.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class Evidence:
             measured, or the telemetry's is unknown or doubted.
         null: the surprise of the null hypothesis, the mirrored frame; 0 if it was not matched, or is a rival.
         elsewhere: the evidence for the best other place that another attempt found.
-        is_tested: whether the null hypothesis was tested, or is among the rivals; if not, only evidence beyond
-            doubt counts.
+        is_tested: whether the null hypothesis was tested, is among the rivals, or needs no test because a picture
+            confirmed the pose; if not, only evidence beyond doubt counts.
         refined: the surprise of the pose refined there, less what was tried for it; None without one.
     """
 
@@ -69,7 +69,7 @@ class Evidence:
 
     @property
     def nats(self) -> float:
-        """What was seen, by how much places look alike; what was known before; and what refinement said."""
+        """The greater of what the match and its refined pose show, plus what was known before, less elsewhere."""
         alike = max(1.0, min(self.chance, self.surprise) / math.log(self.measured))
         seen = max(self.surprise / alike - math.log(self.tried), 0.0)
         if self.refined is not None:  # peak and pose compare the same picture: the greater evidence counts
@@ -78,14 +78,14 @@ class Evidence:
 
     @property
     def of_refinement(self) -> float:
-        """The evidence of the refined pose alone, in nats; a rival as good as the peak leaves none."""
+        """The evidence of the refined pose's correlation, in nats; a rival as good as the peak leaves none."""
         if self.refined is None or self.chance >= self.surprise:
             return -math.inf
         return self.refined * (1.0 - self.chance / self.surprise) - math.log(self.tried)
 
     @property
     def of_pose(self) -> float:
-        """The evidence for the refined pose alone: of its correlation, and of where it lies."""
+        """The evidence for the refined pose itself, its peak apart: of its correlation and of the prior."""
         return self.of_refinement + _of_position(self.prior_chi_square)
 
     def promises(self, risk: float) -> bool:

@@ -22,7 +22,7 @@ from engine.matching.ladder import Answer, Rung, Works, climb, is_accepted, rehe
 from engine.matching.method import Method
 from engine.matching.peak_evidence import candidate_of, early_stop, null_tested, places_in
 from engine.matching.query import Query
-from engine.matching.refinement import Refinement, with_unconfirmed_tilt
+from engine.matching.refinement import Refinement, with_tilt_doubt
 from engine.matching.structure import match_structure
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
@@ -254,7 +254,7 @@ class _Rungs:
         """The pose of a coarse peak refined, or the peak with a tilt that nothing confirmed."""
         assert isinstance(answer, PeakCandidate)  # or it was not offered
         refined = self.refinement_of(answer).refine_at_once(answer)
-        return refined or replace(answer, fix=with_unconfirmed_tilt(self._query, answer.fix))
+        return refined or replace(answer, fix=with_tilt_doubt(self._query, answer.fix))
 
     def _if_untested(self, answer: Answer | None) -> Works:
         """A peak of one window that suffices unless chance does as well there."""
@@ -279,13 +279,12 @@ class _Rungs:
     def _correlate(self, answer: Answer | None, step: Hashable) -> Answer:
         """The peak of one level; beside a coarser one of the same place it has the evidence for that."""
         found = self._find(step)
-        if not self._is_coarse(answer) or not isinstance(found, PeakCandidate):
+        if not isinstance(found, PeakCandidate):
             return found
-        if not found.suffices(self._query.risk) and self._is_same(answer.fix, found.fix):
+        if self._is_coarse(answer) and self._is_refused(found) and self._is_same(answer.fix, found.fix):
             found = found.weighed(answer.evidence)
-        if self._is_coarse(found):
-            return replace(found, fix=with_unconfirmed_tilt(self._query, found.fix))
-        return found
+        rests_on_tilt = found.fix.stage == "coarse" and self._query.telemetry.has_tilt
+        return replace(found, fix=with_tilt_doubt(self._query, found.fix)) if rests_on_tilt else found
 
     def _find(self, step: Hashable) -> PeakCandidate | NoFix:
         assert isinstance(step, tuple)
@@ -300,14 +299,13 @@ class _Rungs:
     def _match_structure(self, answer: Answer | None, step: Hashable) -> Answer | None:
         """Structure where the refused peak lies; it sees what grey levels see, and more: its peak counts."""
         assert isinstance(answer, PeakCandidate)  # or it was not offered
-        found = self._ncc.match_structure(self._query, answer)
-        return None if answer.is_fitted and not is_accepted(found, self._query) else found
+        return self._ncc.match_structure(self._query, answer)
 
     def _if_unrefined(self, answer: Answer | None) -> Works:
         """The pose of a peak, of which it is stronger evidence."""
         if not isinstance(answer, PeakCandidate) or answer.by_refinement or not self._ncc.can_refine(self._query):
             return {}
-        offered = answer.is_possible and (answer.fix.stage == "fine" or self._is_refused(answer))
+        offered = answer.counts and (answer.fix.stage == "fine" or self._is_refused(answer))
         return {_REFINEMENT: self._frame_px} if offered else {}
 
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer:

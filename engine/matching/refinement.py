@@ -48,7 +48,7 @@ reached 0.6. Poses with a wrong tilt reached 0.30 to 0.35, and 0.87 as soon as t
 # Possible tilt error if the picture does not confirm the pose: with angles off by 1.5 degrees, half of the frames
 # of a simulated flight were not confirmed, and their peaks were up to 7.6 m off at 150 m; with correct angles all
 # were confirmed.
-_UNCONFIRMED_TILT_DEG = 1.5
+_TILT_DOUBT_DEG = 1.5
 _HEIGHT_SHARE = 2e-4  # bias of the height from walls and the ground hidden behind them: 3 cm at 150 m
 _COARSE_SAMPLES = 800  # on a coarser level
 # Places about a pose that show what correlation chance gives there, as shares of the shorter side of the ground in
@@ -64,7 +64,7 @@ class Refined:
 
     Attributes:
         fix: that it gives; its score is the correlation of picture and map.
-        pose: of the camera.
+        pose: that was correlated; over an unknown slope the fix differs.
         picture: as it was compared with the map.
         ground: the samples of the map.
     """
@@ -105,7 +105,7 @@ class Refinement:
         if roll and pitch were hardly known, and the more probable pose counts. If neither has evidence, a wrong
         attitude is as probable as a right one: right poses can be refined in 98 of 100 frames, and attitudes are
         right in 99 of 100. Only a prior then confirms the attitude, and the fix is no more certain than that.
-        Without a surface model relief may be the reason, and the fix stays as it is.
+        Without a surface model relief may be the reason: the fix stays as it is, unless a prior disagrees with it.
         """
         query, has_tilt, found = self.query, self.query.telemetry.has_tilt, replace(found, by_refinement=True)
         refined = self.refine_pose(found.fix)
@@ -119,7 +119,7 @@ class Refinement:
         if not found.promises(query.risk):
             return found
         if has_tilt:
-            return self._unconfirmed(found)
+            return self._resting_on_prior(found)
         return replace(found, is_contradicted=query.site.has_surface)
 
     def _or_doubted(self, found: PeakCandidate, own: PeakCandidate | None) -> PeakCandidate | None:
@@ -169,8 +169,8 @@ class Refinement:
             return 0.0
         return surprise_of(refined.fix.score, float(chance.std()))
 
-    def _unconfirmed(self, found: PeakCandidate) -> PeakCandidate:
-        """A known attitude that the picture does not confirm, if the prior agrees with the position."""
+    def _resting_on_prior(self, found: PeakCandidate) -> PeakCandidate:
+        """A peak whose known attitude no picture confirms; contradicted if the prior disagrees with it."""
         query, fix = self.query, found.fix
         off, covariance_m2 = query.prior_chi_square(fix), fix.covariance_m2
         if query.site.has_surface and query.prior is not None:
@@ -181,7 +181,7 @@ class Refinement:
 
     def refine_at_once(self, found: PeakCandidate) -> PeakCandidate | None:
         """The candidate refined on the frame's own level; None if the picture does not confirm it."""
-        refined = self._refined(found.fix, self._prior(found.fix), 0)
+        refined, found = self._refined(found.fix, self._prior(found.fix), 0), replace(found, by_refinement=True)
         if refined is None or not refined.is_clear:
             return None
         if found.suffices(self.query.risk):
@@ -362,9 +362,9 @@ class Refinement:
         return replace(refined, stage="refined", confidence=fix.confidence)
 
 
-def with_unconfirmed_tilt(query: Query, fix: Fix) -> Fix:
+def with_tilt_doubt(query: Query, fix: Fix) -> Fix:
     """The fix of a frame whose picture does not confirm its attitude, with a covariance for a wrong tilt."""
-    doubt_m = query.telemetry.known_height_m * math.radians(_UNCONFIRMED_TILT_DEG)
+    doubt_m = query.telemetry.known_height_m * math.radians(_TILT_DOUBT_DEG)
     return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0]))
 
 

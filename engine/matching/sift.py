@@ -15,7 +15,7 @@ from engine.matching.ladder import SHARES, Answer, Rung, Works, climb, is_accept
 from engine.matching.method import Method
 from engine.matching.pose import MIN_INLIERS
 from engine.matching.query import Query
-from engine.matching.refinement import CONFIRMING_CORRELATION, Refinement, with_unconfirmed_tilt
+from engine.matching.refinement import CONFIRMING_CORRELATION, Refinement, with_tilt_doubt
 from engine.matching.views import coarser_scale, drawn_px
 from engine.options import MatcherOptions, SiftOptions
 from engine.orthomap import OrthoMap
@@ -103,7 +103,7 @@ class Sift(Method):
         """
         answer = climb(query, METHOD, _Rungs(self, query, agrees).in_order)
         if isinstance(answer, PoseCandidate) and answer.is_quick:  # it follows the telemetry's attitude
-            answer = replace(answer, fix=with_unconfirmed_tilt(query, answer.fix)).coarse()
+            answer = replace(answer, fix=with_tilt_doubt(query, answer.fix)).coarse()
         return answer
 
     def few_options(self, query: Query) -> SiftOptions | None:
