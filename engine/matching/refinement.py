@@ -29,6 +29,7 @@ from engine.matching.align import shrink
 from engine.matching.candidates import PeakCandidate
 from engine.matching.covariance import tilt_covariance
 from engine.matching.evidence import RELIABILITY, surprise_of
+from engine.matching.oblique import is_oblique
 from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.options import NccOptions
@@ -116,6 +117,8 @@ class Refinement:
         best = self._or_doubted(found, own) if has_tilt and query.site.has_surface and not is_clear else own
         if best is not None:
             return best
+        if has_tilt and query.site.has_surface and not is_oblique(query, query.telemetry.known_attitude):
+            found = found.weighed(replace(found.evidence, refined=-math.inf))  # of few right places
         if not found.promises(query.risk):
             return found
         if has_tilt:

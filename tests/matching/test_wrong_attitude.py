@@ -90,7 +90,8 @@ def test_a_pose_that_is_hardly_confirmed_gives_way_to_one_that_is(ground, site, 
         (7.0, 5.0, None, None),  # chance reaches that as well
         (7.0, None, None, None),
         (11.0, 30.0, "refined", 11.0),  # enough: nothing more is measured
-        (11.0, None, "unconfirmed", 11.0),
+        (11.0, None, None, None),
+        (14.0, None, "unconfirmed", 14.0 + math.log(0.02)),
     ],
 )
 def test_a_refined_pose_is_evidence_for_the_place_and_without_it_only_the_prior_confirms_the_attitude(
