@@ -12,19 +12,19 @@ from tests.support.paths import ROOT
 
 FIGURES = {  # page: claim: results page, heading and words of each row that states it
     "README.md": {
-        "| wooded park, 9 photographs | 9 | 0.25 | 0 | 0.91 |":
+        "| wooded park, 9 photographs | 9 | 0.20 | 0 | 0.91 |":
             [("field.md", "`brighton`", "| auto |", "| plain classical recipe")],
-        "| fields, infrared, 82 photographs | 82 | 0.72 | 0 | 1.16 |":
+        "| fields, infrared, 82 photographs | 82 | 0.60 | 0 | 1.16 |":
             [("field.md", "`seneca`", "| auto |", "| plain classical recipe")],
-        "| bare ground, 37 photographs | 37 | 0.18 | 0 | 0.71 |":
+        "| bare ground, 37 photographs | 37 | 0.13 | 0 | 0.71 |":
             [("field.md", "`caliterra`", "| auto |", "| plain classical recipe")],
-        "| campus, 271 video frames, map of another date | 271 | 1.13 | 0 | 1.15 |":
+        "| campus, 271 video frames, map of another date | 271 | 1.08 | 0 | 1.15 |":
             [("field.md", "`nust`", "| auto |", "| paper's NCC, OpenCV |")],
-        "| Gazebo and ArduPilot, 79 frames | 79 | 0.18 | 0 | 1.23 |":
+        "| Gazebo and ArduPilot, 79 frames | 79 | 0.19 | 0 | 1.23 |":
             [("field.md", "`gazebo-a1`:", "| auto,"), ("field.md", "The paper's recipe", "| `gazebo-a1` |")],
         "| the same, evening, map of noon | 79 | 0.21 | 0 | 1.31 |":
             [("field.md", "`gazebo-a1-evening`", "| auto,", "| plain classical recipe")],
-        "8 to 593 ms a frame":
+        "3 to 372 ms a frame":
             [("field.md", "`gazebo-a1`:", "| auto,"), ("field.md", "`brighton`", "| auto |")],
         "from 30 to 150 m up":
             [("field.md", "`caliterra`", "survey photographs"),
