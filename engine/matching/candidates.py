@@ -91,7 +91,6 @@ class PeakCandidate(Candidate):
         is_fitted: whether heading and height were fitted to the picture, which maximises its score.
         by_structure: whether structure was matched as well as grey levels.
         by_refinement: whether refining its pose was tried.
-        is_contradicted: whether the picture should have confirmed the pose, and did not.
     """
 
     peak: Peak
@@ -100,7 +99,6 @@ class PeakCandidate(Candidate):
     is_fitted: bool = False
     by_structure: bool = False
     by_refinement: bool = False
-    is_contradicted: bool = False
 
     @property
     def is_inside(self) -> bool:
@@ -110,7 +108,7 @@ class PeakCandidate(Candidate):
     @property
     def counts(self) -> bool:
         """Whether its evidence counts: not a slope's, nor a fitted score until structure confirms the place."""
-        return self.is_inside and not self.is_contradicted and (self.by_structure or not self.is_fitted)
+        return self.is_inside and (self.by_structure or not self.is_fitted)
 
     def _refusal(self, risk: float) -> Refusal:
         evidence, score = self.evidence, self.peak.score
@@ -125,8 +123,6 @@ class PeakCandidate(Candidate):
         figures = f"NCC {sigmas:.1f} sigmas, {which} at {rival:.1f}, {self._from_prior}"
         if not evidence.promises(risk):
             return Reason.AMBIGUOUS, f"{self._wrong(risk)} ({figures})"
-        if self.is_contradicted:
-            return Reason.BAD_POSE, f"the picture does not confirm roll and pitch there ({figures})"
         if self.by_search:
             doubt = "found by a search, not confirmed by the structure about the place"
             return Reason.UNCONFIRMED, f"{doubt} ({figures})"

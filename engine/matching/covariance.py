@@ -134,6 +134,31 @@ def peak_covariance_px(peak: Peak, pixels: int) -> Array:
     return np.asarray((vectors * variances) @ vectors.T, dtype=np.float64)
 
 
+def misalignment_covariance_px2(
+    peak: Peak, shape: tuple[int, int], height_m: float, errors: AssumedErrors
+) -> Array:
+    """Covariance of a peak whose template is rotated or scaled relative to the map.
+
+    An error of heading or height moves every part of the patch by a different amount. If the parts stay within the
+    width of the peak, the peak lies at their mean, and nothing is lost; if not, it follows the part with the
+    strongest texture, which may be anywhere. The share between the two is u^2 / (u^2 + width^2).
+
+    Args:
+        peak: of the patch.
+        shape: (rows, columns) of the patch.
+        height_m: above the ground.
+        errors: assumed errors of height and heading.
+
+    Returns:
+        (2, 2) in square pixels.
+    """
+    share = math.hypot(errors.height_share, errors.height_m / height_m, math.radians(errors.heading_deg))
+    apart = share**2 * (shape[0] ** 2 + shape[1] ** 2) / 24.0  # mean over the patch along one axis
+    bend = -float(np.trace(peak.curvature)) / 2.0
+    width = max(peak.score, 0.05) / max(bend, 1e-9)
+    return np.asarray(apart * apart / (apart + width) * np.eye(2), dtype=np.float64)
+
+
 def ncc_covariance_m2(
     peak_px2: Array, pose: GridPose, camera: Camera, enu_jacobian: Array, errors: AssumedErrors
 ) -> Array:

@@ -9,6 +9,7 @@ from engine.kernels.scores import enhance
 from engine.matching.candidates import PeakCandidate
 from engine.matching.correlation import METHOD, Aligned, Correlator
 from engine.matching.covariance import (
+    misalignment_covariance_px2,
     ncc_covariance_m2,
     peak_covariance_px,
     score_sigma,
@@ -100,6 +101,7 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
     errors = query.errors(correlator.options.errors)
     rows, columns = aligned.template.shape
     peak_px2 = peak_covariance_px(peak, rows * columns)
+    peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), pose.known_height_m, errors)
     covariance = ncc_covariance_m2(peak_px2, pose, query.camera, aligned.jacobian, errors)
     return query.fix(
         METHOD,

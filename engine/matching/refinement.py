@@ -34,7 +34,7 @@ from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.options import NccOptions
 from engine.runtime.scheduler import OutOfTime
-from engine.values import CHANCE, Attitude, Fix, Window
+from engine.values import CHANCE, Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
 
@@ -99,8 +99,8 @@ class Refinement:
     doubts_tilt: bool = False
     pictures: dict[int, EnhancedFrame] = field(default_factory=dict, repr=False, compare=False)
 
-    def refine(self, found: PeakCandidate) -> PeakCandidate:
-        """The candidate with its whole pose refined and the evidence of that, or a less certain one.
+    def refine(self, found: PeakCandidate) -> PeakCandidate | NoFix:
+        """The candidate with its whole pose refined and the evidence of that, a less certain one, or a refusal.
 
         If the picture hardly confirms the telemetry's attitude over a surface model, the pose is refined again as
         if roll and pitch were hardly known, and the more probable pose counts. If neither has evidence, a wrong
@@ -123,7 +123,10 @@ class Refinement:
             return found
         if has_tilt:
             return self._resting_on_prior(found)
-        return replace(found, is_contradicted=query.site.has_surface)
+        if not query.site.has_surface:
+            return found
+        detail = "roll and pitch are unknown, and the picture does not determine them"
+        return found.fix.refused(Reason.BAD_POSE, detail)
 
     def _or_doubted(self, found: PeakCandidate, own: PeakCandidate | None) -> PeakCandidate | None:
         """The candidate refined by a known attitude, or as if that were hardly known; the more probable one."""
@@ -172,15 +175,17 @@ class Refinement:
             return 0.0
         return surprise_of(refined.fix.score, float(chance.std()))
 
-    def _resting_on_prior(self, found: PeakCandidate) -> PeakCandidate:
-        """A peak whose known attitude no picture confirms; contradicted if the prior disagrees with it."""
+    def _resting_on_prior(self, found: PeakCandidate) -> PeakCandidate | NoFix:
+        """A peak whose known attitude no picture confirms; refused if the prior disagrees with it."""
         query, fix = self.query, found.fix
         off, covariance_m2 = query.prior_chi_square(fix), fix.covariance_m2
         if query.site.has_surface and query.prior is not None:
             covariance_m2 = covariance_m2 + query.prior.sigma_m**2 * np.diag([1.0, 1.0, 0.0])
         agrees = off <= chi_square_of(CHANCE, 2) if off is not None else not query.site.has_surface
-        fix = replace(fix, stage="unconfirmed", covariance_m2=covariance_m2)
-        return replace(found, fix=fix) if agrees else replace(found, is_contradicted=True)
+        if agrees:
+            return replace(found, fix=replace(fix, stage="unconfirmed", covariance_m2=covariance_m2))
+        against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
+        return fix.refused(Reason.BAD_POSE, f"the picture does not confirm roll and pitch, and {against}")
 
     def refine_at_once(self, found: PeakCandidate) -> PeakCandidate | None:
         """The candidate refined on the frame's own level; None if the picture does not confirm it."""

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from engine import Camera
 from engine.matching.covariance import (
+    misalignment_covariance_px2,
     ncc_covariance_m2,
     peak_covariance_px,
     score_sigma,
@@ -122,3 +123,14 @@ def test_the_height_of_a_tilted_camera_moves_the_fix_along_the_tilt():
     turned = errors_for(frame, height_m=1e-6, height_share=1e-9, **(small | {"heading_deg": 1.0}))
     assert math.sqrt(turned[1, 1]) == pytest.approx(54.6 * math.radians(1.0), rel=1e-2)
     assert turned[0, 0] < 1e-4
+
+
+def test_a_turned_patch_pulls_its_peak_only_where_its_parts_come_apart():
+    """By hand: what 240 x 320 px move by when turned by 1 degree, against a peak 0.8 / 0.02 = 40 px^2 wide."""
+    stated = AssumedErrors(heading_deg=1.0, height_m=1e-9, height_share=1e-9)
+    apart = math.radians(1.0) ** 2 * (240**2 + 320**2) / 24.0
+    pull = misalignment_covariance_px2(peak(0.8), (240, 320), 150.0, stated)
+    np.testing.assert_allclose(pull, apart**2 / (apart + 40.0) * np.eye(2), rtol=1e-9)
+    sharp = misalignment_covariance_px2(peak(0.8, bend=((-80.0, 0.0), (0.0, -80.0))), (240, 320), 150.0, stated)
+    assert sharp[0, 0] == pytest.approx(apart, rel=0.01)  # the parts cannot agree: anywhere between them
+    assert misalignment_covariance_px2(peak(0.8), (24, 32), 150.0, stated)[0, 0] < 1e-3 * pull[0, 0]

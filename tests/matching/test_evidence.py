@@ -188,12 +188,6 @@ def test_of_a_peak_and_its_refined_pose_the_greater_evidence_counts():
     assert math.exp(none - unknown) == pytest.approx(0.02)  # few right places have no pose that can be refined
 
 
-def test_a_peak_whose_pose_the_picture_contradicts_is_refused_whatever_its_evidence():
-    certain = replace(a_peak(replace(PEAK, surprise=1250.0)), is_contradicted=True)
-    assert not certain.suffices(1e-4)
-    assert certain.refusal(1e-4)[0] is Reason.BAD_POSE
-
-
 @given(st.floats(7.0, 1e3))
 def test_a_refined_pose_is_no_evidence_against_a_rival_as_good_as_its_peak(surprise):
     alike = Evidence(surprise, surprise, 1000.0, 1000.0, None, refined=1e4)
