@@ -16,7 +16,7 @@ from engine.maps.landmarks import LandmarkMap
 from engine.matching.align import MIN_DOWN
 from engine.matching.candidates import PoseCandidate
 from engine.matching.covariance import tilt_covariance
-from engine.matching.evidence import Evidence, is_beyond_doubt, probability
+from engine.matching.evidence import Evidence, probability
 from engine.matching.feature_matching import Matched, match_views
 from engine.matching.pose import MIN_INLIERS, PoseStats, solve_pose
 from engine.matching.query import Query
@@ -69,9 +69,8 @@ class FeatureMatcher:
             first = first or result
             if isinstance(result, PoseCandidate):
                 found.append((result, matcher, hypothesis))
-                nats, is_own = result.evidence.nats, result is first
                 # What is found after the telemetry failed may be as wrong as that.
-                if is_beyond_doubt(nats, query.risk) or (is_own and nats >= query.needed_nats):
+                if result.suffices(query.risk) or (result is first and result.promises(query.risk)):
                     break
             elif result.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
                 break
@@ -79,7 +78,7 @@ class FeatureMatcher:
             assert first is not None  # the telemetry's own hypothesis is always tried
             return first
         best, matcher, hypothesis = max(found, key=lambda each: each[0].evidence.nats)
-        if len(found) == 1 and is_beyond_doubt(best.evidence.nats, query.risk):
+        if len(found) == 1 and best.suffices(query.risk):
             return best
         return matcher._null_tested(best.against(each for each, _, _ in found), hypothesis)
 

@@ -178,12 +178,12 @@ class Refinement:
     def _resting_on_prior(self, found: PeakCandidate) -> PeakCandidate | NoFix:
         """A peak whose known attitude no picture confirms; refused if the prior disagrees with it."""
         query, fix = self.query, found.fix
-        off, covariance_m2 = query.prior_chi_square(fix), fix.covariance_m2
-        if query.site.has_surface and query.prior is not None:
-            covariance_m2 = covariance_m2 + query.prior.sigma_m**2 * np.diag([1.0, 1.0, 0.0])
+        off = query.prior_chi_square(fix)
         agrees = off <= chi_square_of(CHANCE, 2) if off is not None else not query.site.has_surface
         if agrees:
-            return replace(found, fix=replace(fix, stage="unconfirmed", covariance_m2=covariance_m2))
+            if query.site.has_surface and query.prior is not None:
+                fix = _less_certain(fix, query.prior.sigma_m)
+            return replace(found, fix=replace(fix, stage="unconfirmed"))
         against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
         return fix.refused(Reason.BAD_POSE, f"the picture does not confirm roll and pitch, and {against}")
 
@@ -372,8 +372,12 @@ class Refinement:
 
 def with_tilt_doubt(query: Query, fix: Fix) -> Fix:
     """The fix of a frame whose picture does not confirm its attitude, with a covariance for a wrong tilt."""
-    doubt_m = query.telemetry.known_height_m * math.radians(_TILT_DOUBT_DEG)
-    return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0]))
+    return _less_certain(fix, query.telemetry.known_height_m * math.radians(_TILT_DOUBT_DEG))
+
+
+def _less_certain(fix: Fix, sigma_m: float) -> Fix:
+    """The fix with one more error, of this standard deviation per axis."""
+    return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([sigma_m**2, sigma_m**2, 0.0]))
 
 
 def _tilted(pose: Pose, height_m: float, sigma_deg: float) -> list[Pose]:

@@ -214,7 +214,7 @@ class _Rungs:
         """The pose by few features, to be refined; or at once the second opinion, if it agrees."""
         assert self._few_options is not None  # or it was not offered
         found = self._sift.find_few(self._query, self._few_options)
-        if isinstance(found, NoFix) or found.evidence.nats < self._query.needed_nats:
+        if isinstance(found, NoFix) or not found.promises(self._query.risk):
             return None
         if self._agrees is None:
             return found

@@ -61,8 +61,8 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
         tried=found.evidence.tried,
         sigma=max(float(chance.std(dtype=np.float64)), 1e-3),
     )
-    own = own.weighed(replace(own.evidence, is_tested=True))
-    return replace(own, by_structure=True, fix=replace(own.fix, window=found.fix.window))
+    evidence, fix = replace(own.evidence, is_tested=True), replace(own.fix, window=found.fix.window)
+    return replace(own, by_structure=True, evidence=evidence, fix=fix)
 
 
 def _templates(correlator: Correlator, aligned: Aligned) -> FloatImage:
