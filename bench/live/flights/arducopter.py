@@ -14,7 +14,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -107,12 +107,16 @@ def simulator(
     camera = [sys.executable, "-m", "bench.live.flights.town_camera", folder, pipe, fault_file]
     with (run / "sitl.log").open("w") as log, contextlib.ExitStack() as world:
         parameters = ["--defaults", ",".join(map(str, defaults))]
-        for command, where in (([*camera, "--delay-ms", DELAY_MS], None), ([sitl, *arguments, *parameters], run)):
-            started = ["chrt", "--rr", "1", *map(str, command)]  # what flies does not wait for other work
-            process = subprocess.Popen(started, cwd=where, stdout=log, stderr=log)
-            world.callback(process.wait)
-            world.callback(process.kill)
+        launch(world, [*camera, "--delay-ms", DELAY_MS], stdout=log, stderr=log)
+        launch(world, [sitl, *arguments, *parameters], cwd=run, stdout=log, stderr=log)
         yield run / "logs"
+
+
+def launch(world: contextlib.ExitStack, command: Sequence[object], **how: Any) -> None:
+    """Start a program that lasts as long as the world; what flies does not wait for other work."""
+    process = subprocess.Popen(["chrt", "--rr", "1", *map(str, command)], **how)
+    world.callback(process.wait)
+    world.callback(process.kill)
 
 
 def fly(
@@ -217,25 +221,40 @@ def report(log: Path, pilot: LoggedPilot, begin_s: float, duration_s: float, fau
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Fly, and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("flight", type=Path)
-    parser.add_argument("sitl", type=Path, help="arducopter, in build/sitl/bin of ArduPilot")
+def parser_of(description: str | None) -> argparse.ArgumentParser:
+    """The options of every simulator's flight."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("flight", type=Path, help="folder of the town; drawn if there is none")
     parser.add_argument("--method", choices=("auto", "ncc"), default="auto")
-    parser.add_argument("--message", default="vision_position_estimate")
     parser.add_argument("--wind-mps", type=float, default=5.0)
     parser.add_argument("--seconds", type=float, default=300.0, help="without GNSS")
     parser.add_argument("--faults", action="store_true")
-    parser.add_argument("--realtime", action="store_true", help="bridge.realtime")
-    arguments = parser.parse_args()
-    folder, before = arguments.flight.absolute(), os.getloadavg()[0]
+    return parser
+
+
+def planned(arguments: argparse.Namespace) -> tuple[Path, tuple[Fault, ...], float]:
+    """The flight's folder, drawn if there is none, its faults, and its seconds without GNSS."""
+    folder, faults = arguments.flight.absolute(), FAULTS if arguments.faults else ()
     if not folder.exists():
         write_flight(folder, plan_flight(1, frames=round(FLIGHT_S * RATE_HZ), rate_hz=RATE_HZ))
+    return folder, faults, faults[-1].end_s + _AFTER_S if faults else arguments.seconds
+
+
+def conditions(before: float) -> str:
+    """Today, and the machine's load before the flight and now."""
+    load = f"load {before:.1f} before, {os.getloadavg()[0]:.1f} after, {os.cpu_count()} cores"
+    return f"{time.strftime('%Y-%m-%d')}, {load}"
+
+
+def main() -> None:
+    """Fly, and print the tables."""
+    parser = parser_of(__doc__)
+    parser.add_argument("sitl", type=Path, help="arducopter, in build/sitl/bin of ArduPilot")
+    parser.add_argument("--message", default="vision_position_estimate")
+    parser.add_argument("--realtime", action="store_true", help="bridge.realtime")
+    arguments, before, port = parser.parse_args(), os.getloadavg()[0], free_port()
+    folder, faults, seconds = planned(arguments)
     motion, place, _ = recorded(folder)
-    faults = FAULTS if arguments.faults else ()
-    seconds = faults[-1].end_s + _AFTER_S if faults else arguments.seconds
-    port = free_port()
     with (
         simulator(arguments.sitl.absolute(), folder, place, port, arguments.message, arguments.wind_mps) as logs,
         contextlib.ExitStack() as stack,
@@ -247,9 +266,8 @@ def main() -> None:
         pilot = LoggedPilot(link, place)
         begin_s = fly(pilot, motion, seconds, bridge, faults)
         pilot.listen(2.0)
-    load = f"load {before:.1f} before, {os.getloadavg()[0]:.1f} after, {os.cpu_count()} cores"
     what = f"{arguments.method}, {arguments.message}, wind {arguments.wind_mps:g} m/s"
-    print(f"{what}, {time.strftime('%Y-%m-%d')}, {load}\n")
+    print(f"{what}, {conditions(before)}\n")
     print(report(max(logs.glob("*.BIN")), pilot, begin_s, seconds, faults))
 
 

@@ -7,7 +7,6 @@ stamps. A fault's row has the time from its end to the bridge's "fixes begin" on
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import subprocess
@@ -20,14 +19,21 @@ from typing import Any
 import numpy as np
 from pymavlink import mavutil
 
-from bench.live.flights.arducopter import DELAY_MS, FAULTS, SitlBridge, change, off_m
+from bench.live.flights.arducopter import (
+    DELAY_MS,
+    SitlBridge,
+    change,
+    conditions,
+    launch,
+    off_m,
+    parser_of,
+    planned,
+)
 from bench.live.flights.faults import Fault
-from bench.live.flights.fly import FLIGHT_S, RATE_HZ
+from bench.live.flights.fly import FLIGHT_S
 from bench.live.flights.recorded import recorded
 from bench.live.flights.sitl import Motion, Pilot
 from engine.geo import LocalFrame
-from scenematch.runs.simulation import write_flight
-from scenematch.simulator import plan_flight
 
 _OFFBOARD = (1.0, 6.0)  # custom mode enabled, PX4's main mode
 _INT32 = 6
@@ -78,11 +84,8 @@ def simulator(build: Path, folder: Path, place: LocalFrame, wind_mps: float) -> 
     camera = [*own, "--delay-ms", DELAY_MS, "--link", "udpin:127.0.0.1:19410"]
     px4 = [build / "bin" / "px4", "-d", "-w", run, build / "etc"]
     with (run / "px4.log").open("w") as log, contextlib.ExitStack() as world:
-        for command_of in (camera, px4):
-            started = ["chrt", "--rr", "1", *map(str, command_of)]  # what flies does not wait for other work
-            process = subprocess.Popen(started, stdout=log, stderr=log, env=environment)
-            world.callback(process.wait)
-            world.callback(process.kill)
+        for program in (camera, px4):
+            launch(world, program, stdout=log, stderr=log, env=environment)
         yield
 
 
@@ -145,20 +148,11 @@ def report(pilot: Px4Pilot, begin_s: float, ended: list[tuple[Fault, float]]) ->
 
 def main() -> None:
     """Fly, and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("flight", type=Path)
+    parser = parser_of(__doc__)
     parser.add_argument("build", type=Path)
-    parser.add_argument("--method", choices=("auto", "ncc"), default="auto")
-    parser.add_argument("--wind-mps", type=float, default=5.0)
-    parser.add_argument("--seconds", type=float, default=300.0, help="without GNSS")
-    parser.add_argument("--faults", action="store_true")
-    arguments = parser.parse_args()
-    folder, before = arguments.flight.absolute(), os.getloadavg()[0]
-    if not folder.exists():
-        write_flight(folder, plan_flight(1, frames=round(FLIGHT_S * RATE_HZ), rate_hz=RATE_HZ))
+    arguments, before = parser.parse_args(), os.getloadavg()[0]
+    folder, faults, seconds = planned(arguments)
     motion, place, _ = recorded(folder)
-    faults = FAULTS if arguments.faults else ()
-    seconds = faults[-1].end_s + 30.0 if faults else arguments.seconds
     with (
         simulator(arguments.build.absolute(), folder, place, arguments.wind_mps),
         contextlib.ExitStack() as stack,
@@ -169,8 +163,7 @@ def main() -> None:
         link.wait_heartbeat()
         pilot = Px4Pilot(link, place)
         begin_s, ended = fly(pilot, motion, seconds, bridge, faults)
-    load = f"load {before:.1f} before, {os.getloadavg()[0]:.1f} after, {os.cpu_count()} cores"
-    print(f"{arguments.method}, wind {arguments.wind_mps:g} m/s, {time.strftime('%Y-%m-%d')}, {load}\n")
+    print(f"{arguments.method}, wind {arguments.wind_mps:g} m/s, {conditions(before)}\n")
     print(report(pilot, begin_s, ended))
 
 
