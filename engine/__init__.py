@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from engine.runtime.lazy_names import imported_on_use
 
 _NAMES = {
+    "engine.assumed_errors": "AssumedErrors",
     "engine.budget": "Budget",
     "engine.camera": "Camera",
     "engine.runtime.threads": "set_threads",
@@ -13,8 +14,7 @@ _NAMES = {
     "OptionError ShapeError StateError TelemetryError",
     "engine.navigation.live": "Answer Live LiveOptions",
     "engine.matching.matcher": "SceneMatcher",
-    "engine.options": "AssumedErrors LearnedOptions MatcherOptions NavigatorOptions NccOptions "
-    "PoseOptions SiftOptions",
+    "engine.options": "LearnedOptions MatcherOptions NavigatorOptions NccOptions PoseOptions SiftOptions",
     "engine.navigation.navigator": "Navigator",
     "engine.navigation.state": "NavigatorState",
     "engine.orthomap": "OrthoMap",
@@ -30,6 +30,7 @@ _imported = imported_on_use(__name__, _NAMES)
 if TYPE_CHECKING:  # the same names for type checkers; `as` makes them public
     from engine import features as features
     from engine import ncc_fft as ncc_fft
+    from engine.assumed_errors import AssumedErrors as AssumedErrors
     from engine.budget import Budget as Budget
     from engine.camera import Camera as Camera
     from engine.errors import BackendError as BackendError
@@ -49,7 +50,6 @@ if TYPE_CHECKING:  # the same names for type checkers; `as` makes them public
     from engine.navigation.live import LiveOptions as LiveOptions
     from engine.navigation.navigator import Navigator as Navigator
     from engine.navigation.state import NavigatorState as NavigatorState
-    from engine.options import AssumedErrors as AssumedErrors
     from engine.options import LearnedOptions as LearnedOptions
     from engine.options import MatcherOptions as MatcherOptions
     from engine.options import NavigatorOptions as NavigatorOptions

@@ -1,64 +1,25 @@
-"""Settings of matching and navigation, and errors to assume if telemetry and map do not state them."""
+"""Settings of matching and navigation."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
-from engine.errors import OptionError
+from engine.assumed_errors import AssumedErrors
 from engine.geo import chi_square_of
 from engine.learned.pairs import PairMatcher
 from engine.sift import BACKENDS
-from engine.values import CHANCE, MAX_SIGMA_M, RISK, GridPose, check, check_choice, check_positive
+from engine.values import CHANCE, RISK, check, check_choice, check_positive
+
+if TYPE_CHECKING:
+    from engine.orthomap import OrthoMap
 
 PROFILES = ("engine", "paper")
 PAPER_SCALE = 0.5
 """To which the paper reduces frame and map before detection."""
 MIN_HEIGHT_M = 1.0
 """The lowest height to search if the height is unknown."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AssumedErrors:
-    """Standard deviations of the telemetry, the map and the ground, used if they do not state their own.
-
-    Attributes:
-        height_m: of the height, besides its share below.
-        height_share: of the height, as a share of it.
-        heading_deg: of the heading.
-        tilt_deg: of roll and of pitch, if the frame came with them.
-        unknown_tilt_deg: of roll and of pitch, if it did not: nothing holds a camera level in flight.
-        map_m: georeferencing accuracy per axis, if the map does not state it (:func:`with_map_accuracy`); the
-            default is typical of web maps and public orthophotos.
-        surface_slope_deg: slope accuracy of the surface model under one frame, if it does not state its own.
-        unknown_slope_deg: slope of the ground if flat ground is assumed: the scale of a mixture of small and
-            larger slopes (:mod:`engine.matching.unknown_slope`).
-    """
-
-    height_m: float = 0.5
-    height_share: float = 0.01
-    heading_deg: float = 1.0
-    tilt_deg: float = 0.37
-    unknown_tilt_deg: float = 4.0
-    map_m: float = 3.0
-    surface_slope_deg: float = 0.1
-    unknown_slope_deg: float = 2.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, *(name for name in self.__dataclass_fields__ if name != "height_share"))
-        check(self, "height_share", "a number from 0 up", lambda share: 0.0 <= share < math.inf)
-        for name in self.__dataclass_fields__:
-            if getattr(self, name) > MAX_SIGMA_M:
-                raise OptionError(f"{name}: expected at most {MAX_SIGMA_M:g}, got {getattr(self, name):g}")
-
-    def height_sigma_m(self, height_m: float) -> float:
-        """Standard deviation of a height, in metres."""
-        return math.hypot(self.height_m, self.height_share * height_m)
-
-    def tilts_deg(self, pose: GridPose) -> tuple[float, float]:
-        """Standard deviations of roll and of pitch, in degrees, by whether they are known."""
-        unknown, known = self.unknown_tilt_deg, self.tilt_deg
-        return (unknown if pose.roll_deg is None else known, unknown if pose.pitch_deg is None else known)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,6 +162,11 @@ class MatcherOptions:
     def __post_init__(self) -> None:
         check_choice(self, "profile", PROFILES)
         check(self, "risk", "a probability above 0 and below 1", lambda risk: 0.0 < risk < 1.0)
+
+    def on_map(self, site: OrthoMap) -> MatcherOptions:
+        """The settings, with the map's stated accuracy in place of the assumed one."""
+        ncc = replace(self.ncc, errors=self.ncc.errors.on_map(site))
+        return replace(self, ncc=ncc, sift=replace(self.sift, errors=self.sift.errors.on_map(site)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

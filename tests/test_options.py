@@ -6,7 +6,8 @@ import math
 import pytest
 
 from engine import LearnedOptions, LiveOptions, MatcherOptions, NavigatorOptions, OptionError
-from engine.options import AssumedErrors, NccOptions, PoseOptions, SiftOptions
+from engine.assumed_errors import AssumedErrors
+from engine.options import NccOptions, PoseOptions, SiftOptions
 
 ENGINE = (AssumedErrors, LearnedOptions, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, SiftOptions)
 

@@ -19,8 +19,9 @@ from bench.accuracy.flights import MIDDLE, Recorded, moved_to_middle, recorded
 from bench.command import parser_on_one_thread
 from bench.pages.text import paragraph, rewrite, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
+from engine.assumed_errors import AssumedErrors
 from engine.geo import Array
-from engine.options import AssumedErrors, NccOptions, SiftOptions
+from engine.options import NccOptions, SiftOptions
 from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import plan_flight

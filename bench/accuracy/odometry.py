@@ -31,9 +31,9 @@ from engine import (
     Reason,
     SceneMatcher,
 )
+from engine.assumed_errors import map_sigma_of
 from engine.geo import Array
 from engine.matching.align import to_gray
-from engine.matching.covariance import map_sigma_of
 from engine.navigation.motion import GroundMotion
 from engine.navigation.odometry import NoMotion, VisualOdometry
 from scenematch.report.metrics import Ground

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from engine.matching.agreement import agree_in_height, agree_in_place, offset_between_m
 from engine.matching.candidates import Candidate
 from engine.matching.evidence import is_beyond_doubt
-from engine.matching.explanation import Explanation
+from engine.matching.for_reports import Explanation
 from engine.matching.ladder import Answer, is_accepted, is_late
 from engine.matching.method import Method
 from engine.matching.ncc import Ncc

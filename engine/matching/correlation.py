@@ -13,6 +13,7 @@ from engine.kernels.coarse_to_fine import EarlyStop
 from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance
 from engine.maps.prepared import PreparedMap, Region
+from engine.matching import refusals
 from engine.matching.align import FRACTION, MIN_SHRINK, GroundView, Patch, rectify, view_of
 from engine.matching.oblique import is_oblique, oblique_patch
 from engine.matching.query import Query
@@ -89,7 +90,7 @@ class Correlator:
             return self._align_oblique(pose, level, nadir_px)
         view = view_of(query.camera, attitude, height, jacobian)
         if view is None:
-            return query.refuse_tilted(attitude, METHOD)
+            return refusals.tilted(query, attitude, METHOD)
         rows, columns = query.site.level_shape(level)
         if (MIN_SHRINK * FRACTION) ** 2 * view.area_px > rows * columns:
             return query.refuse(Reason.OUTSIDE_MAP, "the frame covers more ground than the map", METHOD)
@@ -119,7 +120,7 @@ class Correlator:
         place = query.prior_px if nadir_px is None else nadir_px
         patch = oblique_patch(query, attitude, height, level, place)
         if patch is None:
-            return query.refuse_tilted(attitude, METHOD)
+            return refusals.tilted(query, attitude, METHOD)
         size = np.array(patch.gray.shape[::-1], np.float64)
         extent = (float(size[0]), float(size[1]))
         view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))

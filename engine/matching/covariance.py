@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import transport_covariance
-from engine.options import AssumedErrors, MatcherOptions
-from engine.orthomap import OrthoMap
-from engine.values import Frame, GridPose, Peak
+from engine.values import GridPose, Peak
 
 Array = NDArray[np.float64]
 
@@ -31,30 +28,6 @@ def tilt_covariance(cam_from_map: Array, sigma_rad: float) -> Array:
     """
     horizontal = cam_from_map[:, :2]
     return np.asarray(sigma_rad**2 * horizontal @ horizontal.T)
-
-
-def with_map_accuracy(site: OrthoMap, errors: AssumedErrors) -> AssumedErrors:
-    """The errors, with the map's stated accuracy in place of the assumed one."""
-    return replace(
-        errors,
-        map_m=errors.map_m if site.georeference_sigma_m is None else site.georeference_sigma_m,
-        surface_slope_deg=errors.surface_slope_deg if site.slope_sigma_deg is None else site.slope_sigma_deg,
-    )
-
-
-def options_on_map(options: MatcherOptions, site: OrthoMap) -> MatcherOptions:
-    """The settings, with the map's stated accuracy in place of the assumed one."""
-    ncc, sift = options.ncc, options.sift
-    return replace(
-        options,
-        ncc=replace(ncc, errors=with_map_accuracy(site, ncc.errors)),
-        sift=replace(sift, errors=with_map_accuracy(site, sift.errors)),
-    )
-
-
-def map_sigma_of(site: OrthoMap) -> float:
-    """Georeferencing accuracy of a map per axis: as stated, or as assumed."""
-    return AssumedErrors().map_m if site.georeference_sigma_m is None else site.georeference_sigma_m
 
 
 def scale_doubt_m(off_m: float, height_m: float, camera_down: Array, told_down: Array | None) -> float:
@@ -76,25 +49,6 @@ def scale_doubt_m(off_m: float, height_m: float, camera_down: Array, told_down: 
     aside = float(np.hypot(*camera_down[:2])) / max(-float(camera_down[2]), 1e-3) + _ASIDE
     turned = 0.0 if told_down is None else math.acos(min(1.0, float(told_down @ camera_down)))
     return math.hypot(off_m * aside, height_m * math.tan(min(turned, _MAX_TURNED)))
-
-
-def with_frame_accuracy(frame: Frame, errors: AssumedErrors) -> AssumedErrors:
-    """The errors, with the frame's stated accuracies in place of assumed ones."""
-    return _with_accuracy(errors, frame.heading_sigma_deg, frame.tilt_sigma_deg, frame.height_sigma_m)
-
-
-@lru_cache(maxsize=16)  # a frame asks several times
-def _with_accuracy(
-    errors: AssumedErrors,
-    heading_sigma_deg: float | None,
-    tilt_sigma_deg: float | None,
-    height_sigma_m: float | None,
-) -> AssumedErrors:
-    stated = {"heading_deg": heading_sigma_deg, "tilt_deg": tilt_sigma_deg}
-    if height_sigma_m is not None:
-        stated |= {"height_m": height_sigma_m, "height_share": 0.0}
-    known = {name: value for name, value in stated.items() if value is not None}
-    return replace(errors, **known) if known else errors
 
 
 _MAX_TURNED = math.radians(60.0)

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.assumed_errors import AssumedErrors
 from engine.geo import attitude_from_rotation
 from engine.maps.landmarks import LandmarkMap
+from engine.matching import refusals
 from engine.matching.align import MIN_DOWN
 from engine.matching.candidates import PoseCandidate
 from engine.matching.covariance import tilt_covariance
@@ -22,7 +24,7 @@ from engine.matching.pose import MIN_INLIERS, PoseStats, solve_pose
 from engine.matching.query import Query
 from engine.matching.views import TelemetryHypothesis, level_at, view_in, views_of, x_axis_deg
 from engine.matching.votes import Vote
-from engine.options import MIN_HEIGHT_M, PAPER_SCALE, AssumedErrors, SiftOptions
+from engine.options import MIN_HEIGHT_M, PAPER_SCALE, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, NoFix, Reason, Window
 
@@ -56,7 +58,7 @@ class FeatureMatcher:
     def find(self) -> PoseCandidate | NoFix:
         """The pose of the frame, or a refusal if there is none."""
         query = self.query
-        flat = query.refuse_flat(self.method)
+        flat = refusals.if_flat(query, self.method)
         if flat is not None:
             return flat
         first: NoFix | PoseCandidate | None = None
@@ -84,7 +86,7 @@ class FeatureMatcher:
 
     def find_at_once(self) -> PoseCandidate | NoFix:
         """The pose of a frame by its own telemetry, with no second attempt and no null hypothesis."""
-        return self.query.refuse_flat(self.method) or self._find_with(next(self._attempts())[1])
+        return refusals.if_flat(self.query, self.method) or self._find_with(next(self._attempts())[1])
 
     def _null_tested(self, found: PoseCandidate, hypothesis: TelemetryHypothesis) -> PoseCandidate:
         """The candidate compared with the mirrored frame under the same telemetry."""

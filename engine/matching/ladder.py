@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TypeAlias, TypeGuard
 
+from engine.matching import refusals
 from engine.matching.candidates import Candidate
 from engine.matching.query import Query
 from engine.runtime.scheduler import OutOfTime, Scheduler
@@ -60,7 +61,7 @@ def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Answer:
                     looked = rung.look(answer, step)
                 if looked is not None and not (has_fix and is_late(looked)):
                     answer = looked
-    return answer or query.refuse_late(method)
+    return answer or refusals.late(query, method)
 
 
 def settled(query: Query, answer: Candidate | Result) -> Result:
@@ -69,7 +70,7 @@ def settled(query: Query, answer: Candidate | Result) -> Result:
         return answer
     if answer.suffices(query.risk):
         return answer.fix
-    return replace(answer.fix.refused(*answer.refusal(query.risk)), match=answer.fix)
+    return replace(answer.fix.refused(*refusals.of_candidate(answer, query.risk)), match=answer.fix)
 
 
 def is_accepted(answer: Answer | None, query: Query) -> TypeGuard[Candidate]:

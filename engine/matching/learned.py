@@ -9,8 +9,8 @@ from functools import partial
 
 from engine.learned import KeypointMatcher, load_matcher
 from engine.maps.keypoints import KeypointMap
-from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import FeatureMatcher
+from engine.matching.for_reports import Explanation, explain_features
 from engine.matching.ladder import SHARES, Answer, Rung, Works, climb
 from engine.matching.method import Method
 from engine.matching.point_finding import PointFinder

@@ -14,10 +14,9 @@ import numpy as np
 from engine.budget import Budget, Deadline
 from engine.camera import Camera
 from engine.errors import EngineError, OptionError
-from engine.matching import method_type
+from engine.matching import method_type, refusals
 from engine.matching.align import to_gray
-from engine.matching.covariance import options_on_map
-from engine.matching.explanation import Explanation
+from engine.matching.for_reports import Explanation
 from engine.matching.ladder import settled
 from engine.matching.method import Method
 from engine.matching.query import Query
@@ -77,7 +76,7 @@ class SceneMatcher:
         device: str | torch.device = "auto",
         options: MatcherOptions | None = None,
     ) -> None:
-        self.options = options_on_map(options or MatcherOptions(), site)
+        self.options = (options or MatcherOptions()).on_map(site)
         build = method_type(method, self.options.profile)
         self.site = site
         self.camera = camera
@@ -165,7 +164,7 @@ class SceneMatcher:
         deadline = Deadline(budget, searches=prior is None)
         query = self._query(frame, prior, deadline)
         if query.prior_px is not None and not np.isfinite(query.prior_px).all():
-            return query.refuse_outside(self.method)  # nowhere in the map's coordinate system
+            return refusals.outside(query, self.method)  # nowhere in the map's coordinate system
         if prior is None and not self.site.is_searchable:
             detail = f"the map of {self.site.size_km} is not searched as a whole; a start position is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method)

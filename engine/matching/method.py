@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from engine.matching.candidates import Candidate
-from engine.matching.explanation import Explanation
+from engine.matching.for_reports import Explanation
 from engine.matching.query import Query
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap

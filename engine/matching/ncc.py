@@ -12,12 +12,12 @@ import numpy as np
 from engine.maps.prepared import PreparedMap
 from engine.maps.samples import SampleMap
 from engine.maps.tiles import WHOLE_LEVEL_PX
-from engine.matching import hypothesis_search
+from engine.matching import hypothesis_search, refusals
 from engine.matching.agreement import agree_in_place, offset_between_m
 from engine.matching.candidates import PeakCandidate
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
 from engine.matching.evidence import Evidence
-from engine.matching.explanation import Explanation, explain_correlation
+from engine.matching.for_reports import Explanation, explain_correlation
 from engine.matching.ladder import Answer, Rung, Works, climb, is_accepted, rehearse
 from engine.matching.method import Method
 from engine.matching.peak_evidence import candidate_of, early_stop, null_tested, places_in
@@ -131,7 +131,7 @@ class Ncc(Method):
             return aligned
         window = correlator.window(aligned)
         if window is None:
-            return query.refuse_outside(METHOD)
+            return refusals.outside(query, METHOD)
         wide = query.site.is_large and window.area_px >> 2 * aligned.level > MAX_WINDOW_PX
         if wide and hypothesis_search.coarse_px(correlator, aligned, window) > MAX_WINDOW_PX:
             size = f"{window.width_px} x {window.height_px} px"
@@ -195,7 +195,7 @@ class Ncc(Method):
         if pose.grid_heading_deg is None:
             detail = "NCC needs the heading; with a sigma of 180 degrees it tries all of them"
             return query.refuse(Reason.NO_HEADING, detail, METHOD)
-        return query.refuse_flat(METHOD)
+        return refusals.if_flat(query, METHOD)
 
     def _align(self, correlator: Correlator, coarser: int) -> Aligned | NoFix:
         """The frame with its own height and heading."""

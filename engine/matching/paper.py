@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import attitude_from_rotation
+from engine.matching import refusals
 from engine.matching.align import FRACTION
-from engine.matching.explanation import (
+from engine.matching.for_reports import (
     Explanation,
     PointMatches,
     outline_of,
@@ -46,7 +47,7 @@ class PaperNcc(Method):
             return query.refuse(Reason.NO_HEADING, "NCC needs the heading", "ncc")
         window = _window(query)
         if window is None:
-            return query.refuse_outside("ncc")
+            return refusals.outside(query, "ncc")
         search = query.site.gray(window)
         with query.scheduler.stage("align"):
             template = template_of(query, window)
@@ -78,7 +79,7 @@ class PaperSift(Method):
             return query.refuse(Reason.NO_HEIGHT, "the paper's window needs the height above ground", "sift")
         window = _window(query)
         if window is None:
-            return query.refuse_outside("sift")
+            return refusals.outside(query, "sift")
         search = query.site.gray(window)
         with query.scheduler.stage("match"):
             matched = matches(query.gray, search)

@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
 from engine.geo import angle_covariance_deg2, enu_from_body, inverse_2x2, transport_covariance, wrap_heading_deg
-from engine.matching.covariance import scale_doubt_m, with_frame_accuracy
+from engine.matching.covariance import scale_doubt_m
 from engine.matching.evidence import needed_nats, prior_chi_square
 from engine.matching.pose import AttitudePrior
-from engine.options import AssumedErrors
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
 from engine.runtime.scheduler import Scheduler
@@ -23,8 +22,6 @@ from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 
 Array = NDArray[np.float64]
 
-MIN_DEVIATION = 3.0
-"""Standard deviation in grey levels below which a frame has no texture."""
 _AGREE_SIGMAS = 2.0  # difference at which a measured height still agrees with the telemetry's
 _FOUND_HEADING_DEG, _FOUND_HEIGHT_SHARE = 2.0, 0.03  # standard deviations of what a search found
 
@@ -130,7 +127,7 @@ class Query:
 
     def errors(self, assumed: AssumedErrors) -> AssumedErrors:
         """The assumed errors of telemetry and map, replaced by those that the frame states."""
-        return with_frame_accuracy(self.frame, assumed)
+        return assumed.of_frame(self.frame)
 
     def attitude_prior(self, grid_heading_deg: float, sigma_deg: float, errors: AssumedErrors) -> AttitudePrior:
         """The frame's attitude with its assumed errors about the body's axes; an unknown tilt is taken as level.
@@ -267,30 +264,4 @@ class Query:
             score=score,
             window=window,
             timings=self.timings,
-        )
-
-    def refuse_flat(self, method: str) -> NoFix | None:
-        """A refusal if the picture has no texture to match, else None."""
-        deviation = float(cv2.meanStdDev(self.gray)[1][0, 0])
-        if deviation >= MIN_DEVIATION:
-            return None
-        figure = f"the frame's grey levels deviate by {deviation:.1f}"
-        return self.refuse(Reason.NO_TEXTURE, f"{figure}; {MIN_DEVIATION:g} is required", method)
-
-    def refuse_tilted(self, attitude: Attitude, method: str) -> NoFix:
-        """The refusal of a frame that sees the horizon, or nearly so."""
-        tilt = f"roll {attitude.roll_deg:.1f}, pitch {attitude.pitch_deg:.1f} degrees"
-        return self.refuse(Reason.TILTED, f"a corner of the frame looks at the horizon ({tilt})", method)
-
-    def refuse_outside(self, method: str) -> NoFix:
-        """The refusal of a frame whose window does not overlap the map."""
-        return self.refuse(Reason.OUTSIDE_MAP, "the window lies outside the map", method)
-
-    def refuse_late(self, method: str) -> NoFix:
-        """The refusal of a frame with no time for a method's quickest variant."""
-        left_ms = self.scheduler.deadline.remaining_ms
-        if left_ms < 0.0:
-            return self.refuse(Reason.LATE, "the budget was spent before there was a fix", method)
-        return self.refuse(
-            Reason.LATE, f"{left_ms:.1f} ms are left; {method}'s quickest variant takes longer", method
         )

@@ -9,8 +9,8 @@ from engine.maps.landmarks import LandmarkMap
 from engine.maps.samples import SampleMap
 from engine.matching.candidates import PoseCandidate
 from engine.matching.evidence import is_beyond_doubt
-from engine.matching.explanation import Explanation, explain_features
 from engine.matching.feature_pose import METHOD, FeatureMatcher
+from engine.matching.for_reports import Explanation, explain_features
 from engine.matching.ladder import SHARES, Answer, Rung, Works, climb, is_accepted, rehearse
 from engine.matching.method import Method
 from engine.matching.pose import MIN_INLIERS

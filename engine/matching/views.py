@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.maps.landmarks import PREPARED_PX
+from engine.matching import refusals
 from engine.matching.align import MIN_DOWN, ground_bounds_px
 from engine.matching.query import Query
 from engine.values import Attitude, NoFix, Window
@@ -131,12 +132,12 @@ def _window(query: Query, height_m: float, has_heading: bool, method: str) -> Wi
     attitude = query.telemetry.grid_attitude or Attitude(0.0, 0.0, 0.0)
     bounds = ground_bounds_px(query.camera, attitude, height_m, query.jacobian)
     if bounds is None:
-        return query.refuse_tilted(attitude, method)
+        return refusals.tilted(query, attitude, method)
     width, height = (float(n) for n in bounds[1] - bounds[0])
     if not has_heading:  # at any heading the footprint fits the square of its diagonal
         width = height = math.hypot(width, height)
     window = query.window(nadir + bounds.mean(axis=0), (width, height), (width, height))
-    return window or query.refuse_outside(method)
+    return window or refusals.outside(query, method)
 
 
 def slant_m(query: Query, height_m: float) -> float:

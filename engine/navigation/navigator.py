@@ -9,8 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
+from engine.assumed_errors import map_sigma_of
 from engine.budget import Budget, Deadline
-from engine.matching.covariance import map_sigma_of
 from engine.matching.evidence import SEARCHED, needed_nats, probability
 from engine.navigation.motion import (
     Array,

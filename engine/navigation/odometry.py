@@ -18,13 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import larger_variance
 from engine.matching.align import MAX_FIELD_DEG, to_gray
-from engine.matching.covariance import with_frame_accuracy
 from engine.navigation.motion import GroundMotion, velocity_of
-from engine.options import AssumedErrors
 from engine.values import CHANCE, Attitude, Frame
 
 Array = NDArray[np.float64]
@@ -111,7 +110,7 @@ class VisualOdometry:
             self._last = None  # its timestamp is wrong, so the next interval would be too
             return NoMotion("the picture repeats the last one")
         view = _View(self._camera, begin, end, height_m)
-        errors = with_frame_accuracy(later, AssumedErrors())
+        errors = AssumedErrors().of_frame(later)
         moved_m = np.zeros(3) if self._velocity_mps is None else self._velocity_mps * interval_s
         moved_m[2] = (later.height_agl_m or height_m) - height_m
         expected = view.homography(moved_m)

@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
 from engine.geo import wrap_heading_deg
 from engine.matching.covariance import scale_doubt_m
 from engine.navigation.tracks import MIN_FRAMES
-from engine.options import AssumedErrors, NavigatorOptions
+from engine.options import NavigatorOptions
 from engine.values import Attitude, Fix, Frame
 from engine.window import SPREAD_SIGMAS
 

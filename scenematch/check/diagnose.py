@@ -8,9 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
+from engine.assumed_errors import map_sigma_of
 from engine.camera import Camera
 from engine.geo import Array
-from engine.matching.covariance import map_sigma_of
 from engine.navigation.motion import position_of
 from engine.orthomap import OrthoMap
 from engine.values import Frame, Prior

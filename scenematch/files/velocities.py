@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from engine.options import AssumedErrors
+from engine.assumed_errors import AssumedErrors
 
 # Odometry often states too small covariances; beyond the maximum it is lost.
 _MIN_SIGMA_MPS, _MAX_SIGMA_MPS = 0.1, 5.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from engine.errors import EngineError
 from engine.geo import Array
-from engine.matching.explanation import Explanation, PointMatches, ScoreSurface
+from engine.matching.for_reports import Explanation, PointMatches, ScoreSurface
 from engine.matching.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
 from engine.values import Frame, Window

@@ -20,7 +20,7 @@ import rerun.blueprint as rrb
 
 from engine.errors import BackendError
 from engine.geo import Array
-from engine.matching.explanation import Explanation
+from engine.matching.for_reports import Explanation
 from engine.matching.matcher import SceneMatcher
 from engine.navigation.live import Answer
 from engine.navigation.navigator import Navigator

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from engine import Camera
+from engine.assumed_errors import AssumedErrors
 from engine.matching.covariance import (
     misalignment_covariance_px2,
     ncc_covariance_m2,
@@ -17,7 +18,6 @@ from engine.matching.covariance import (
     score_sigma,
 )
 from engine.ncc_fft import find_peak, ncc
-from engine.options import AssumedErrors
 from engine.values import GridPose, Peak
 
 CAMERA = Camera.from_fov(300, 300, 60.0)

@@ -19,6 +19,7 @@ from engine.matching.evidence import (
     probability,
     surprise_of,
 )
+from engine.matching.refusals import of_candidate
 from engine.values import Peak
 from tests.support.fixes import a_fix
 
@@ -77,11 +78,11 @@ def test_a_refusal_of_a_pose_tells_its_figures():
     weak = Evidence(3.5 * math.log(10.0), 0.0, 1000.0, 1000.0, None)
     pose = PoseCandidate(a_fix(), weak)
     assert not pose.suffices(1e-4)
-    reason, text = pose.refusal(1e-4)
+    reason, text = of_candidate(pose, 1e-4)
     assert reason is Reason.BAD_POSE
     for figure in ("0.0001 is allowed", "10^3.5", "rival once in 10^0.0", "chi-square unknown"):
         assert figure in text
-    assert "chi-square 3.2" in pose.weighed(replace(weak, prior_chi_square=3.2)).refusal(1e-4)[1]
+    assert "chi-square 3.2" in of_candidate(pose.weighed(replace(weak, prior_chi_square=3.2)), 1e-4)[1]
 
 
 @given(st.floats(1e-12, 0.1), st.floats(0, 300))
@@ -94,7 +95,7 @@ def test_without_the_null_hypothesis_only_evidence_beyond_doubt_is_handed_out(ri
 def test_a_pose_that_there_was_no_time_to_test_is_late():
     untested = PoseCandidate(a_fix(), Evidence(32.0, 0.0, 1000.0, 1000.0, None))
     assert untested.promises(1e-4)
-    assert untested.refusal(1e-4)[0] is Reason.LATE
+    assert of_candidate(untested, 1e-4)[0] is Reason.LATE
 
 
 # ------------------------------------------------------------------------------------------------------- peaks
@@ -162,7 +163,7 @@ def test_a_peak_is_believed_if_the_risk_allows_it(evidence, risk, reason):
     found = a_peak(evidence)
     assert found.suffices(risk) == (reason is None)
     if reason is not None:
-        why, figures = found.refusal(risk)
+        why, figures = of_candidate(found, risk)
         assert why is reason
         assert f"{math.sqrt(2.0 * evidence.surprise):.1f}" in figures
 
@@ -170,7 +171,7 @@ def test_a_peak_is_believed_if_the_risk_allows_it(evidence, risk, reason):
 def test_what_a_search_fitted_waits_for_the_structure_about_the_place():
     searched = replace(a_peak(replace(PEAK, surprise=1250.0)), by_search=True, is_fitted=True)
     assert not searched.suffices(1e-4)
-    assert searched.refusal(1e-4)[0] is Reason.UNCONFIRMED
+    assert of_candidate(searched, 1e-4)[0] is Reason.UNCONFIRMED
     assert replace(searched, by_structure=True).suffices(1e-4)
 
 
@@ -179,7 +180,7 @@ def test_a_peak_that_still_rises_at_the_edge_of_the_window_is_refused():
     at_edge = replace(certain, peak=replace(certain.peak, curvature=np.zeros((2, 2))))
     assert certain.suffices(1e-4)
     assert not at_edge.suffices(1e-4)
-    assert at_edge.refusal(1e-4) == (Reason.AMBIGUOUS, "NCC 0.900 still rises at the window's edge")
+    assert of_candidate(at_edge, 1e-4) == (Reason.AMBIGUOUS, "NCC 0.900 still rises at the window's edge")
 
 
 def test_of_a_peak_and_its_refined_pose_the_greater_evidence_counts():

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from engine import Camera, OrthoMap, SceneMatcher
+from engine.assumed_errors import AssumedErrors
 from engine.budget import Budget, Deadline
 from engine.errors import DeviceError, OptionError
 from engine.features import match, sift
@@ -20,7 +21,7 @@ from engine.matching.evidence import Evidence, probability
 from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
-from engine.options import AssumedErrors, MatcherOptions, NccOptions, SiftOptions
+from engine.options import MatcherOptions, NccOptions, SiftOptions
 from engine.values import Fix, Frame, GridPose, NoFix, Prior, Reason
 from tests.support.fixes import a_fix, px_off, values_of
 from tests.support.ground import Ground

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine import Camera, Navigator, Prior, SceneMatcher
+from engine.assumed_errors import AssumedErrors
 from engine.navigation.telemetry_errors import TelemetryErrors, considered
-from engine.options import ACCEPT_ALL, AssumedErrors, NavigatorOptions
+from engine.options import ACCEPT_ALL, NavigatorOptions
 from engine.values import Attitude, Fix, Frame
 from scenematch.simulator import plan_flight
 from tests.support.fields import fields_of
