@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,12 +75,8 @@ class Auto(Method):
         first = self.ncc.locate(query, widely=False)  # SIFT finds the heading by itself
         if is_accepted(first, query) and _is_settled(first, query):
             return first
-        agrees = None
-        if is_accepted(first, query) and not first.fix.rests_on_attitude:
-            # Few features follow the telemetry's attitude, and so does a fix that no picture refined.
-            agrees = partial(_agree, first.fix)
         with query.scheduler.with_fix(is_accepted(first, query)):
-            second = self.sift.locate(query, agrees)
+            second = self.sift.locate(query)
         if isinstance(first, Candidate) and isinstance(second, Candidate):
             return self._posterior(query, first, second)
         return first if is_accepted(first, query) or is_late(second) else second

@@ -20,7 +20,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.errors import DtypeError, OptionError, ShapeError
 from engine.geo import chi_square_of
 from engine.matching.pnp import (
     SLACK,
@@ -67,13 +66,6 @@ class AttitudePrior:
     rotation: Array
     sigma_deg: float | tuple[float, float, float]
     axes: Array = field(default_factory=lambda: np.eye(3))
-
-    def __post_init__(self) -> None:
-        for name in ("rotation", "axes"):
-            if np.shape(getattr(self, name)) != (3, 3):
-                raise ShapeError(f"{name}: expected (3, 3), got {np.shape(getattr(self, name))}")
-        if np.shape(self.sigma_deg) not in ((), (3,)) or not np.all(np.asarray(self.sigma_deg) > 0):
-            raise OptionError(f"sigma_deg: expected one or three positive numbers, got {self.sigma_deg}")
 
     @property
     def precision(self) -> Array:
@@ -147,18 +139,16 @@ def solve_pose(
     Returns:
         None if the matches are few, collinear, behind the camera, ambiguous or, without a start, as many as chance
         gives.
-
-    Raises:
-        ShapeError: An array has another shape.
-        DtypeError: An array is not of real numbers.
     """
     options = options or PoseOptions()
-    points_m, points_px, K, weights = _checked(points_m, points_px, camera_matrix, weights)
+    weights = np.ones(len(points_m)) if weights is None else weights
     known = np.flatnonzero(np.isfinite(points_m).all(1) & np.isfinite(points_px).all(1) & (weights > 0))
     if len(known) < MIN_INLIERS or _spread(points_px[known].T) < options.min_spread_px:
         return None
     origin = points_m[known].mean(0)
-    problem = _problem((points_m[known] - origin).T, points_px[known].T, K, weights[known], options, prior)
+    problem = _problem(
+        (points_m[known] - origin).T, points_px[known].T, camera_matrix, weights[known], options, prior
+    )
     fit = _fit(problem) if start is None else _fit_from(problem, start, origin)
     if fit is not None and prior is not None:
         problem, fit = _without_wrong_prior(problem, fit)
@@ -214,21 +204,6 @@ def _stats(
         log10_nfa=log10_nfa,
         log10_tried=log10_tried,
     )
-
-
-def _checked(points_m: Array, points_px: Array, camera_matrix: Array, weights: Array | None) -> tuple[Array, ...]:
-    count = len(points_m)
-    weights = np.ones(count) if weights is None else weights
-    expected = {"points_m": (count, 3), "points_px": (count, 2), "camera_matrix": (3, 3), "weights": (count,)}
-    out = []
-    for (name, shape), values in zip(expected.items(), (points_m, points_px, camera_matrix, weights), strict=True):
-        array = np.asarray(values)
-        if array.shape != shape:
-            raise ShapeError(f"{name}: expected {shape}, got {array.shape}")
-        if array.dtype.kind not in "fiu":
-            raise DtypeError(f"{name}: expected real numbers, got {array.dtype}")
-        out.append(array.astype(np.float64))
-    return tuple(out)
 
 
 def _spread(points: Array) -> float:

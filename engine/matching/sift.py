@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import replace
 
 from engine.maps.landmarks import LandmarkMap
@@ -91,17 +91,12 @@ class Sift(Method):
         if query.prior is None:
             self.locate(query)
 
-    def locate(self, query: Query, agrees: Callable[[Fix], bool] | None = None) -> Answer:
+    def locate(self, query: Query) -> Answer:
         """A refined pose by few features, else one by all at the highest resolution that time allows.
 
         Few features take a fifth of the time, and refinement restores the accuracy that their pose lacks.
-
-        Args:
-            query: the frame.
-            agrees: whether a fix agrees with another method's. The fix is then for comparison: not refined by the
-                grey levels that the other uses, and by all features if one by few does not agree.
         """
-        answer = climb(query, METHOD, _Rungs(self, query, agrees).in_order)
+        answer = climb(query, METHOD, _Rungs(self, query).in_order)
         if isinstance(answer, PoseCandidate) and answer.is_quick:  # it follows the telemetry's attitude
             answer = replace(answer, fix=with_tilt_doubt(query, answer.fix)).coarse()
         return answer
@@ -171,32 +166,20 @@ class Sift(Method):
 
 
 class _Rungs:
-    """The ladder of one frame.
+    """The ladder of one frame."""
 
-    Args:
-        sift: the method.
-        query: the frame.
-        agrees: see :meth:`Sift.locate`.
-    """
-
-    def __init__(self, sift: Sift, query: Query, agrees: Callable[[Fix], bool] | None = None) -> None:
-        self._sift, self._query, self._agrees = sift, query, agrees
+    def __init__(self, sift: Sift, query: Query) -> None:
+        self._sift, self._query = sift, query
         self._few_options = sift.few_options(query)
         self._works = sift.works(query)
-        self._refinement: Works = {_REFINEMENT: float(query.gray.size)}
         self.few = Rung(self._if_few_suffice, self._by_few)
-        self.few_refined = Rung(
-            lambda answer: self._refinement if self._is_quick(answer) and agrees is None else {}, self._refine_few
-        )
-        self.all = Rung(
-            lambda answer: self._works if answer is None or self._is_quick(answer) else {}, self._by_all
-        )
-        self.refinement = Rung(lambda answer: self._refinement if self._is_refinable(answer) else {}, self._refine)
+        self.all = Rung(self._if_few_do_not_suffice, self._by_all)
+        self.refinement = Rung(self._if_refinable, self._refine)
 
     @property
     def in_order(self) -> list[Rung]:
         """Cheap ones first."""
-        return [self.few, self.few_refined, self.all, self.refinement]
+        return [self.few, self.refinement, self.all, self.refinement]
 
     def _if_few_suffice(self, answer: Answer | None) -> Works:
         """Few features, if time allows all of them as well, or only few."""
@@ -211,25 +194,13 @@ class _Rungs:
         return {}
 
     def _by_few(self, answer: Answer | None, step: Hashable) -> Answer | None:
-        """The pose by few features, to be refined; or at once the second opinion, if it agrees."""
+        """The pose by few features, to be refined."""
         assert self._few_options is not None  # or it was not offered
         found = self._sift.find_few(self._query, self._few_options)
-        if isinstance(found, NoFix) or not found.promises(self._query.risk):
-            return None
-        if self._agrees is None:
-            return found
-        is_second = is_accepted(found, self._query) and self._agrees(found.fix)
-        return replace(found, is_quick=False) if is_second else None
+        return found if isinstance(found, PoseCandidate) and found.promises(self._query.risk) else None
 
-    def _refine_few(self, answer: Answer | None, step: Hashable) -> Answer | None:
-        """The pose by few features refined, if they are beyond doubt or the picture confirms it."""
-        assert isinstance(answer, PoseCandidate)  # or it was not offered
-        refined = self._sift.refined(self._query, answer.fix)
-        if refined is None:
-            return replace(answer, is_refinable=False)
-        if not (is_accepted(answer, self._query) or refined.score >= CONFIRMING_CORRELATION):
-            return None
-        return replace(answer, fix=refined, is_quick=False, evidence=replace(answer.evidence, is_tested=True))
+    def _if_few_do_not_suffice(self, answer: Answer | None) -> Works:
+        return self._works if answer is None or _is_quick(answer) else {}
 
     def _by_all(self, answer: Answer | None, step: Hashable) -> Answer:
         """The pose by all features."""
@@ -239,22 +210,24 @@ class _Rungs:
             return found
         return replace(found, is_refinable=answer.is_refinable)
 
-    def _is_quick(self, answer: Answer | None) -> bool:
-        return isinstance(answer, PoseCandidate) and answer.is_quick
-
-    def _is_refinable(self, answer: Answer | None) -> bool:
-        return (
-            self._agrees is None
-            and is_accepted(answer, self._query)
-            and isinstance(answer, PoseCandidate)
-            and answer.is_refinable
-            and answer.fix.stage != "refined"
-            and not answer.is_quick
-            and self._sift.can_refine(self._query)
-        )
+    def _if_refinable(self, answer: Answer | None) -> Works:
+        """The pose of few features that promise a fix, or of all that suffice, unless a refinement has failed."""
+        if not (is_accepted(answer, self._query) or _is_quick(answer)):
+            return {}
+        assert isinstance(answer, PoseCandidate)  # no other is proposed here
+        offered = answer.is_refinable and answer.fix.stage != "refined" and self._sift.can_refine(self._query)
+        return {_REFINEMENT: float(self._query.gray.size)} if offered else {}
 
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer | None:
-        """The pose by all features refined."""
+        """The pose refined, if its features are beyond doubt or the picture confirms it."""
         assert isinstance(answer, PoseCandidate)  # or it was not offered
         refined = self._sift.refined(self._query, answer.fix)
-        return None if refined is None else replace(answer, fix=refined)
+        if refined is None:
+            return replace(answer, is_refinable=False)
+        if not (is_accepted(answer, self._query) or refined.score >= CONFIRMING_CORRELATION):
+            return None
+        return replace(answer, fix=refined, is_quick=False, evidence=replace(answer.evidence, is_tested=True))
+
+
+def _is_quick(answer: Answer | None) -> bool:
+    return isinstance(answer, PoseCandidate) and answer.is_quick

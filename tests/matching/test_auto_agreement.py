@@ -65,24 +65,6 @@ def test_two_places_that_are_about_as_evident_refuse(told, sift_nats):
     assert "evidence for another place" in result.detail
 
 
-def test_few_features_that_disagree_are_not_the_second_opinion(site, camera, frame, prior, monkeypatch):
-    """All of them are; a pose of few, a level coarser, is off by more."""
-    monkeypatch.setattr("engine.matching.auto._is_settled", lambda *_: False)
-    matcher = SceneMatcher(site, camera, "auto", "cpu")
-    expected, few = matcher.locate(frame, prior), Sift.find_few
-
-    def off(self, *args):
-        found = few(self, *args)
-        north_m = found.fix.north_m + 4.0
-        fix = replace(found.fix, north_m=north_m, covariance_m2=0.01 * np.eye(3), map_sigma_m=0.0)
-        return replace(found, fix=fix)
-
-    monkeypatch.setattr(Sift, "find_few", off)
-    result = matcher.locate(frame, prior)
-    assert result.stage == expected.stage == "verified"
-    assert (result.east_m, result.north_m) == (expected.east_m, expected.north_m)
-
-
 def test_a_refined_fix_beyond_doubt_is_not_matched_a_second_time(site, camera, frame, prior, monkeypatch):
     monkeypatch.setattr(Sift, "locate", lambda *_: pytest.fail("SIFT was asked"))
     fix = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from engine.errors import DtypeError, OptionError, ShapeError
 from engine.matching.pose import AttitudePrior, PoseStart, PoseStats, solve_pose
 from engine.options import PoseOptions
 from tests.support.poses import CAMERA, GROUNDS, SIZE_PX, WRONG, Scene, any_scene, attitude, measured, scene
@@ -279,33 +278,6 @@ def test_a_little_relief_does_not_hide_the_ambiguity():
         turn = cv2.Rodrigues(s.rotation @ pose.rotation.T)[0][:, 0]
         assert turn @ np.linalg.solve(pose.covariance[3:, 3:], turn) < 25
     assert 0 < refused < 60
-
-
-# Wrong use.
-
-
-USUAL = {
-    solve_pose: {"points_m": np.zeros((8, 3)), "points_px": np.zeros((8, 2)), "camera_matrix": K},
-    AttitudePrior: {"rotation": np.eye(3), "sigma_deg": 1},
-}
-
-
-@pytest.mark.parametrize(
-    ("call", "changes", "error", "text"),
-    [
-        (solve_pose, {"points_m": np.zeros((8, 2))}, ShapeError, r"points_m: expected \(8, 3\), got \(8, 2\)"),
-        (solve_pose, {"points_px": np.zeros((7, 2))}, ShapeError, r"points_px: expected \(8, 2\), got \(7, 2\)"),
-        (solve_pose, {"camera_matrix": np.eye(4)}, ShapeError, "camera_matrix"),
-        (solve_pose, {"weights": np.ones(3)}, ShapeError, "weights"),
-        (solve_pose, {"points_px": np.zeros((8, 2), complex)}, DtypeError, "points_px: expected real numbers"),
-        (AttitudePrior, {"rotation": np.eye(2)}, ShapeError, "rotation"),
-        (AttitudePrior, {"axes": np.zeros(3)}, ShapeError, r"axes: expected \(3, 3\), got \(3,\)"),
-        (AttitudePrior, {"sigma_deg": 0}, OptionError, "sigma_deg"),
-    ],
-)
-def test_wrong_arguments_are_named(call, changes, error, text):
-    with pytest.raises(error, match=text):
-        call(**(USUAL[call] | changes))
 
 
 # From a start
