@@ -12,19 +12,19 @@ from tests.support.paths import ROOT
 
 FIGURES = {  # page: claim: results page, heading and words of each row that states it
     "README.md": {
-        "| wooded park, 9 photographs | 9 | 0.20 | 0 | 0.91 |":
+        "| 9 of 9 photographs of a wooded park | 0.20 | 0 | 0.91 |":
             [("field.md", "`brighton`", "| auto |", "| plain classical recipe")],
-        "| fields, infrared, 82 photographs | 82 | 0.60 | 0 | 1.16 |":
+        "| 82 of 82 of fields, near infrared | 0.60 | 0 | 1.16 |":
             [("field.md", "`seneca`", "| auto |", "| plain classical recipe")],
-        "| bare ground, 37 photographs | 37 | 0.13 | 0 | 0.71 |":
+        "| 37 of 37 of bare ground | 0.13 | 0 | 0.71 |":
             [("field.md", "`caliterra`", "| auto |", "| plain classical recipe")],
-        "| campus, 271 video frames, map of another date | 271 | 1.08 | 0 | 1.15 |":
+        "| 271 of 271 video frames of a campus, satellite map of another date | 1.08 | 0 | 1.15 |":
             [("field.md", "`nust`", "| auto |", "| paper's NCC, OpenCV |")],
-        "| Gazebo and ArduPilot, 79 frames | 79 | 0.19 | 0 | 1.23 |":
+        "| 79 of 79 frames from Gazebo and ArduPilot | 0.19 | 0 | 1.23 |":
             [("field.md", "`gazebo-a1`:", "| auto,"), ("field.md", "The paper's recipe", "| `gazebo-a1` |")],
-        "| the same, evening, map of noon | 79 | 0.21 | 0 | 1.31 |":
+        "| 79 of 79 of the same, evening, map of noon | 0.21 | 0 | 1.31 |":
             [("field.md", "`gazebo-a1-evening`", "| auto,", "| plain classical recipe")],
-        "3 to 372 ms a frame":
+        "3 to 372 ms at the median":
             [("field.md", "`gazebo-a1`:", "| auto,"), ("field.md", "`brighton`", "| auto |")],
         "from 30 to 150 m up":
             [("field.md", "`caliterra`", "survey photographs"),
@@ -92,7 +92,7 @@ FIGURE = re.compile(
 )
 NUMBER = re.compile(r"(?<![\w.-])\d[\d,]*(?:\.\d+)?")
 UNMEASURED = {  # what the front pages state as assumed
-    "README.md": ["good to 1 m", "error (3 m unless stated)"],
+    "README.md": ["good to 1 m", "error, 3 m unless"],
     "docs/index.md": [],
 }
 
