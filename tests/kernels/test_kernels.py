@@ -6,10 +6,11 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from engine.kernels import blocks, reference, tensors
+from engine.kernels import blocks, tensors
 from engine.kernels.local import LocalScores
 from engine.ncc_fft import MapRegion, ncc, prepare, surface
 from engine.runtime import threads as chosen
+from tests.support import ncc_reference as reference
 from tests.support.tensors import assert_close
 
 KERNELS = {"dispatch": ncc, "tensors": tensors.ncc_surface}
