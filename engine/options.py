@@ -121,7 +121,7 @@ class LearnedOptions:
     """Settings of the learned method; it takes all others from SIFT's.
 
     Attributes:
-        weights: files of LoFTR, or of LightGlue with DISK, ALIKED or SuperPoint.
+        weights: files of LoFTR, or of LightGlue with DISK or ALIKED.
         max_picture_px: most pixels that a frame covers on the map level it is matched on.
         max_keypoints: most keypoints of a frame, and a quarter of those of a window; LoFTR has none.
         max_window_px: a window with more pixels on its level is not searched.

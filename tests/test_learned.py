@@ -3,6 +3,7 @@
 import pickle
 import re
 import socket
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,8 +14,7 @@ from torch import nn
 
 from engine.errors import DtypeError, OptionError, ShapeError
 from engine.learned import KeypointMatcher, Loftr, load_matcher
-from engine.learned.keypoints import Disk, SuperPointKeypoints
-from engine.learned.superpoint import SuperPoint, sample, strongest
+from engine.learned.keypoints import by_disk
 from tests.support.refusals import refusal
 
 
@@ -144,7 +144,7 @@ class Reversed(nn.Module):
 def test_sparse_points_come_back_in_pairs_and_unmoved():
     points = [[0.0, 0.0], [5.0, 6.0], [9.0, 3.0]], [[1.0, 1.0], [20.0, 30.0], [40.0, 7.0]]
     lightglue = Reversed()
-    matcher = KeypointMatcher(Disk(corners(*points)), lightglue, 2048)
+    matcher = KeypointMatcher(partial(by_disk, corners(*points)), lightglue, 2048)
     first, second = matcher(torch.zeros(1, 1, 45, 61), torch.zeros(1, 1, 50, 70))
     assert first.tolist() == [[0, 0], [5, 6]]
     assert second.tolist() == [[40, 7], [20, 30]]
@@ -152,7 +152,7 @@ def test_sparse_points_come_back_in_pairs_and_unmoved():
 
 
 def test_nothing_found_is_no_match():
-    matcher = KeypointMatcher(Disk(corners([[0.0, 0.0]], [])), Reversed(), 2048)
+    matcher = KeypointMatcher(partial(by_disk, corners([[0.0, 0.0]], [])), Reversed(), 2048)
     first, second = matcher(torch.zeros(1, 1, 45, 61), torch.zeros(1, 1, 50, 70))
     assert first.shape == second.shape == (0, 2)
 
@@ -195,7 +195,7 @@ def test_disk_and_lightglue_are_what_the_files_say(files, tmp_path):
 
 def test_files_are_recognised_in_any_order(files):
     matcher = load_matcher([files / "lightglue.pth", files / "disk.pth"], device="cpu", max_keypoints=20)
-    assert isinstance(matcher.extractor, Disk)
+    assert isinstance(matcher.extractor.args[0], DISK)
     assert isinstance(load_matcher([files / "loftr.ckpt"], device="cpu"), Loftr)
 
 
@@ -209,7 +209,7 @@ def test_aliked_is_of_the_size_of_its_file(name, tmp_path):
     dim = 64 if name == "aliked-t16" else 128
     torch.save(lightglue_of(dim), tmp_path / "lightglue.pth")
     matcher = load_matcher([tmp_path / "aliked.pth", tmp_path / "lightglue.pth"], device="cpu")
-    assert matcher.extractor.network.model_name == name
+    assert matcher.extractor.args[0].model_name == name
     found = matcher.extract(picture(64, 96), 30)
     assert 2 <= len(found) <= 30
     assert found.descriptors.shape == (len(found), dim)
@@ -239,34 +239,6 @@ REFUSED = {
 def test_files_that_make_no_matcher_are_refused_in_one_line(files, names):
     paths = [files / name for name in names.split()]
     assert re.search(REFUSED[names], refusal(load_matcher, paths, device="cpu", error=OptionError))
-
-
-# SuperPoint.
-
-
-def test_superpoint_finds_the_same_places_in_a_picture_moved_by_a_cell():
-    torch.manual_seed(3)
-    extract = SuperPointKeypoints(SuperPoint().eval())
-    whole = picture(120, 136)
-    with torch.inference_mode():
-        found, moved = extract(whole, 400), extract(whole[..., 8:, 16:], 400)
-    places = {tuple(map(int, xy)): d for xy, d in zip(found.xy_px, found.descriptors, strict=True)}
-    again = {(int(x) + 16, int(y) + 8): d for (x, y), d in zip(moved.xy_px, moved.descriptors, strict=True)}
-    inner = [at for at in again if all(44 + 8 <= v < n - 44 for v, n in zip(at, (136, 120), strict=True))]
-    assert inner  # beyond the reach of the edges
-    assert all(at in places for at in inner)
-    assert all(torch.allclose(places[at], again[at], atol=1e-4) for at in inner)
-
-
-def test_superpoint_keeps_the_strongest_of_neighbours_and_reads_descriptors_at_cell_middles():
-    scores = torch.zeros(40, 40)
-    scores[20, 10], scores[22, 12], scores[30, 30], scores[1, 1] = 0.9, 0.8, 0.5, 0.99
-    xy, strength = strongest(scores, 10)
-    assert xy.tolist() == [[10, 20], [30, 30]]  # the neighbour is weaker, the corner too near to the edge
-    assert strength.tolist() == pytest.approx([0.9, 0.5])
-    cells = nn.functional.normalize(torch.randn(256, 5, 5, generator=torch.Generator().manual_seed(0)), dim=0)
-    at = torch.tensor([[3.5 + 8 * 2, 3.5 + 8 * 4], [3.5, 3.5]])
-    assert torch.allclose(sample(cells, at), torch.stack([cells[:, 4, 2], cells[:, 0, 0]]), atol=1e-6)
 
 
 class Malicious:

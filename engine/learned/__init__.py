@@ -1,7 +1,7 @@
 """Learned matchers: networks with weights from the user's own files. Nothing is downloaded.
 
-LoFTR alone, or DISK, ALIKED or SuperPoint with LightGlue; :func:`load_matcher` recognises a file by the names of
-its tensors. A weights file is opened as tensors only: a pickle that would run code is refused.
+LoFTR alone, or DISK or ALIKED with LightGlue; :func:`load_matcher` recognises a file by the names of its tensors.
+A weights file is opened as tensors only: a pickle that would run code is refused.
 """
 
 from typing import TYPE_CHECKING

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from engine.errors import OptionError
-from engine.learned.keypoints import Aliked, Disk, Extractor, SuperPointKeypoints
+from engine.learned.keypoints import Extractor, by_aliked, by_disk
 from engine.learned.matchers import KeypointMatcher, Loftr
-from engine.learned.superpoint import SuperPoint
 from engine.learned.weights import Weights, fill, read_weights
 from engine.runtime import device as devices
 from engine.runtime.tensors import nn, torch
 
-_EXTRACTORS = ("DISK", "ALIKED", "SuperPoint")
-_EXPECTED = "LoFTR, or LightGlue with DISK, ALIKED or SuperPoint"
+_EXPECTED = "LoFTR, or LightGlue with DISK or ALIKED"
 
 
 def load_matcher(
@@ -29,8 +28,8 @@ def load_matcher(
     """Build the matcher from its files, in any order.
 
     Args:
-        paths: LoFTR alone, or LightGlue with DISK, ALIKED or SuperPoint; state dicts or checkpoints, under the
-            published names of their layers or kornia's.
+        paths: LoFTR alone, or LightGlue with DISK or ALIKED; state dicts or checkpoints, under the published names
+            of their layers or kornia's.
         device: "cpu", "cuda" or "auto".
         max_keypoints: taken from each picture; LoFTR has none.
         min_confidence: of a match by LoFTR, in [0, 1]; LightGlue has a threshold of its own.
@@ -50,7 +49,7 @@ def load_matcher(
     kinds = sorted(weights.kind for weights in files)
     if kinds == ["LoFTR"]:
         return Loftr(fill(_kornia().LoFTR(pretrained=None), files[0], target), min_confidence)
-    extractors = [weights for weights in files if weights.kind in _EXTRACTORS]
+    extractors = [weights for weights in files if weights.kind in ("DISK", "ALIKED")]
     matchers = [weights for weights in files if weights.kind == "LightGlue"]
     if len(extractors) != 1 or len(matchers) != 1 or len(files) != 2:
         raise OptionError(f"weights: expected the files of {_EXPECTED}, got {' and '.join(kinds)}")
@@ -61,10 +60,8 @@ def load_matcher(
 def _extractor(weights: Weights, device: torch.device) -> tuple[Extractor, int]:
     """The extractor of a file, and how many numbers its descriptors have."""
     if weights.kind == "DISK":
-        return Disk(fill(_kornia().DISK(), weights, device)), 128
-    if weights.kind == "SuperPoint":
-        return SuperPointKeypoints(fill(SuperPoint(), weights, device)), 256
-    return Aliked(_aliked(weights, device)), len(weights.tensors["desc_head.sf_conv.weight"])
+        return partial(by_disk, fill(_kornia().DISK(), weights, device)), 128
+    return partial(by_aliked, _aliked(weights, device)), len(weights.tensors["desc_head.sf_conv.weight"])
 
 
 def _kornia() -> Any:
@@ -93,7 +90,7 @@ def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Modul
     projection = tensors.get("input_proj.weight")
     taken = 256 if projection is None else int(projection.shape[-1])
     if tensors["posenc.Wr.weight"].shape[-1] != 2:
-        what = "expected LightGlue for DISK, ALIKED or SuperPoint, got one whose keypoints have scales or shapes"
+        what = "expected LightGlue for DISK or ALIKED, got one whose keypoints have scales or shapes"
         raise OptionError(f"weights: {weights.path}: {what}")
     if taken != numbers:
         what = f"expected LightGlue for descriptors of {numbers} numbers, got one for {taken}"

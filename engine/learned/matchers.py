@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from engine.errors import DtypeError, ShapeError
-from engine.learned.keypoints import Extractor, Keypoints, padded
-from engine.runtime.tensors import Tensor, nn, torch
+from engine.learned.keypoints import Extractor, Keypoints
+from engine.runtime.tensors import Tensor, functional, nn, torch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +37,7 @@ class Loftr:
         _check(frame, crop)
         device = _device_of(self.network)
         with torch.inference_mode():
-            images = {"image0": padded(frame.to(device), 8), "image1": padded(crop.to(device), 8)}
+            images = {"image0": _padded(frame.to(device)), "image1": _padded(crop.to(device))}
             found = self.network(images)
             first, second = found["keypoints0"], found["keypoints1"]
             kept = found["confidence"] >= self.min_confidence
@@ -100,6 +100,12 @@ class KeypointMatcher:
             partner = self.lightglue(data)["matches0"][0]
         matched = torch.nonzero(partner >= 0)[:, 0]
         return torch.stack([matched, partner[matched]], dim=1)
+
+
+def _padded(picture: Tensor) -> Tensor:
+    """The picture, padded at the right and bottom to LoFTR's cells of 8 pixels by replicating its edge."""
+    height, width = picture.shape[2:]
+    return functional.pad(picture, (0, -width % 8, 0, -height % 8), mode="replicate")
 
 
 def _size(image: Tensor) -> tuple[int, int]:

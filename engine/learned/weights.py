@@ -15,7 +15,6 @@ from engine.runtime.tensors import Tensor, nn, torch
 KINDS = {
     "DISK": ("unet.path_down.0.1.3.weight",),
     "ALIKED": ("block1.conv1.weight", "score_head.0.weight", "desc_head.sf_conv.weight"),
-    "SuperPoint": ("conv1a.weight", "convPa.weight", "convDa.weight"),
     "LightGlue": ("posenc.Wr.weight", "log_assignment.0.final_proj.weight"),
     "LoFTR": ("backbone.conv1.weight", "loftr_coarse.layers.0.q_proj.weight"),
 }
