@@ -5,7 +5,6 @@ contrast, level, octave.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -24,45 +23,13 @@ from engine.sift.values import Features, SiftChoice
 AnyArray = NDArray[Any]
 Floats = NDArray[np.float32]
 Filters = tuple[Floats, NDArray[np.int64]]
+Octaves = tuple[Octave, ...]
 
 _BORDER = 4  # octave pixels along the edge without keypoints
 _EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
 _MOVES = 2  # times that a keypoint may move to a neighbouring voxel
 _MAX_SHIFT = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
 _X, _Y, _GROWTH, _CONTRAST, _, _OCTAVE = range(6)
-
-
-@dataclass(frozen=True, slots=True)
-class LoopPlan:
-    """What the loops need to know of pictures of one shape.
-
-    Attributes:
-        octaves: layout in the buffer of Gaussian levels.
-        table: (octaves, 5) int64, the octaves' layouts.
-        upsample: samples per image pixel of the first octave.
-    """
-
-    octaves: tuple[Octave, ...]
-    table: NDArray[np.int64]
-    upsample: int
-
-    @property
-    def first_sigma(self) -> np.float32:
-        """Sigma of each octave's first level in pixels of the octave."""
-        return np.float32(FIRST_SIGMA_PX * self.upsample)
-
-
-@lru_cache(maxsize=256)
-def plan_loops(height: int, width: int, upsample: int) -> LoopPlan:
-    """Lay out the octaves of a picture.
-
-    Args:
-        height: of the picture.
-        width: of the picture.
-        upsample: 1 or 2.
-    """
-    octaves = octaves_of(height, width, upsample)
-    return LoopPlan(octaves, np.array([octave.layout for octave in octaves]), upsample)
 
 
 @lru_cache(maxsize=16)
@@ -113,34 +80,34 @@ def find_features(pictures: Floats, allowed: NDArray[np.bool_] | None, choice: S
 
 def _of_picture(image: Floats, mask: NDArray[np.bool_] | None, choice: SiftChoice) -> tuple[Floats, ...]:
     """Positions, scales, angles in degrees and descriptors of the keypoints of one picture (H, W)."""
-    plan = plan_loops(*image.shape, choice.upsample)
-    gaussians, keypoints = detect(image, plan, choice.contrast_threshold)
-    keypoints = strongest(keypoints, plan, mask, choice.max_keypoints, choice.spread)
+    octaves = octaves_of(*image.shape, choice.upsample)
+    gaussians, keypoints = detect(image, octaves, choice.contrast_threshold)
+    keypoints = strongest(keypoints, octaves, mask, choice.max_keypoints, choice.spread)
     if choice.up_rad is None:
-        angle_rad = dominant_angle(gaussians, keypoints, plan)
+        angle_rad = dominant_angle(gaussians, keypoints, octaves)
     else:
         angle_rad = np.full(len(keypoints), choice.up_rad, np.float32)
-    descriptors = describe(gaussians, keypoints, angle_rad, plan)
+    descriptors = describe(gaussians, keypoints, angle_rad, octaves)
     angle_deg = np.remainder(np.rad2deg(angle_rad), np.float32(360))
-    return xy_px(keypoints, plan), scale_px(keypoints), angle_deg, descriptors
+    return xy_px(keypoints, octaves), scale_px(keypoints), angle_deg, descriptors
 
 
-def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Floats, Floats]:
+def detect(image: Floats, octaves: Octaves, contrast_threshold: float) -> tuple[Floats, Floats]:
     """Find the extrema of all octaves, refine them, and drop those of low contrast and on edges.
 
     Args:
         image: (H, W), contiguous.
-        plan: of its shape.
+        octaves: of its shape.
         contrast_threshold: Lowe's.
 
     Returns:
         The Gaussian levels (N,), which the thread's next call overwrites; and keypoints (K, 6).
     """
-    buffer = threads.own_array("scale space", (plan.octaves[-1].end,), np.float32)
+    buffer = threads.own_array("scale space", (octaves[-1].end,), np.float32)
     found, source = [], image
     threshold = contrast_threshold / SCALES
     limits = (SCALES, _MOVES, threshold, _MAX_SHIFT, EDGE_RATIO)
-    for number, octave in enumerate(plan.octaves):
+    for number, octave in enumerate(octaves):
         layout, of_octave = octave.layout, filters(octave.sigmas, octave.up)
         early, margin = np.float32(_EARLY * threshold), int(of_octave[1].max()) + TAPS
         padded = cv2.copyMakeBorder(source, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
@@ -157,7 +124,7 @@ def detect(image: Floats, plan: LoopPlan, contrast_threshold: float) -> tuple[Fl
 
 
 def strongest(
-    keypoints: Floats, plan: LoopPlan, mask: NDArray[np.bool_] | None, max_keypoints: int, spread: int
+    keypoints: Floats, octaves: Octaves, mask: NDArray[np.bool_] | None, max_keypoints: int, spread: int
 ) -> Floats:
     """The keypoints to keep by precedence.
 
@@ -166,7 +133,7 @@ def strongest(
 
     Args:
         keypoints: (K, 6).
-        plan: of their picture.
+        octaves: of their picture.
         mask: (H, W), True where keypoints are allowed; None is everywhere.
         max_keypoints: how many are kept.
         spread: cells along each side of the picture; keypoints beyond a cell's double share come last.
@@ -174,7 +141,7 @@ def strongest(
     Returns:
         (M, 6) at most ``max_keypoints`` of them.
     """
-    pixel_px = _pixel_px(keypoints, plan)
+    pixel_px = _pixel_px(keypoints, octaves)
     x, y = keypoints[:, _X] * pixel_px, keypoints[:, _Y] * pixel_px
     if mask is not None:
         column = np.clip(np.rint(x).astype(np.intp), 0, mask.shape[1] - 1)
@@ -182,9 +149,9 @@ def strongest(
         allowed = mask[row, column]
         keypoints, x, y = keypoints[allowed], x[allowed], y[allowed]
     order = np.argsort(-keypoints[:, _CONTRAST] * np.sqrt(scale_px(keypoints)), kind="stable")
-    octave = plan.octaves[0]
-    column = np.clip((x * (plan.upsample * spread / octave.width)).astype(np.int64), 0, spread - 1)
-    row = np.clip((y * (plan.upsample * spread / octave.height)).astype(np.int64), 0, spread - 1)
+    octave = octaves[0]
+    column = np.clip((x * (octave.up * spread / octave.width)).astype(np.int64), 0, spread - 1)
+    row = np.clip((y * (octave.up * spread / octave.height)).astype(np.int64), 0, spread - 1)
     is_crowded = _rank((row * spread + column)[order]) >= 2 * max_keypoints / spread**2
     kept = np.argsort(is_crowded, kind="stable")[:max_keypoints]
     return np.asarray(keypoints[order[kept]], np.float32)
@@ -198,48 +165,54 @@ def _rank(group: NDArray[np.int64]) -> NDArray[np.int64]:
     return rank
 
 
-def dominant_angle(gaussians: Floats, keypoints: Floats, plan: LoopPlan) -> Floats:
+def dominant_angle(gaussians: Floats, keypoints: Floats, octaves: Octaves) -> Floats:
     """Direction of the highest peak in the histogram of gradient directions.
 
     Args:
         gaussians: (N,) levels.
         keypoints: (K, 6).
-        plan: of their picture.
+        octaves: of their picture.
 
     Returns:
         (K,) radians from +x towards +y.
     """
-    window, smooth = orientation_weights()
-    step = np.float32(ORIENT_STEP) * plan.first_sigma
+    (window, smooth), (table, sigma) = orientation_weights(), _table(octaves)
+    step = np.float32(ORIENT_STEP) * sigma
     return _in_parts(
-        lambda part: sift_descriptors.angles(gaussians, plan.table, keypoints[slice(*part)], step, window, smooth),
+        lambda part: sift_descriptors.angles(gaussians, table, keypoints[slice(*part)], step, window, smooth),
         threads.parts(len(keypoints), len(keypoints)),
     )
 
 
-def describe(gaussians: Floats, keypoints: Floats, angle_rad: Floats, plan: LoopPlan) -> Floats:
+def describe(gaussians: Floats, keypoints: Floats, angle_rad: Floats, octaves: Octaves) -> Floats:
     """4 x 4 cells of 8 orientations in the keypoints' frames, as RootSIFT.
 
     Args:
         gaussians: (N,) levels.
         keypoints: (K, 6).
         angle_rad: (K,) from +x towards +y.
-        plan: of their picture.
+        octaves: of their picture.
 
     Returns:
         (K, 128) of unit L2 norm.
     """
+    table, sigma = _table(octaves)
     return _in_parts(
         lambda part: sift_descriptors.descriptors(
-            gaussians, plan.table, keypoints[slice(*part)], angle_rad[slice(*part)], plan.first_sigma, tents()
+            gaussians, table, keypoints[slice(*part)], angle_rad[slice(*part)], sigma, tents()
         ),
         threads.parts(len(keypoints), len(keypoints)),
     )
 
 
-def xy_px(keypoints: Floats, plan: LoopPlan) -> Floats:
+def _table(octaves: Octaves) -> tuple[NDArray[np.int64], np.float32]:
+    """The octaves' layouts (octaves, 5), and the sigma of each one's first level in pixels of the octave."""
+    return np.array([octave.layout for octave in octaves]), np.float32(FIRST_SIGMA_PX * octaves[0].up)
+
+
+def xy_px(keypoints: Floats, octaves: Octaves) -> Floats:
     """Positions (K, 2) in pixels of the picture."""
-    return np.asarray(keypoints[:, :2] * _pixel_px(keypoints, plan)[:, None], np.float32)
+    return np.asarray(keypoints[:, :2] * _pixel_px(keypoints, octaves)[:, None], np.float32)
 
 
 def scale_px(keypoints: Floats) -> Floats:
@@ -247,9 +220,9 @@ def scale_px(keypoints: Floats) -> Floats:
     return np.asarray(np.float32(FIRST_SIGMA_PX) * keypoints[:, _GROWTH] * np.exp2(keypoints[:, _OCTAVE]))
 
 
-def _pixel_px(keypoints: Floats, plan: LoopPlan) -> Floats:
+def _pixel_px(keypoints: Floats, octaves: Octaves) -> Floats:
     """(K,) pixels of the picture per octave pixel."""
-    return np.asarray(np.exp2(keypoints[:, _OCTAVE]) / np.float32(plan.upsample))
+    return np.asarray(np.exp2(keypoints[:, _OCTAVE]) / np.float32(octaves[0].up))
 
 
 def _in_parts(work: Callable[[tuple[int, int]], AnyArray], parts: list[tuple[int, int]]) -> AnyArray:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 SCALES = 3  # DoG levels searched per octave, Lowe's s
 FIRST_SIGMA_PX = 0.8  # sigma of the first Gaussian level, in pixels of the image
@@ -38,6 +39,7 @@ class Octave:
         return self.offset + len(self.sigmas) * self.per_level
 
 
+@lru_cache(maxsize=256)
 def octaves_of(height: int, width: int, upsample: int) -> tuple[Octave, ...]:
     """Lay out the octaves of a picture, one after the other.
 

@@ -11,6 +11,7 @@ from engine.features import sift
 from engine.runtime import jit
 from engine.runtime.threads import count, set_threads
 from engine.sift import loops
+from engine.sift.scale_space import FIRST_SIGMA_PX, octaves_of
 from tests.support import sift_reference as reference
 from tests.support.tensors import assert_close
 
@@ -32,66 +33,62 @@ SIZES = ((64, 80), (33, 121), (150, 149), (3, 60))
 
 
 @pytest.fixture(scope="module", params=[(*size, upsample) for size in SIZES for upsample in (1, 2)], ids=str)
-def plan(request):
-    return loops.plan_loops(*request.param)
+def octaves(request):
+    return octaves_of(*request.param)
 
 
-def octaves(plan):
-    return plan.octaves
-
-
-def shaped(buffer, plan):
+def shaped(buffer, octaves):
     """The levels (L, H, W) of each octave in the flat buffer."""
-    return [buffer[o.offset : o.end].reshape(-1, o.height, o.width) for o in octaves(plan)]
+    return [buffer[o.offset : o.end].reshape(-1, o.height, o.width) for o in octaves]
 
 
 @pytest.fixture(scope="module")
-def both(plan):
+def both(octaves):
     """The picture's levels and keypoints by the reference, and by the loops."""
-    image, contrast_threshold = picture(*octaves(plan)[0].source)[0].numpy(), 0.02
-    levels = reference.levels_of(image, octaves(plan))
-    buffer, rows = loops.detect(image, plan, contrast_threshold)
+    image, contrast_threshold = picture(*octaves[0].source)[0].numpy(), 0.02
+    levels = reference.levels_of(image, octaves)
+    buffer, rows = loops.detect(image, octaves, contrast_threshold)
     return levels, reference.keypoints_of(levels, contrast_threshold), buffer.copy(), rows
 
 
-def test_levels_are_those_of_the_equation(plan, both):
+def test_levels_are_those_of_the_equation(octaves, both):
     expected, _, buffer, _ = both
-    for wanted, got in zip(expected, shaped(buffer, plan), strict=True):
+    for wanted, got in zip(expected, shaped(buffer, octaves), strict=True):
         np.testing.assert_allclose(got, wanted, atol=2e-6)
 
 
-def test_keypoints_are_those_of_the_reference(plan, both):
+def test_keypoints_are_those_of_the_reference(octaves, both):
     """All but those that rounding moves across a threshold, of which there is at most one in a hundred."""
     _, expected, _, got = both
     near = [np.abs(got - row).max(axis=1).min(initial=np.inf) < 0.02 for row in expected]
     assert len(expected) - sum(near) <= 0.01 * len(expected)
     assert abs(len(expected) - len(got)) <= 0.01 * len(expected)
-    if min(octaves(plan)[0].source) > 60:
+    if min(octaves[0].source) > 60:
         assert len(expected) > 20
 
 
 @pytest.mark.parametrize("spread", [1, 3, 6])
 @pytest.mark.parametrize("most", [7, 60, 5000])
-def test_the_strongest_are_those_of_the_reference(plan, both, spread, most):
+def test_the_strongest_are_those_of_the_reference(octaves, both, spread, most):
     rows = both[3]
-    mask = np.random.default_rng(3).random(octaves(plan)[0].source) > 0.3
-    kept = reference.strongest(rows, mask, plan.upsample, most, spread)
-    np.testing.assert_array_equal(loops.strongest(rows, plan, mask, most, spread), rows[kept])
+    mask = np.random.default_rng(3).random(octaves[0].source) > 0.3
+    kept = reference.strongest(rows, mask, octaves[0].up, most, spread)
+    np.testing.assert_array_equal(loops.strongest(rows, octaves, mask, most, spread), rows[kept])
 
 
 @pytest.mark.parametrize("turn_rad", [None, 0.0], ids=["turned", "upright"])
-def test_angles_and_descriptors_are_those_of_the_reference(plan, both, turn_rad):
+def test_angles_and_descriptors_are_those_of_the_reference(octaves, both, turn_rad):
     _, _, buffer, rows = both
-    rows, levels, sigma = rows[:20], shaped(buffer.astype(np.float64), plan), float(plan.first_sigma)
+    rows, levels, sigma = rows[:20], shaped(buffer.astype(np.float64), octaves), FIRST_SIGMA_PX * octaves[0].up
     pictures = [levels[int(row[5])][int(row[4])] for row in rows]
     expected = np.array([reference.angle_of(p, row, sigma) for p, row in zip(pictures, rows, strict=True)])
-    apart = np.abs((loops.dominant_angle(buffer, rows, plan) - expected + math.pi) % math.tau - math.pi)
+    apart = np.abs((loops.dominant_angle(buffer, rows, octaves) - expected + math.pi) % math.tau - math.pi)
     assert (apart > 0.01).sum() <= 0.05 * len(apart)  # two peaks of one height
     turns = np.full(len(rows), turn_rad) if turn_rad is not None else expected
     described = [
         reference.descriptor_of(p, row, sigma, turn) for p, row, turn in zip(pictures, rows, turns, strict=True)
     ]
-    got = loops.describe(buffer, rows, turns.astype(np.float32), plan)
+    got = loops.describe(buffer, rows, turns.astype(np.float32), octaves)
     np.testing.assert_allclose(got, np.array(described).reshape(-1, 128), atol=3e-4)
 
 
