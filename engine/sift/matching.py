@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.runtime.device import as_float, device_of, on_host, same_kind_as
-from engine.sift.values import FORBIDDEN, ROUNDING, TRAIN_CHUNK, Features, Limits, Matches, fields_of
+from engine.runtime.device import Picture, as_float, device_of, on_host, same_kind_as
+from engine.sift.values import ROUNDING, TRAIN_CHUNK, Features, Limits, Matches, fields_of
 
 Floats = NDArray[np.float32]
 AnyArray = NDArray[Any]
+
+_MAX = float(np.finfo(np.float32).max)
 
 
 def match(
@@ -44,12 +46,28 @@ def match(
     if not 0 < ratio <= 1:
         raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
     limits, given = (scale, max_scale_factor), query.descriptors
-    if device_of(given).type != "cpu":
-        from engine.sift.matching_tensors import match_tensors  # torch takes a while to import
+    if device_of(given).type == "cpu":
+        found: tuple[Picture, ...] = _nearest(_as_arrays(query), _as_arrays(train), limits)
+    else:
+        from engine.sift.matching_tensors import nearest  # torch takes a while to import
 
-        return match_tensors(query, train, limits, ratio)
-    found = _by_loops(_as_arrays(query), _as_arrays(train), limits, ratio)
-    return Matches(*(same_kind_as(given, values) for values in found))
+        found = nearest(query, train, limits)
+    return Matches(*(same_kind_as(given, values) for values in tested(found, ratio)))
+
+
+def tested(nearest: tuple[Picture, ...], ratio: float) -> tuple[Picture, ...]:
+    """The four fields of the matches.
+
+    Args:
+        nearest: (B, N) each: cosine of the nearest, minus infinity if none was allowed; its slot; cosine of the
+            second nearest, likewise; whether the query is its slot's nearest, too.
+        ratio: see :func:`match`.
+    """
+    first, index, second, is_mutual = nearest
+    distance, next_distance = ((2 - 2 * as_float(cosine, "float32")).clip(0) ** 0.5 for cosine in (first, second))
+    # Two equal distances have a ratio of 1, even if rounding makes one of them 0, or if both are infinite.
+    quotient = distance.clip(ROUNDING, _MAX) / next_distance.clip(ROUNDING, _MAX)
+    return index, distance, quotient, (distance < math.inf) & (quotient <= ratio) & is_mutual
 
 
 def _as_arrays(features: Features) -> Features:
@@ -58,19 +76,7 @@ def _as_arrays(features: Features) -> Features:
     return Features(xy_px, scale_px, angle_deg, descriptors, on_host(valid))
 
 
-def _by_loops(query: Features, train: Features, limits: Limits, ratio: float) -> tuple[AnyArray, ...]:
-    """The four fields of the matches: a matrix product, and one pass over it."""
-    first, index, second, is_mutual = _nearest_by_loops(query, train, limits)
-    nearest, next_nearest = (
-        np.where(c < FORBIDDEN, np.inf, np.sqrt(np.maximum(2 - 2 * c, 0))) for c in (first, second)
-    )
-    with np.errstate(invalid="ignore"):  # of two that are infinite
-        quotient = np.maximum(nearest, ROUNDING) / np.maximum(next_nearest, ROUNDING)
-    quotient = np.where(np.isnan(quotient), np.float32(1), quotient)
-    return index, nearest, quotient, np.isfinite(nearest) & (quotient <= ratio) & is_mutual
-
-
-def _nearest_by_loops(query: Features, train: Features, limits: Limits) -> tuple[AnyArray, ...]:
+def _nearest(query: Features, train: Features, limits: Limits) -> tuple[AnyArray, ...]:
     """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best."""
     from engine.kernels import nearest  # numba takes a while to import
 

@@ -12,7 +12,6 @@ from engine.runtime.device import Picture
 Limits = tuple[float, float | None]
 """Ratio of the scales of matched keypoints, and the factor that it may be off by; None allows all."""
 TRAIN_CHUNK = 4096  # train slots compared at a time, to bound memory for a whole map
-FORBIDDEN = -2.0  # below every cosine
 ROUNDING = math.sqrt(128 * np.finfo(np.float32).eps)  # most between a descriptor and itself, by rounding
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from engine.errors import OptionError
-from engine.features import Features, match
+from engine.features import Features, Matches, match
 from engine.sift import matching, matching_tensors
 from engine.sift.values import fields_of
 from tests.support.matches import pairs_of
@@ -53,7 +53,8 @@ def plainly(query, train, ratio, scale, factor):
 
 def by_tensor_ops(query, train, *, ratio=0.8, scale=1.0, max_scale_factor=None):
     """As on a device."""
-    return matching_tensors.match_tensors(query, train, (scale, max_scale_factor), ratio)
+    found = matching_tensors.nearest(query, train, (scale, max_scale_factor))
+    return Matches(*matching.tested(found, ratio))
 
 
 WAYS = pytest.mark.parametrize("way", [match, by_tensor_ops], ids=["loops", "tensor ops"])
