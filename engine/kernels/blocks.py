@@ -47,28 +47,17 @@ def ncc_surface(search: FloatImage, templates: FloatImage, *, zero_mean: bool) -
     (B, H, W), (T, h, w) = search.shape, templates.shape[1:]
     windows, pictures = np.ascontiguousarray(search), np.ascontiguousarray(templates)
     out = np.empty((B, T, H - h + 1, W - w + 1), np.float32)
-    in_parallel(lambda b: write_surfaces(out[b], windows[b], pictures[b], zero_mean=zero_mean), range(B))
+
+    def one_window(b: int) -> None:
+        mean, energy = surface_loops.moments(windows[b], zero_mean)
+        models = [surface_loops.unit(template, zero_mean) for template in pictures[b]]
+        check_finite("search", math.isfinite(energy))
+        check_finite("templates", math.isfinite(sum(energy for _, energy in models)))
+        inverse_norms = surface_loops.inverse_norms(windows[b], mean, energy, h, w, zero_mean)
+        correlate(out[b], windows[b], mean, inverse_norms, [model for model, _ in models])
+
+    in_parallel(one_window, range(B))
     return out
-
-
-def write_surfaces(out: FloatImage, window: FloatImage, templates: FloatImage, *, zero_mean: bool) -> None:
-    """Write the scores of all templates in one window.
-
-    Args:
-        out: (T, H-h+1, W-w+1) takes the scores.
-        window: (H, W), contiguous.
-        templates: (T, h, w), contiguous.
-        zero_mean: subtract the means first.
-
-    Raises:
-        OptionError: NaN or infinity.
-    """
-    mean, energy = surface_loops.moments(window, zero_mean)
-    models = [surface_loops.unit(template, zero_mean) for template in templates]
-    check_finite("search", math.isfinite(energy))
-    check_finite("templates", math.isfinite(sum(energy for _, energy in models)))
-    inverse_norms = surface_loops.inverse_norms(window, mean, energy, *templates.shape[1:], zero_mean)
-    correlate(out, window, mean, inverse_norms, [model for model, _ in models])
 
 
 def inverse_norm(image: FloatImage, h: int, w: int) -> FloatImage:

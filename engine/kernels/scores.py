@@ -40,8 +40,15 @@ def enhance(
     """
     if radius_px < 1:
         raise OptionError(f"radius_px: expected 1 or more, got {radius_px}")
-    weight = None if valid is None else valid.astype(np.float32)
-    return _normalised(_smoothed(gray, weight), radius_px, weight)
+    if valid is None:
+        from engine.kernels.local_normalisation import MAX_RADIUS_PX, normalised  # numba takes a while to import
+
+        if radius_px <= MAX_RADIUS_PX:
+            smooth = cv2.GaussianBlur(gray, (3, 3), 0)
+            padded = cv2.copyMakeBorder(smooth, *(radius_px,) * 4, cv2.BORDER_REFLECT_101)
+            return np.asarray(normalised(padded, radius_px, _NOISE_VARIANCE), np.float32)
+        valid = np.ones(gray.shape, np.bool_)
+    return _normalised(gray, valid.astype(np.float32), radius_px)
 
 
 def orientation(
@@ -76,41 +83,22 @@ def orientation(
     box = (2 * radius_px + 1, 2 * radius_px + 1)
     size = cv2.sqrt(cv2.multiply(strength, cv2.blur(strength, box)))
     size += _STRUCTURE_NOISE
-    return np.stack([_masked(cv2.divide(part, size), weight) for part in (cosine, sine)])
+    found = np.stack([cv2.divide(part, size) for part in (cosine, sine)])
+    return found if weight is None else found * weight
 
 
-def _smoothed(gray: NDArray[np.uint8], weight: FloatImage | None) -> NDArray[np.uint8] | FloatImage:
-    """The picture smoothed by 1-2-1: in uint8, which is faster, or in float32 with a mask."""
-    if weight is None:
-        return np.asarray(cv2.GaussianBlur(gray, (3, 3), 0))
+def _normalised(gray: NDArray[np.uint8], weight: FloatImage, radius_px: int) -> FloatImage:
+    """The picture smoothed by 1-2-1, less its neighbourhood's mean, over its standard deviation, all weighted."""
     share = np.maximum(cv2.GaussianBlur(weight, (3, 3), 0), 1e-6)
-    return np.asarray(cv2.GaussianBlur(gray * weight, (3, 3), 0) / share)
-
-
-def _normalised(picture: NDArray[np.uint8] | FloatImage, radius_px: int, weight: FloatImage | None) -> FloatImage:
-    """Each pixel less the mean of its neighbourhood, over its standard deviation, weighted."""
-    if weight is None and picture.dtype == np.uint8:
-        from engine.kernels import local_normalisation  # numba takes a while to import
-
-        if radius_px <= local_normalisation.MAX_RADIUS_PX:
-            padded = cv2.copyMakeBorder(picture, *(radius_px,) * 4, cv2.BORDER_REFLECT_101)
-            return np.asarray(local_normalisation.normalised(padded, radius_px, _NOISE_VARIANCE), np.float32)
+    picture = cv2.GaussianBlur(gray * weight, (3, 3), 0) / share
     box = (2 * radius_px + 1, 2 * radius_px + 1)
-    if weight is None:
-        mean = cv2.boxFilter(picture, cv2.CV_32F, box)
-        square = cv2.sqrBoxFilter(picture, cv2.CV_32F, box)
-    else:
-        share = np.maximum(cv2.blur(weight, box), 1e-6)
-        mean = cv2.blur(picture * weight, box) / share
-        square = cv2.blur(picture * picture * weight, box) / share
+    share = np.maximum(cv2.blur(weight, box), 1e-6)
+    mean = cv2.blur(picture * weight, box) / share
+    square = cv2.blur(picture * picture * weight, box) / share
     # In place: on a patch of 228 x 228 pixels an allocation takes longer than the arithmetic.
     square -= mean * mean
     np.maximum(square, 0.0, out=square)
     square += _NOISE_VARIANCE
-    normal = np.subtract(picture.astype(np.float32, copy=False), mean, out=mean)
+    normal = np.subtract(picture, mean, out=mean)
     normal /= np.sqrt(square, out=square)
-    return _masked(normal, weight)
-
-
-def _masked(picture: FloatImage, weight: FloatImage | None) -> FloatImage:
-    return np.asarray(picture if weight is None else picture * weight, dtype=np.float32)
+    return np.asarray(normal * weight, np.float32)
