@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.kernels import coarse_to_fine
+from engine.kernels import coarse_to_fine, masked
 from engine.kernels.peaks import find_peak
 from engine.kernels.search_levels import MapRegion, prepare
 from engine.runtime.device import Picture, as_arrays, as_float, as_tensor, element_type, same_kind_as
@@ -78,7 +78,7 @@ def ncc(
         if not 0.0 < min_overlap <= 1.0:
             raise OptionError(f"min_overlap: expected above 0 and at most 1, got {min_overlap}")
         pictures = as_arrays(search, search_valid, templates)
-        scores = _kernels(pictures[0], masked=True).ncc_surface(*pictures, min_overlap=min_overlap)
+        scores = masked.ncc_surface(_kernels(pictures[0]), *pictures, min_overlap=min_overlap)
     else:
         if types[0] in _DOUBLE or types[1] in _DOUBLE:
             pictures = [as_tensor(as_float(v, "float64")) for v in (search, templates)]
@@ -114,15 +114,15 @@ def _check_mask(search: Picture, mask: Picture) -> None:
         raise ShapeError(f"search_valid: expected {tuple(search.shape)}, got {tuple(mask.shape)}")
 
 
-def _kernels(picture: Picture, *, masked: bool = False) -> Any:
+def _kernels(picture: Picture) -> Any:
     """The kernels of arrays, or those of tensors; torch and numba take a while to import."""
     if isinstance(picture, np.ndarray):
-        from engine.kernels import blocks, masked_blocks
+        from engine.kernels import blocks
 
-        return masked_blocks if masked else blocks
-    from engine.kernels import masked_tensors, tensors
+        return blocks
+    from engine.kernels import tensors
 
-    return masked_tensors if masked else tensors
+    return tensors
 
 
 def surface(search: MapRegion, templates: Given) -> Given:

@@ -18,16 +18,18 @@ MIDDLE_GREY = 128
 
 
 def integrals(image: NDArray[Any]) -> NDArray[np.float64]:
-    """Integral images of a picture and of its square.
+    """Integral images of pictures and of their squares.
 
     Args:
-        image: (H, W) float32 or float64.
+        image: (..., H, W) float32 or float64.
 
     Returns:
-        (2, H+1, W+1) float64 running sums; the first row and column are 0.
+        (2, ..., H+1, W+1) float64 running sums; the first row and column are 0.
     """
-    both = np.empty((2, image.shape[0] + 1, image.shape[1] + 1))
-    cv2.integral2(np.ascontiguousarray(image), both[0], both[1], sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+    *batch, height, width = image.shape
+    sums, squares = both = np.empty((2, *batch, height + 1, width + 1))
+    for at in np.ndindex(*batch):
+        cv2.integral2(np.ascontiguousarray(image[at]), sums[at], squares[at], cv2.CV_64F, cv2.CV_64F)
     return both
 
 

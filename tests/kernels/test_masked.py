@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine import DtypeError, OptionError, ShapeError
-from engine.kernels import masked_blocks, masked_tensors
+from engine.kernels import masked, tensors
 from engine.ncc_fft import ncc
 
 
@@ -106,8 +106,8 @@ def drawn(kind, size, model):
 
 
 def by_whole_windows(window, valid, templates, min_overlap):
-    tensors = torch.from_numpy(window)[None], torch.from_numpy(valid)[None], torch.from_numpy(templates)[None]
-    return masked_tensors.ncc_surface(*tensors, min_overlap=min_overlap)[0].numpy()
+    given = (torch.from_numpy(values)[None] for values in (window, valid, templates))
+    return masked.ncc_surface(tensors, *given, min_overlap=min_overlap)[0].numpy()
 
 
 @pytest.mark.parametrize("min_overlap", [0.3001, 0.8999])
@@ -130,10 +130,10 @@ def test_flat_templates_and_flat_ground_score_zero_also_across_an_edge(level):
     window, valid, templates = drawn("border", (120, 130), (30, 31))
     for dtype in (np.float32, np.float64):
         flat = np.full((1, 30, 31), level, dtype)
-        scores = masked_blocks.ncc_surface(window.astype(dtype)[None], valid[None], flat[None], min_overlap=0.5)[0]
+        scores = ncc(window.astype(dtype)[None], flat[None], search_valid=valid[None], min_overlap=0.5)[0]
         assert np.abs(scores[scores > -1.0]).max(initial=0.0) < 1e-6
         half = window.astype(dtype)
         half[:, :80] = level
-        scores = masked_blocks.ncc_surface(half[None], valid[None], templates.astype(dtype)[None], min_overlap=0.5)
+        scores = ncc(half[None], templates.astype(dtype)[None], search_valid=valid[None], min_overlap=0.5)
         scores = scores[0, :, :, : 80 - 31]
         assert np.abs(scores[scores > -1.0]).max(initial=0.0) < 1e-6
