@@ -74,6 +74,10 @@ def picture(height, width, seed=0):
 class Brightest(nn.Module):
     """Stands for LoFTR: says where the brightest pixel of each picture is, and keeps the sizes it was given."""
 
+    def __init__(self):
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(1))
+
     def forward(self, data):
         self.sizes = [tuple(data[name].shape[2:]) for name in ("image0", "image1")]
         found = {}

@@ -45,16 +45,15 @@ def load_matcher(
         raise OptionError(f"min_confidence: expected a number in [0, 1], got {min_confidence}")
     if not paths:
         raise OptionError(f"weights: expected the files of {_EXPECTED}, got none")
-    target, files = torch.device(devices.resolve(device)), [read_weights(path) for path in paths]
-    kinds = sorted(weights.kind for weights in files)
+    target = torch.device(devices.resolve(device))
+    files = sorted(map(read_weights, paths), key=lambda weights: weights.kind)
+    kinds = [weights.kind for weights in files]
     if kinds == ["LoFTR"]:
         return Loftr(fill(_kornia().LoFTR(pretrained=None), files[0], target), min_confidence)
-    extractors = [weights for weights in files if weights.kind in ("DISK", "ALIKED")]
-    matchers = [weights for weights in files if weights.kind == "LightGlue"]
-    if len(extractors) != 1 or len(matchers) != 1 or len(files) != 2:
+    if kinds not in (["ALIKED", "LightGlue"], ["DISK", "LightGlue"]):
         raise OptionError(f"weights: expected the files of {_EXPECTED}, got {' and '.join(kinds)}")
-    extractor, numbers = _extractor(extractors[0], target)
-    return KeypointMatcher(extractor, _lightglue(matchers[0], numbers, target), max_keypoints)
+    extractor, numbers = _extractor(files[0], target)
+    return KeypointMatcher(extractor, _lightglue(files[1], numbers, target), max_keypoints)
 
 
 def _extractor(weights: Weights, device: torch.device) -> tuple[Extractor, int]:

@@ -35,7 +35,7 @@ class Loftr:
     def __call__(self, frame: Tensor, crop: Tensor) -> tuple[Tensor, Tensor]:
         """Match two pictures; see :class:`engine.learned.PairMatcher`."""
         _check(frame, crop)
-        device = _device_of(self.network)
+        device = next(self.network.parameters()).device
         with torch.inference_mode():
             images = {"image0": _padded(frame.to(device)), "image1": _padded(crop.to(device))}
             found = self.network(images)
@@ -69,7 +69,7 @@ class KeypointMatcher:
     def extract(self, picture: Tensor, count: int) -> Keypoints:
         """The strongest keypoints of a picture (1, 1, H, W), on the network's device."""
         with torch.inference_mode():
-            return self.extractor(picture.to(_device_of(self.lightglue)), count)
+            return self.extractor(picture.to(next(self.lightglue.parameters()).device), count)
 
     def match(
         self, first: Keypoints, first_size_px: tuple[int, int], second: Keypoints, second_size_px: tuple[int, int]
@@ -85,7 +85,7 @@ class KeypointMatcher:
         Returns:
             (M, 2) indices into both.
         """
-        device = _device_of(self.lightglue)
+        device = next(self.lightglue.parameters()).device
         if min(len(first), len(second)) < 2:  # LightGlue compares a keypoint with others
             return torch.zeros(0, 2, dtype=torch.long, device=device)
         data = {
@@ -119,11 +119,6 @@ def _check(frame: Tensor, crop: Tensor) -> None:
             raise ShapeError(f"{name}: expected (1, 1, H, W), got {tuple(image.shape)}")
         if not image.is_floating_point():
             raise DtypeError(f"{name}: expected floating point, got {image.dtype}")
-
-
-def _device_of(network: nn.Module) -> torch.device:
-    first = next(network.parameters(), None)
-    return torch.device("cpu") if first is None else first.device
 
 
 def _inside(points: Tensor, image: Tensor) -> Tensor:
