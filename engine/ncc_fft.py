@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
-from engine.kernels import coarse_to_fine, masked
+from engine.kernels import coarse_to_fine
 from engine.kernels.peaks import find_peak
 from engine.kernels.search_levels import MapRegion, prepare
+from engine.kernels.sums import over_nodata, share_on_map
 from engine.runtime.device import Picture, as_arrays, as_float, as_tensor, element_type, same_kind_as
 from engine.values import Peak
 
@@ -46,8 +47,6 @@ def ncc(
     templates: Given,
     *,
     zero_mean: bool = True,
-    search_valid: Given | None = None,
-    min_overlap: float = 0.5,
 ) -> Given:
     """Scores in [-1, 1]: normalised cross-correlation of templates with every position in a window.
 
@@ -57,8 +56,6 @@ def ncc(
         search: (B, H, W), any of uint8, int16, uint16, int32, float16, float32, float64.
         templates: (B, T, h, w) with h <= H and w <= W, on the same device.
         zero_mean: subtract the means (OpenCV's ``TM_CCOEFF_NORMED``); False is equation 1 (``TM_CCORR_NORMED``).
-        search_valid: (B, H, W) bool, or None: all. Invalid pixels are left out of all sums.
-        min_overlap: with a mask, positions where less than this share of the template is on valid map score -1.
 
     Returns:
         (B, T, H-h+1, W-w+1), float64 if either input is float64, else float32. A perfect match scores 1, an
@@ -66,25 +63,16 @@ def ncc(
 
     Raises:
         ShapeError: the shapes do not fit each other.
-        DtypeError: an element type is not in the list above, or the mask is not bool.
-        OptionError: different devices, NaN or infinity, or a mask without ``zero_mean``.
+        DtypeError: an element type is not in the list above.
+        OptionError: different devices, NaN or infinity.
     """
     _check(search, templates)
     types = (element_type(search), element_type(templates))
-    if search_valid is not None:
-        _check_mask(search, search_valid)
-        if not zero_mean:
-            raise OptionError("zero_mean: expected True with a mask, got False")
-        if not 0.0 < min_overlap <= 1.0:
-            raise OptionError(f"min_overlap: expected above 0 and at most 1, got {min_overlap}")
-        pictures = as_arrays(search, search_valid, templates)
-        scores = masked.ncc_surface(_kernels(pictures[0]), *pictures, min_overlap=min_overlap)
+    if types[0] in _DOUBLE or types[1] in _DOUBLE:
+        pictures = [as_tensor(as_float(v, "float64")) for v in (search, templates)]
     else:
-        if types[0] in _DOUBLE or types[1] in _DOUBLE:
-            pictures = [as_tensor(as_float(v, "float64")) for v in (search, templates)]
-        else:
-            pictures = as_arrays(*(as_float(v, "float32") for v in (search, templates)))
-        scores = _kernels(pictures[0]).ncc_surface(*pictures, zero_mean=zero_mean)
+        pictures = as_arrays(*(as_float(v, "float32") for v in (search, templates)))
+    scores = _kernels(pictures[0]).ncc_surface(*pictures, zero_mean=zero_mean)
     found: Given = same_kind_as(search, as_float(scores, "float64" if "float64" in types else "float32"))
     return found
 
@@ -107,13 +95,6 @@ def _check(search: Picture, templates: Picture) -> None:
         raise OptionError(f"templates: expected on {places[0]} like search, got {places[1]}")
 
 
-def _check_mask(search: Picture, mask: Picture) -> None:
-    if element_type(mask) != "bool":
-        raise DtypeError(f"search_valid: expected bool, got {mask.dtype}")
-    if mask.shape != search.shape:
-        raise ShapeError(f"search_valid: expected {tuple(search.shape)}, got {tuple(mask.shape)}")
-
-
 def _kernels(picture: Picture) -> Any:
     """The kernels of arrays, or those of tensors; torch and numba take a while to import."""
     if isinstance(picture, np.ndarray):
@@ -125,12 +106,13 @@ def _kernels(picture: Picture) -> Any:
     return tensors
 
 
-def surface(search: MapRegion, templates: Given) -> Given:
+def surface(search: MapRegion, templates: Given, *, min_overlap: float = 0.0) -> Given:
     """Zero-mean NCC of templates with a prepared part of a map.
 
     Args:
         search: (H, W) from :func:`prepare`.
         templates: (T, h, w) float32 on the same device, with h <= H and w <= W.
+        min_overlap: positions where a smaller share of a template lies on valid pixels score -1.
 
     Returns:
         (T, H-h+1, W-w+1) float32 in [-1, 1].
@@ -139,7 +121,7 @@ def surface(search: MapRegion, templates: Given) -> Given:
         ShapeError: the templates are not (T, h, w), are empty, or are larger than the map.
     """
     _check_fit(search, templates)
-    return next(surfaces(search, templates, group=templates.shape[0]))
+    return next(surfaces(search, templates, group=templates.shape[0], min_overlap=min_overlap))
 
 
 def _check_fit(search: MapRegion, templates: Picture) -> None:
@@ -150,28 +132,37 @@ def _check_fit(search: MapRegion, templates: Picture) -> None:
         raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
 
 
-def surfaces(search: MapRegion, templates: Given, *, group: int) -> Iterator[Given]:
+def surfaces(search: MapRegion, templates: Given, *, group: int, min_overlap: float = 0.0) -> Iterator[Given]:
     """Zero-mean NCC, a group of templates at a time, to bound memory for many templates on a large map.
 
     Args:
         search: (H, W) from :func:`prepare`.
         templates: (T, h, w) float32 on the same device, with h <= H and w <= W.
         group: number of templates per tensor.
+        min_overlap: see :func:`surface`.
 
     Returns:
         Yields (group, H-h+1, W-w+1) float32; the last group holds the remainder of T.
     """
-    kernels = _kernels(search.image)
-    known = search.image if search.sums is None else search.sums
-    inverse_norms = kernels.inverse_norm(known, *templates.shape[-2:])
+    kernels, (h, w), off = _kernels(search.image), templates.shape[-2:], None
+    inverse_norms = kernels.inverse_norm(search.image if search.sums is None else search.sums, h, w)
+    if search.counts is not None:
+        inverse_norms, off = over_nodata(inverse_norms, share_on_map(search.counts, h, w), min_overlap)
     for first in range(0, len(templates), group):
         part = same_kind_as(search.image, templates[first : first + group])
         found = kernels.prepared_surface(search.image, inverse_norms, part - part.mean((-2, -1), keepdims=True))
-        yield same_kind_as(templates, found)
+        yield same_kind_as(templates, found if off is None else found + off)
 
 
-def match_template(search: MapRegion, template: Picture, *, exclusion_px: float, exhaustive: bool = False) -> Peak:
-    """The peak of one template in a prepared part of a map; all its pixels count as valid.
+def match_template(
+    search: MapRegion,
+    template: Picture,
+    *,
+    exclusion_px: float,
+    exhaustive: bool = False,
+    min_overlap: float = 0.0,
+) -> Peak:
+    """The peak of one template in a prepared part of a map.
 
     Coarse to fine, see :mod:`engine.kernels.coarse_to_fine`. If that is not certain, with ``exhaustive``, or off
     the CPU, all positions are scored at full resolution.
@@ -181,6 +172,7 @@ def match_template(search: MapRegion, template: Picture, *, exclusion_px: float,
         template: (h, w) float32 on the same device.
         exclusion_px: radius about the peak within which no rival is counted.
         exhaustive: score all positions at full resolution; the peak is then the reference's.
+        min_overlap: see :func:`surface`.
 
     Returns:
         Peak: as :func:`engine.kernels.peaks.find_peak`; on the CPU without ``exhaustive`` the second score may be
@@ -191,7 +183,8 @@ def match_template(search: MapRegion, template: Picture, *, exclusion_px: float,
     """
     _check_fit(search, template[None])
     if isinstance(search.image, np.ndarray) and not exhaustive:
-        found = coarse_to_fine.peak(search, same_kind_as(search.image, template), exclusion_px)
+        own = same_kind_as(search.image, template)
+        found = coarse_to_fine.peak(search, own, exclusion_px, min_overlap=min_overlap)
         if found is not None:
             return found
-    return find_peak(surface(search, template[None])[0], exclusion_px=exclusion_px)
+    return find_peak(surface(search, template[None], min_overlap=min_overlap)[0], exclusion_px=exclusion_px)

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 
 from engine.kernels import surface_loops
 from engine.kernels.sums import check_finite
-from engine.kernels.sums import integrals as integrals
 from engine.runtime.threads import in_parallel, own_array
 
 FloatImage = NDArray[np.float32]
-Sums = NDArray[np.float64]
 _Block = tuple[tuple[slice, slice], NDArray[np.floating]]  # where its scores lie, and its transform
 
 # A float32 transform has an error of about 1e-7 of the window's norm in every numerator, which is divided by the
@@ -130,37 +128,6 @@ def correlate(
         in_parallel(one_block, blocks)
 
     in_parallel(one_template, range(len(models)))
-
-
-def masked_products(window: Sums, mask: Sums, model: Sums) -> Sums:
-    """Correlations of a window with templates, of its mask with them, and of the mask with their squares.
-
-    Args:
-        window: (B, H, W) float64.
-        mask: (B, H, W) float64.
-        model: (B, T, h, w) float64.
-
-    Returns:
-        (3, B, T, H-h+1, W-w+1) float64.
-    """
-    (height, width), (h, w) = window.shape[1:], model.shape[2:]
-    out = np.empty((3, *model.shape[:2], height - h + 1, width - w + 1))
-    product = np.empty((fast_side(height), fast_side(width)))
-    for b in range(len(window)):
-        seen, shown = (spectrum_of(picture, np.empty_like(product)) for picture in (window[b], mask[b]))
-        for t, template in enumerate(model[b]):
-            own, squares = (spectrum_of(part, np.empty_like(product)) for part in (template, template * template))
-            for k, pair in enumerate(((seen, own), (shown, own), (shown, squares))):
-                cv2.mulSpectrums(*pair, 0, product, True)
-                transform(product, cv2.DFT_INVERSE, out.shape[3])
-                out[k, b, t] = product[: out.shape[3], : out.shape[4]] / product.size
-    return out
-
-
-def check_all_finite(**arrays: NDArray[Any]) -> None:
-    """Raise OptionError if an array, by the name of its argument, holds NaN or infinity."""
-    for name, array in arrays.items():
-        check_finite(name, bool(np.isfinite(array).all()))
 
 
 @lru_cache(maxsize=1024)

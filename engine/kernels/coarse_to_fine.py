@@ -3,16 +3,12 @@
 The error bound of the coarse scores is twice the largest error at the refined positions, and at least the loss of
 a match between coarse pixels. If that bound does not exclude every other position, all must be scored at full
 resolution, unless the window is wide and a :class:`EarlyStop` already decides about the frame.
-
-On a coarse level nodata is 0 in a picture with zero mean, and hardly lowers positions that are mostly on the map:
-their scores are divided by the share on the map, which more than compensates if the template's contrast is spread
-evenly. At full resolution nodata is left out of all sums.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +17,7 @@ from numpy.typing import NDArray
 from engine.kernels.local import LocalScores
 from engine.kernels.peaks import FAR, NEAR, best_positions, fit_peak
 from engine.kernels.search_levels import COARSE_TEMPLATE_PX, MapRegion
-from engine.kernels.sums import halved
+from engine.kernels.sums import halved, over_nodata
 from engine.values import Peak
 
 FloatImage = NDArray[np.float32]
@@ -164,35 +160,9 @@ def _levels(search: MapRegion, template: FloatImage, min_overlap: float, max_los
     return _Levels(parts, models, min_overlap) if len(parts) > 1 else None
 
 
-def surfaces_over_nodata(
-    search: MapRegion, templates: FloatImage, *, min_overlap: float, group: int
-) -> Iterator[FloatImage]:
-    """Scores of many templates with nodata taken as 0, which are about those that leave it out.
-
-    Args:
-        search: (H, W) arrays with ``counts``, about 0.
-        templates: (T, h, w) float32.
-        min_overlap: positions where a smaller share of a template lies on valid pixels score -1.
-        group: number of templates at a time, which bounds the memory.
-
-    Returns:
-        Yields T surfaces (H-h+1, W-w+1).
-    """
-    from engine.kernels import blocks  # numba takes a while to import
-
-    assert search.counts is not None
-    model = (templates.shape[1], templates.shape[2])
-    inverse_norms = blocks.inverse_norm(search.image, *model)
-    share = _share_on_map(search.counts, model, 1, inverse_norms.shape)
-    for first in range(0, len(templates), group):
-        part = templates[first : first + group]
-        part = part - part.mean((-2, -1), keepdims=True)
-        yield from _scores_by_share(search, part, inverse_norms, share, min_overlap)
-
-
 def _coarse_scores(levels: _Levels) -> FloatImage:
     """Scores on the coarsest level; positions partly on nodata score about as at full resolution."""
-    from engine.kernels import blocks
+    from engine.kernels import blocks  # numba takes a while to import
 
     coarse, model = levels.parts[-1], levels.models[-1]
     inverse_norms = blocks.inverse_norm(coarse.image, *model.shape)
@@ -201,22 +171,8 @@ def _coarse_scores(levels: _Levels) -> FloatImage:
         return np.asarray(blocks.prepared_surface(coarse.image, inverse_norms, model[None])[0])
     share = _share_on_map(counts, (h, w), step, inverse_norms.shape)
     # A position between those of the level has this much more of the template on the map at most.
-    least = levels.min_overlap - step * (1.0 / h + 1.0 / w)
-    return np.asarray(_scores_by_share(coarse, model[None], inverse_norms, share, least)[0])
-
-
-def _scores_by_share(
-    part: MapRegion, models: FloatImage, inverse_norms: FloatImage, share: FloatImage, least: float
-) -> FloatImage:
-    """Scores (T, H', W') divided by the share on the map; -1 where that is less than ``least``."""
-    from engine.kernels import blocks
-
-    is_off = share < max(least, 1e-3)
-    inverse_norms[is_off] = 0.0
-    scores = blocks.prepared_surface(part.image, inverse_norms, models)
-    np.divide(scores, share, out=scores, where=(share < 1.0) & (scores > 0.0))
-    scores[:, is_off] = -1.0
-    return np.asarray(np.minimum(scores, np.float32(1.0), out=scores))
+    inverse_norms, off = over_nodata(inverse_norms, share, levels.min_overlap - step * (1.0 / h + 1.0 / w))
+    return np.asarray(blocks.prepared_surface(coarse.image, inverse_norms, model[None])[0] + off)
 
 
 def _share_on_map(

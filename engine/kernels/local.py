@@ -11,13 +11,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels.sums import FLAT_SHARE, box_sum, integrals, masked_scores
+from engine.kernels.sums import over_nodata, share_on_map
 
 FloatImage = NDArray[np.float32]
 Sums = NDArray[np.float64]
 Index = NDArray[np.int64]
 Counts = NDArray[np.int32]
-Flat = NDArray[np.float32]
 
 
 class LocalScores:
@@ -27,7 +26,7 @@ class LocalScores:
         image: (H, W) float32, its mean small against its standard deviation; 0 where not valid.
         template: (h, w) float32 of zero mean.
         middle: (y, x); scores can be computed within ``REACH`` of it.
-        counts: (H+1, W+1) running sums of the valid pixels; all sums use only these. None if all pixels are valid.
+        counts: (H+1, W+1) running sums of the valid pixels; None if all are.
         min_overlap: positions where a smaller share of the template lies on valid pixels score -1.
     """
 
@@ -53,16 +52,12 @@ class LocalScores:
         padded = np.zeros((h, self._row), np.float32)
         padded[:, :w] = template
         self._patch, self._template = patch.ravel(), padded.ravel()[: (h - 1) * self._row + w]
-        self._energy, self._valid = float(np.dot(self._template, self._template)), None
+        energy = float(np.dot(self._template, self._template))
+        self._inverse_norm = blocks.inverse_norm(patch, h, w) * (1.0 / math.sqrt(energy) if energy > 0.0 else 0.0)
+        self._off = np.zeros_like(self._inverse_norm)
         if counts is not None:
-            counts = counts[y0 : y1 + h + 1, x0 : x1 + w + 1]
-            self._count, self._least = box_sum(counts, h, w), max(min_overlap * (h * w), 1.0)
-            if (self._count < h * w).any():
-                self._valid = box_sum(counts, 1, 1).astype(np.float32).ravel()
-                self._squares, self._sums = self._template**2, box_sum(integrals(patch), h, w)
-        if self._valid is None:
-            scale = 1.0 / math.sqrt(self._energy) if self._energy > 0.0 else 0.0
-            self._inverse_norm = blocks.inverse_norm(patch, h, w) * scale
+            share = share_on_map(counts[y0 : y1 + h + 1, x0 : x1 + w + 1], h, w)
+            self._inverse_norm, self._off = over_nodata(self._inverse_norm, share, min_overlap)
 
     def at(self, y: Index, x: Index) -> Sums:
         """Scores at positions at which the template fits.
@@ -75,16 +70,6 @@ class LocalScores:
             (N,) float64 in [-1, 1].
         """
         j, i = y - self._corner[0], x - self._corner[1]
-        places = (j * self._row + i).tolist()
-        products = self._products(self._patch, self._template, places)
-        if self._valid is None:
-            return (products * self._inverse_norm[j, i]).clip(-1.0, 1.0)
-        of_model, of_squares = (self._products(self._valid, m, places) for m in (self._template, self._squares))
-        (total, square), count = self._sums[:, j, i], self._count[j, i]
-        floors = FLAT_SHARE * float(self._sums[1].max(initial=0.0)), FLAT_SHARE * self._energy
-        scores = masked_scores(products, of_model, of_squares, total, square, count, floors)
-        return np.asarray(np.where(count < self._least, -1.0, scores))
-
-    def _products(self, patch: Flat, model: Flat, places: list[int]) -> Sums:
-        """Sums of products of a model with a patch from each place on."""
-        return np.array([np.dot(patch[k : k + model.size], model) for k in places], np.float64)
+        places, model = (j * self._row + i).tolist(), self._template
+        products = np.array([np.dot(self._patch[k : k + model.size], model) for k in places], np.float64)
+        return np.asarray((products * self._inverse_norm[j, i]).clip(-1.0, 1.0) + self._off[j, i])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from engine.errors import DtypeError, ShapeError
 from engine.kernels.sums import counts, halved
-from engine.runtime.device import Picture, as_arrays, element_type
+from engine.runtime.device import Picture, as_arrays, element_type, to_device
 
 # Coarse to fine: templates are halved while they stay at least this wide.
 COARSE_TEMPLATE_PX = 48
@@ -27,13 +27,13 @@ class MapRegion:
         sums: (2, H+1, W+1) float64 running sums of the picture and of its square on a GPU; None on the CPU, where
             the sums of a window take one pass.
         counts: (H+1, W+1) int32 running sums of its valid pixels; invalid ones are 0 in the picture. None if all
-            are valid, on a GPU, and at half resolution.
+            are valid, and at half resolution.
     """
 
     image: Picture
     half: MapRegion | None = None
     sums: Picture = None
-    counts: NDArray[np.int32] | None = None
+    counts: Picture = None
 
     def crop(self, x0: int, y0: int, width: int, height: int) -> MapRegion:
         """Crop columns [x0, x0 + width) and rows [y0, y0 + height), without a copy.
@@ -70,11 +70,13 @@ def prepare(image: Picture, *, halvings: int = MAX_HALVINGS, valid: NDArray[np.b
     if element_type(image) != "float32":
         raise DtypeError(f"image: expected float32, got {image.dtype}")
     (image,) = as_arrays(image)
+    known = None if valid is None else counts(valid)
     if not isinstance(image, np.ndarray):
         from engine.kernels.tensors import integrals
 
-        return MapRegion(image.contiguous(), sums=integrals(image))
+        known = None if known is None else to_device(known, image.device)
+        return MapRegion(image.contiguous(), sums=integrals(image), counts=known)
     image, half = np.ascontiguousarray(image), None
     if halvings > 0 and min(image.shape) >= 2 * COARSE_TEMPLATE_PX:
         half = prepare(halved(image), halvings=halvings - 1)
-    return MapRegion(image, half, counts=None if valid is None else counts(valid))
+    return MapRegion(image, half, counts=known)

@@ -1,36 +1,18 @@
-"""Sums and 2 x 2 means of a picture, computed once on the CPU by OpenCV, and scores from sums."""
+"""Sums and 2 x 2 means of a picture, computed once on the CPU by OpenCV, and what nodata does to scores."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.runtime.device import Picture
+from engine.runtime.device import Picture, as_float
 
 # Sums of squares about a mean below this share of the whole picture's are rounding: there a patch is flat.
 FLAT_SHARE = 1e-12
 MIDDLE_GREY = 128
 """Of uint8; levels are counted from it, so that sums of squares lose fewer digits."""
-
-
-def integrals(image: NDArray[Any]) -> NDArray[np.float64]:
-    """Integral images of pictures and of their squares.
-
-    Args:
-        image: (..., H, W) float32 or float64.
-
-    Returns:
-        (2, ..., H+1, W+1) float64 running sums; the first row and column are 0.
-    """
-    *batch, height, width = image.shape
-    sums, squares = both = np.empty((2, *batch, height + 1, width + 1))
-    for at in np.ndindex(*batch):
-        cv2.integral2(np.ascontiguousarray(image[at]), sums[at], squares[at], cv2.CV_64F, cv2.CV_64F)
-    return both
 
 
 def halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -82,31 +64,24 @@ def box_sum(running: Picture, h: int, w: int) -> Picture:
     return sums
 
 
-def masked_scores(
-    products: Picture,
-    of_model: Picture,
-    of_squares: Picture,
-    total: Picture,
-    square: Picture,
-    count: Picture,
-    floors: tuple[Picture, Picture],
-) -> Picture:
-    """Correlation coefficients over valid pixels, from sums over them.
+def share_on_map(counts: Picture, h: int, w: int) -> Picture:
+    """Share (H-h+1, W-w+1) float32 of every patch's pixels that is valid, from running sums of these."""
+    return as_float(box_sum(counts, h, w), "float32") / (h * w)
+
+
+def over_nodata(inverse_norms: Picture, share: Picture, min_overlap: float) -> tuple[Picture, Picture]:
+    """What takes nodata out of the scores of a picture that is 0 there.
+
+    Zeros add nothing to the sum of products nor to the patch's norm, but the template keeps its whole norm: if its
+    contrast is spread evenly, a share s of it on the map scores less by the root of s.
 
     Args:
-        products: (...) float64 sums of the picture's products with the template, both about some mean.
-        of_model: of the template.
-        of_squares: of its squares.
-        total: of the picture.
-        square: of its squares.
-        count: number of valid pixels.
-        floors: sums of squares of picture and template that are rounding.
+        inverse_norms: (H', W') float32 reciprocal norms of the patches.
+        share: (H', W') float32 of the template's pixels that lie on the map.
+        min_overlap: positions with a smaller share score -1.
 
     Returns:
-        (...) float64 in [-1, 1]; 0 where picture or template is flat.
+        The norms to score by, and what to add to the scores: -1 where too little of the template lies on the map.
     """
-    count = count.clip(1)
-    spread, model_spread = square - total * total / count, of_squares - of_model * of_model / count
-    textured = (spread > floors[0]) & (model_spread > floors[1])
-    norm = (spread * model_spread * textured + ~textured) ** 0.5
-    return ((products - total * of_model / count) / norm * textured).clip(-1.0, 1.0)
+    is_on = as_float((share > 0.0) & (share >= min_overlap), "float32")
+    return inverse_norms * is_on / share.clip(FLAT_SHARE) ** 0.5, is_on - 1.0

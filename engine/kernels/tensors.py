@@ -146,11 +146,6 @@ def correlate(search: Tensor, templates: Tensor) -> Tensor:
     return found[0] if len(found) == 1 else torch.cat(found)
 
 
-def masked_products(window: Tensor, mask: Tensor, model: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Correlations of windows with templates, of their masks with them, and of the masks with their squares."""
-    return correlate(window, model), correlate(mask, model), correlate(mask, model.square())
-
-
 def _inverse(spectrum: Tensor, height: int, width: int, columns: int) -> Tensor:
     """The top-left (height, width) of irfft2, without the transform of the other rows."""
     rows = torch.fft.ifft(spectrum, dim=-2)[..., :height, :]

@@ -17,7 +17,7 @@ from engine.kernels.search_levels import MAX_HALVINGS
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, tiles_under, widened, within
 from engine.ncc_fft import MapRegion, prepare
-from engine.runtime.device import Device, Picture, to_device
+from engine.runtime.device import Device, to_device
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -38,13 +38,11 @@ class Region:
         window: its extent, in pixels of the level.
         search: prepared pixels that templates are matched against.
         valid: (H, W) bool, False on nodata; None if all pixels are valid.
-        mask: the same on the host, to read without waiting for a device.
     """
 
     window: Window
     search: MapRegion
-    valid: Picture | None
-    mask: NDArray[np.bool_] | None = None
+    valid: NDArray[np.bool_] | None
 
 
 class PreparedMap:
@@ -79,9 +77,9 @@ class PreparedMap:
         i, j = aligned.x0 - region.window.x0, aligned.y0 - region.window.y0
         search = region.search.crop(i, j, aligned.width_px, aligned.height_px)
         part = within(aligned, region.window)
-        if region.valid is None or region.mask is None or region.mask[part].all():
+        if region.valid is None or region.valid[part].all():
             return Region(aligned, replace(search, counts=None), None)
-        return Region(aligned, search, region.valid[part], region.mask[part])
+        return Region(aligned, search, region.valid[part])
 
     def _region(self, window: Window, level: int) -> Region:
         """The most recently used region that contains a window, or a new one."""
@@ -107,10 +105,7 @@ class PreparedMap:
 
     def _prepare(self, window: Window, level: int) -> Region:
         picture, mask = enhanced_part(self._site, window, level)
-        image = to_device(picture, self._device)
-        if mask is None:
-            return Region(window, prepare(image), None)
-        return Region(window, prepare(image, valid=mask), to_device(mask, self._device), mask)
+        return Region(window, prepare(to_device(picture, self._device), valid=mask), mask)
 
 
 def enhanced_part(site: OrthoMap, window: Window, level: int) -> tuple[FloatImage, NDArray[np.bool_] | None]:

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from engine.kernels import coarse_to_fine
 from engine.kernels.coarse_to_fine import EarlyStop
-from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance
 from engine.maps.prepared import PreparedMap, Region
 from engine.matching import refusals
 from engine.matching.align import FRACTION, MIN_SHRINK, GroundView, Patch, rectify, view_of
 from engine.matching.oblique import is_oblique, oblique_patch
 from engine.matching.query import Query
-from engine.ncc_fft import match_template, ncc
+from engine.ncc_fft import match_template, surface
 from engine.options import NccOptions
 from engine.runtime.device import Picture, to_device
 from engine.runtime.scheduler import OutOfTime
@@ -202,10 +201,8 @@ class Correlator:
         return isinstance(region.search.image, np.ndarray) and not self.options.exhaustive
 
     def _of_every_place(self, region: Region, template: NDArray[np.float32], exclusion_px: float) -> Peak:
-        if region.valid is not None:
-            return find_peak(self.masked_scores(region, template[None])[0], exclusion_px=exclusion_px)
-        own = to_device(template, self.query.device)
-        return match_template(region.search, own, exclusion_px=exclusion_px, exhaustive=True)
+        own, least = to_device(template, self.query.device), MIN_VALID_SHARE
+        return match_template(region.search, own, exclusion_px=exclusion_px, exhaustive=True, min_overlap=least)
 
     def exclusion_px(self, level: int) -> float:
         """Distance within which a rival is the peak itself, in pixels of a level."""
@@ -222,23 +219,9 @@ class Correlator:
         region = self.cut(window, aligned.level)
         if region.window.width_px < width or region.window.height_px < height:
             return None
-        template = aligned.template[None]
-        if region.valid is None:
-            scores = ncc(region.search.image[None], to_device(template[None], self.query.device))[0, 0]
-        else:
-            scores = self.masked_scores(region, template)[0]
+        own = to_device(aligned.template[None], self.query.device)
+        scores = surface(region.search, own, min_overlap=MIN_VALID_SHARE)[0]
         return scores, np.array([region.window.x0, region.window.y0], np.float64)
-
-    def masked_scores(self, region: Region, templates: NDArray[np.float32]) -> Picture:
-        """Scores (T, H', W') where the region has nodata; -1 where too little of a template lies on map."""
-        assert region.valid is not None
-        scores = ncc(
-            region.search.image[None],
-            to_device(templates[None], self.query.device),
-            search_valid=region.valid[None],
-            min_overlap=MIN_VALID_SHARE,
-        )
-        return scores[0]
 
     def nadir_px(self, peak: Peak, aligned: Aligned) -> Array:
         """The camera's nadir (2,) in map pixels, from where its patch was found."""

@@ -15,7 +15,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.kernels.coarse_to_fine import surfaces_over_nodata
 from engine.kernels.peaks import best_positions
 from engine.maps.prepared import Region
 from engine.matching.correlation import MIN_SIDE_PX, MIN_VALID_SHARE, Aligned, Correlator
@@ -199,15 +198,9 @@ def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.floa
     """Yield one surface (H', W') at a time; only a few are in memory."""
     area_px = region.window.width_px * region.window.height_px
     group = max(1, _MAX_COARSE_PX // area_px)
-    if region.valid is None:
-        own = to_device(templates, correlator.query.device)
-        for several in surfaces(region.search, own, group=group):
-            yield from several
-    elif region.search.counts is not None:
-        yield from surfaces_over_nodata(region.search, templates, min_overlap=MIN_VALID_SHARE, group=group)
-    else:
-        for first in range(0, len(templates), group):
-            yield from correlator.masked_scores(region, templates[first : first + group])
+    own = to_device(templates, correlator.query.device)
+    for several in surfaces(region.search, own, group=group, min_overlap=MIN_VALID_SHARE):
+        yield from several
 
 
 def _same_size(fitting: list[Aligned]) -> tuple[NDArray[np.float32], list[Array]]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance, orientation
-from engine.kernels.sums import box_sum, counts
+from engine.kernels.sums import counts, share_on_map
 from engine.matching.candidates import PeakCandidate
 from engine.matching.correlation import MIN_VALID_SHARE, Aligned, Correlator
 from engine.matching.peak_evidence import candidate_of
@@ -88,13 +88,8 @@ def _scores(
     scores = on_host(ncc(to_device(search, query.device), to_device(templates, query.device)).mean(0))
     if valid is not None:
         # Nodata is 0 in all channels, near their mean, and so hardly lowers places that are mostly on the map.
-        scores[:, _share_on_map(valid, height, width) < MIN_VALID_SHARE] = -1.0
+        scores[:, share_on_map(counts(valid), height, width) < MIN_VALID_SHARE] = -1.0
     return scores, crop
-
-
-def _share_on_map(valid: NDArray[np.bool_], height: int, width: int) -> NDArray[np.float64]:
-    """Share of the template's pixels on valid map at every place (H', W')."""
-    return np.asarray(box_sum(counts(valid), height, width) / (height * width), np.float64)
 
 
 def _channels(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None) -> FloatImage:

@@ -96,9 +96,8 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px:
     if not site.fully_valid and site.valid(extent, level).mean() < MIN_VALID_SHARE:
         return nothing
     gray = site.gray(extent, level)
-    # Nodata is 0 once enhanced: rivals there are weak, as with the masked NCC that a flight uses.
     region = prepared.cut(_window(plan, middle), level)
-    scores = surface(region.search, _templates(gray, noise))
+    scores = surface(region.search, _templates(gray, noise), min_overlap=MIN_VALID_SHARE)
     x, y = x0 - region.window.x0, y0 - region.window.y0
     exclusion_px = NCC.exclusion_m / (site.gsd_m_per_px * 2.0**level)
     own, rivals = _own_and_rivals(scores, x, y, exclusion_px)

@@ -11,7 +11,7 @@ from bench.inputs.scenes import flight, town_gray
 from engine import MatcherOptions, SceneMatcher, SiftOptions
 from engine.errors import OptionError
 from engine.features import match, sift
-from engine.ncc_fft import match_template, ncc, prepare
+from engine.ncc_fft import match_template, ncc, prepare, surface
 from engine.runtime.device import on_host, to_device
 from tests.support.pretended import DEVICE, Pretended, pretended_device
 from tests.support.tensors import assert_close
@@ -85,6 +85,18 @@ def test_arrays_cross_once_and_come_back_as_they_were():
 
 
 @SIZES
+def test_nodata_lowers_no_score_on_a_device_either(size, model):
+    image, valid = picture(*size, 1), np.ones(size, np.bool_)
+    valid[:, : size[1] // 12] = False
+    image[torch.from_numpy(~valid)] = 0.0
+    templates = cut(image, model, 2)[None]
+    expected = surface(prepare(image, valid=valid), templates, min_overlap=0.9)
+    with pretended_device():
+        found = surface(prepare(image.to(DEVICE), valid=valid), templates.to(DEVICE), min_overlap=0.9).cpu()
+    assert_close(found, expected, atol=2e-6, rtol=0)
+
+
+@SIZES
 def test_a_match_uploads_a_template_and_downloads_28_numbers(size, model):
     image = picture(*size, 1)
     template = cut(image, model, 2)
@@ -97,16 +109,13 @@ def test_a_match_uploads_a_template_and_downloads_28_numbers(size, model):
     assert_same_peak(found, expected)
 
 
-@pytest.mark.parametrize(("zero_mean", "masked"), [(True, False), (False, False), (True, True)])
-def test_the_surface_waits_for_the_check_of_its_arguments_alone(zero_mean, masked):
+@pytest.mark.parametrize("zero_mean", [True, False])
+def test_the_surface_waits_for_the_check_of_its_arguments_alone(zero_mean):
     windows = torch.stack([picture(70, 81, i) for i in range(2)]) + 3.0
     templates = torch.stack([torch.stack([cut(w, (20, 31), i) for i in range(3)]) for w in windows])
-    valid = torch.ones(2, 70, 81, dtype=torch.bool)
-    valid[:, :, 50:] = False
-    expected = ncc(windows, templates, zero_mean=zero_mean, search_valid=valid if masked else None)
+    expected = ncc(windows, templates, zero_mean=zero_mean)
     with pretended_device() as crossings:
-        *given, mask = (tensor.to(DEVICE) for tensor in (windows, templates, valid))
-        found = ncc(*given, zero_mean=zero_mean, search_valid=mask if masked else None)
+        found = ncc(*(tensor.to(DEVICE) for tensor in (windows, templates)), zero_mean=zero_mean)
         assert (crossings.downloads, crossings.waits) == ([2], [])
         back = found.cpu()
     assert_close(back, expected, atol=2e-6, rtol=0)
@@ -247,13 +256,9 @@ needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA d
 def test_a_gpu_makes_the_surfaces_of_float64(zero_mean):
     windows = torch.stack([picture(170, 181, i) for i in range(2)]) + 3.0
     templates = torch.stack([torch.stack([cut(w, (60, 71), i) for i in range(3)]) for w in windows])
-    valid = torch.ones(2, 170, 181, dtype=torch.bool)
-    valid[:, 100:, 140:] = False
-    for mask in (None, valid) if zero_mean else (None,):
-        expected = ncc(windows.double(), templates.double(), zero_mean=zero_mean, search_valid=mask)
-        given = None if mask is None else mask.cuda()
-        found = ncc(windows.cuda(), templates.cuda(), zero_mean=zero_mean, search_valid=given)
-        assert_close(found.cpu().double(), expected, atol=2e-5, rtol=0)
+    expected = ncc(windows.double(), templates.double(), zero_mean=zero_mean)
+    found = ncc(windows.cuda(), templates.cuda(), zero_mean=zero_mean)
+    assert_close(found.cpu().double(), expected, atol=2e-5, rtol=0)
 
 
 @needs_cuda
