@@ -182,7 +182,7 @@ def _psr(query: Query, ncc: Ncc, found: PeakCandidate) -> float:
     """Peak-to-sidelobe ratio: the peak above the mean of the rest, in standard deviations of the rest."""
     crop = level_crop(query.site, found.fix.window, found.aligned.level)
     region, template = ncc.prepared.cut(crop, found.aligned.level), found.aligned.template
-    scores = np.asarray(surface(region.search, template[None])[0])
+    scores = np.asarray(surface(replace(region.search, counts=None), template[None])[0])
     y, x = np.unravel_index(int(scores.argmax()), scores.shape)
     rows, columns = np.ogrid[: scores.shape[0], : scores.shape[1]]
     rest = scores[np.hypot(rows - y, columns - x) > _PSR_PX]

@@ -9,9 +9,16 @@ from engine.sift.values import TRAIN_CHUNK, Features, Limits, fields_of
 
 
 def nearest(query: Features, train: Features, limits: Limits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best.
+    """The nearest and the second nearest of each query.
 
-    Pairs that are not allowed have a cosine of minus infinity.
+    Args:
+        query: features of B images, or of one.
+        train: features of B images, or of one.
+        limits: on their scales.
+
+    Returns:
+        (B, N) each: the largest cosine, its slot, the second largest, and whether the query is its slot's nearest.
+        Pairs that are not allowed have a cosine of minus infinity.
     """
     found = []
     with torch.inference_mode():
