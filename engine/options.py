@@ -183,7 +183,6 @@ class NavigatorOptions:
         lost_sigma_m: uncertainty of the prediction above which the whole map is searched as well.
         memory_s: time in which the evidence of past fixes fades: however long a flight, matches that agree with
             each other outweigh it.
-        late_s: how much older than the newest frame a frame may be.
         attitude_lag_s: standard deviation of the attitude telemetry's delay before images have measured it.
         attitude_jitter_s: standard deviation of one frame's delay about the mean delay, in attitude and position.
         tilt_bias_deg: standard deviation of a lasting error in roll and in pitch before images have measured it.
@@ -201,7 +200,6 @@ class NavigatorOptions:
     risk: float = CHANCE
     lost_sigma_m: float = 100.0
     memory_s: float = 30.0
-    late_s: float = 2.0
     attitude_lag_s: float = 0.1
     attitude_jitter_s: float = 0.03
     tilt_bias_deg: float = 1.0

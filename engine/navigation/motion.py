@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,14 +35,6 @@ class Step:
     sigma_mps: float
     noise_m2: float
 
-    def part(self, begin: float, end: float) -> Step:
-        """The part between two shares, in [0, 1], of the way."""
-        known, share = self.begin_mps, end - begin
-        turn_mps = np.zeros(2) if known is None else self.end_mps - known
-        first_mps = None if known is None else known + begin * turn_mps
-        last_mps = self.end_mps - (1.0 - end) * turn_mps
-        return Step(share * self.moved_m, first_mps, last_mps, self.sigma_mps, share * self.noise_m2)
-
 
 @dataclass(frozen=True, slots=True)
 class Ways:
@@ -58,11 +49,6 @@ class Ways:
     interval_s: float
     told: Step | None = None
     seen: Step | None = None
-
-    def part(self, begin: float, end: float) -> Ways:
-        """The part between two shares, in [0, 1], of the way."""
-        told, seen = (step and step.part(begin, end) for step in (self.told, self.seen))
-        return Ways((end - begin) * self.interval_s, told, seen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +98,7 @@ class GroundMotion:
 
 
 class FrameClock:
-    """Orders the frames in time and integrates the telemetry's velocity between them.
+    """Times the frames and integrates the telemetry's velocity between them.
 
     Args:
         options: of the navigator.
@@ -120,33 +106,21 @@ class FrameClock:
 
     def __init__(self, options: NavigatorOptions) -> None:
         self._options = options
-        self._stamps: deque[int] = deque()  # of the last late_s
         self._newest_ns: int | None = None
         self._told_mps: Array | None = None  # with the newest frame
 
-    def is_late(self, frame: Frame) -> bool:
-        """Whether a frame is older than the newest one.
+    def interval_s(self, frame: Frame) -> float:
+        """Time from the newest frame to this one.
 
         Raises:
-            TelemetryError: it came before, or is older than ``late_s``.
+            TelemetryError: it is not newer.
         """
         stamp, newest = frame.timestamp_ns, self._newest_ns
-        if stamp is None or newest is None or stamp > newest:
-            return False
-        if stamp in self._stamps:
-            raise TelemetryError(f"timestamp_ns: expected a frame that did not come before, got {stamp} again")
-        min_stamp_ns = newest - round(self._options.late_s * 1e9)
-        if stamp < min_stamp_ns:
-            raise TelemetryError(
-                f"timestamp_ns: expected {min_stamp_ns} or later ({newest} was the newest frame), got {stamp}"
-            )
-        return True
-
-    def interval_s(self, frame: Frame) -> float:
-        """Time from the newest frame to this one; negative for a late one."""
-        if frame.timestamp_ns is None or self._newest_ns is None:
+        if stamp is None or newest is None:
             return self._options.default_interval_s
-        return (frame.timestamp_ns - self._newest_ns) * 1e-9
+        if stamp <= newest:
+            raise TelemetryError(f"timestamp_ns: expected later than the last frame's {newest}, got {stamp}")
+        return (stamp - newest) * 1e-9
 
     def told(self, frame: Frame) -> Step | None:
         """The way to a new frame by the velocities that came with it and with the newest.
@@ -170,13 +144,8 @@ class FrameClock:
 
     def append(self, frame: Frame) -> None:
         """Add a frame that was matched."""
-        stamp, newest = frame.timestamp_ns, self._newest_ns
-        if stamp is not None:
-            self._stamps.append(stamp)
-            if newest is not None and stamp <= newest:
-                return  # late
-            self._newest_ns = stamp
-            self._stamps = deque(known for known in self._stamps if known >= stamp - self._options.late_s * 1e9)
+        if frame.timestamp_ns is not None:
+            self._newest_ns = frame.timestamp_ns
         self._told_mps = velocity_of(frame)
 
 

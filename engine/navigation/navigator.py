@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -25,7 +24,7 @@ from engine.navigation.motion import (
     velocity_of,
 )
 from engine.navigation.odometry import VisualOdometry, odometry_of
-from engine.navigation.repeats import Repeats
+from engine.navigation.repeats import Picture
 from engine.navigation.state import NavigatorState
 from engine.navigation.telemetry_errors import Calibration, TelemetryErrors, considered
 from engine.navigation.tracks import MISS, RELIABLE, Match, Track, Tracks, Weighed
@@ -36,10 +35,11 @@ from engine.values import Fix, Frame, NoFix, Prior, Reason
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    """The flight at one frame: its time, the way to it, and the tracks after it."""
+    """The flight at one frame: its time, the way to it, its picture, and the tracks after it."""
 
     time_s: float
     ways: Ways
+    picture: Picture
     tracks: Tracks
 
 
@@ -90,9 +90,8 @@ class Navigator:
         self._errors = TelemetryErrors(o, assumed)
         self._pictures = odometry_of(matcher) if o.odometry else None
         self._motion: GroundMotion | None = None  # up to the newest frame
-        self._repeats = Repeats()
         self._start = None if start is None else position_of(start, matcher.site)
-        self._moments: deque[_Moment] = deque()  # of the last late_s
+        self._last: _Moment | None = None
         self._accepted: _Accepted | None = None
         self._refusals = self._frames_lost = 0  # in a row
         self._fixed = self._lost = False  # whether the newest frame was fixed; whether the flight is lost
@@ -120,7 +119,9 @@ class Navigator:
     @property
     def anchor_age_s(self) -> float | None:
         """Age of the last fix when the newest frame was taken, or None before the first."""
-        return None if self._accepted is None else self._moments[-1].time_s - self._accepted.time_s
+        if self._last is None or self._accepted is None:
+            return None
+        return self._last.time_s - self._accepted.time_s
 
     @property
     def healthy(self) -> bool:
@@ -136,9 +137,9 @@ class Navigator:
     @property
     def prediction(self) -> Prior | None:
         """Dead reckoning at the newest frame with its uncertainty; None without a start or a fix."""
-        if not self._moments:
+        if self._last is None:
             return None
-        tracks, last = self._moments[-1].tracks, self._accepted
+        tracks, last = self._last.tracks, self._accepted
         track = tracks.best if last is None else tracks.of(last.number) or tracks.best
         if track is None:
             return None
@@ -158,47 +159,41 @@ class Navigator:
         """The fix of the next frame.
 
         Args:
-            frame: the newest, or one late by at most ``late_s``. A late frame is matched where the vehicle was
-                then, and does not turn back the navigator's state.
+            frame: newer than every frame before it.
             prior: this frame's position from a source other than the map. The search centres on it if it is
                 tighter than dead reckoning; else it is evidence for or against a place that no track predicts.
             budget: of this frame; replaces the navigator's.
 
         Raises:
-            TelemetryError: the frame came before, or is older than ``late_s``.
+            TelemetryError: the frame is not newer than the last one.
             CalibrationError: the frame is not of the camera's resolution.
         """
         clock, budget = Deadline(Budget()), budget or self._budget
-        late = self._clock.is_late(frame)
-        self._motion = None if late or self._pictures is None else self._seen_motion(self._pictures, frame)
-        moment = self._past(frame) if late else self._next(frame)
-        repeated = None if late else self._repeats.refusal(frame, moment.ways)
+        moment = self._next(frame)
+        repeated = moment.picture.refusal(frame)
         if repeated is not None:
-            self._take(frame, moment)
-            self._fixed = False
-            self._note_loss(moment.tracks)
+            self._take(frame, moment, is_fixed=False)
             return repeated
-        searched, is_given = self._searched(moment.tracks, prior, late=late)
-        shown = self._errors.corrected(frame, moment.time_s, late=late, refusals=self._refusals)
+        searched, is_given = self._searched(moment.tracks, prior)
+        shown = self._errors.corrected(frame, moment.time_s, self._refusals)
         left = budget and budget.after(clock.elapsed_ms if self._pictures else 0.0)
         result = self._matcher.locate(self._with_height(shown), searched, left)
         if isinstance(result, Fix):
             result = considered(result, frame, shown, getattr(self._matcher, "camera", None))
             if not is_valid(result):
                 result = result.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
-        self._take(frame, None if late else moment)
+        tracks = moment.tracks
         if isinstance(result, Fix):
             given = None if prior is None else position_of(prior, self._matcher.site)
             match = self._match(result, frame, moment.ways.seen, searched, given, is_about_given=is_given)
-            result = self._judge(match, moment, late=late)
-        elif not late and result.reason is not Reason.LATE:  # a lack of time is no evidence about the position
+            weighed = tracks.weighed(match)
+            result, tracks = self._judged(result, weighed, moment), weighed.tracks
+        elif result.reason is not Reason.LATE:  # a lack of time is no evidence about the position
             self._refusals += 1
-            self._moments[-1] = replace(moment, tracks=moment.tracks.missed())
-        if not late:
-            self._fixed = isinstance(result, Fix)
-            if isinstance(result, Fix):
-                self._errors.note(result, self._ground_below(result))
-            self._note_loss(self._moments[-1].tracks)
+            tracks = tracks.missed()
+        if isinstance(result, Fix):
+            self._errors.note(result, self._ground_below(result))
+        self._take(frame, replace(moment, tracks=tracks), is_fixed=isinstance(result, Fix))
         return result
 
     # ------------------------------------------------------------------------------------------ predictions
@@ -210,42 +205,35 @@ class Navigator:
 
     def _next(self, frame: Frame) -> _Moment:
         """A new frame, by what was known before."""
-        if not self._moments:
+        interval_s, last = self._clock.interval_s(frame), self._last
+        self._motion = motion = None if self._pictures is None else self._seen_motion(self._pictures, frame)
+        if last is None:
             tracks, start = Tracks(self._options), self._start
-            return _Moment(0.0, Ways(0.0), tracks.begun(start, self._velocity(frame)) if start else tracks)
-        last, interval_s, motion = self._moments[-1], self._clock.interval_s(frame), self._motion
+            begun = tracks.begun(start, self._velocity(frame)) if start else tracks
+            return _Moment(0.0, Ways(0.0), Picture.of(frame), begun)
         seen = None
         if motion is not None and math.isclose(motion.interval_s, interval_s, abs_tol=1e-6):
             seen = motion.step(None if last.ways.seen is None else last.ways.seen.end_mps)
         ways = Ways(interval_s, self._clock.told(frame), seen)  # not seen if a frame in between failed
-        return _Moment(last.time_s + interval_s, ways, last.tracks.carried(ways))
+        return _Moment(last.time_s + interval_s, ways, last.picture.next(frame, ways), last.tracks.carried(ways))
 
-    def _past(self, frame: Frame) -> _Moment:
-        """A late frame, by what was known when the newest frame before it had been matched."""
-        time_s = self._moments[-1].time_s + self._clock.interval_s(frame)
-        known = [each for each in self._moments if each.time_s <= time_s]
-        if not known:
-            return replace(self._moments[0], time_s=time_s)
-        last, after = known[-1], self._moments[len(known)]
-        share = (time_s - last.time_s) / after.ways.interval_s
-        return replace(last, time_s=time_s, tracks=last.tracks.carried(after.ways.part(0.0, share)))
-
-    def _take(self, frame: Frame, moment: _Moment | None) -> None:
-        """Add a frame that was matched, and its moment unless it is late."""
+    def _take(self, frame: Frame, moment: _Moment, *, is_fixed: bool) -> None:
+        """Continue from a frame, and declare the flight lost after too many refusals or too much uncertainty."""
         self._clock.append(frame)
-        if moment is None:
+        self._last, self._fixed = moment, is_fixed
+        track = moment.tracks.best
+        if is_fixed or track is None:
             return
-        self._repeats.take()
-        self._moments.append(moment)
-        while len(self._moments) > 2 and self._moments[1].time_s < moment.time_s - self._options.late_s:
-            self._moments.popleft()
+        self._frames_lost += self._lost
+        if not self._lost and (track.is_lost or self._is_vague(track)):
+            self._lost = True
+            self._errors.forget()  # a wrong or outdated bias would keep frames refused
 
-    def _searched(self, tracks: Tracks, prior: Prior | None, *, late: bool) -> tuple[Prior | None, bool]:
+    def _searched(self, tracks: Tracks, prior: Prior | None) -> tuple[Prior | None, bool]:
         """Where the matcher searches: about the best track, or the other source if that is tighter (True)."""
         own, track, map_m = None, tracks.sought, map_sigma_of(self._matcher.site)
         if track is not None and not self._leads_nowhere(track):
-            moved_m = None if late else track.moved_m
-            own = track.estimate.prior(track.widened, moved_m, 0.0 if track.fix else map_m)
+            own = track.estimate.prior(track.widened, track.moved_m, 0.0 if track.fix else map_m)
         misled = self._refusals * MISS >= RELIABLE and self._is_turn(self._refusals)
         if prior is None or misled or (own is not None and own.sigma_m <= prior.sigma_m):
             return own, False
@@ -310,15 +298,12 @@ class Navigator:
         told_mps = velocity_of(frame)
         return None if told_mps is None else (told_mps, self._clock.sigma_mps(frame))
 
-    def _judge(self, match: Match, moment: _Moment, *, late: bool) -> Fix | NoFix:
-        """The fix if there is enough evidence for it; otherwise its account is remembered and it is refused."""
-        fix, weighed = match.fix, moment.tracks.weighed(match)
+    def _judged(self, fix: Fix, weighed: Weighed, moment: _Moment) -> Fix | NoFix:
+        """The fix if there is enough evidence for it; otherwise it is refused."""
         if weighed.log_odds >= needed_nats(self._options.risk):
-            self._accept(fix, weighed, moment, late=late)
+            self._accept(fix, weighed.number, moment.time_s)
             return fix
-        if not late:
-            self._refusals += 1
-            self._moments[-1] = replace(moment, tracks=weighed.tracks)
+        self._refusals += 1
         best = moment.tracks.best
         if best is not None and self._is_known(best) and best.estimate.chi_square(fix) > self._options.gate:
             return replace(best.estimate.refusal(fix), match=fix)
@@ -332,37 +317,11 @@ class Navigator:
         known = track.fix is None or track.log_odds >= needed_nats(self._options.risk)
         return known and not self._is_vague(track)
 
-    def _accept(self, fix: Fix, weighed: Weighed, moment: _Moment, *, late: bool) -> None:
-        """Continue from this fix; a late one counts if it is newer than the last fix."""
+    def _accept(self, fix: Fix, number: int, time_s: float) -> None:
+        """Continue from this fix, which belongs to an account of this number."""
         last = self._accepted
-        if late:
-            if last is not None and moment.time_s < last.time_s:
-                return
-            self._replay(replace(moment, tracks=weighed.tracks))
-        else:
-            self._moments[-1] = replace(moment, tracks=weighed.tracks)
-        jump = last is not None and (self._lost or weighed.number != last.number)
-        self._resets += jump
-        if jump:  # what was learnt came from a wrong position
-            self._errors.forget()
-        self._accepted = _Accepted(fix, moment.time_s, weighed.number)
+        if last is not None and (self._lost or number != last.number):  # a jump
+            self._resets += 1
+            self._errors.forget()  # what was learnt came from a wrong position
+        self._accepted = _Accepted(fix, time_s, number)
         self._refusals, self._frames_lost, self._lost = 0, 0, False
-
-    def _replay(self, moment: _Moment) -> None:
-        """Carry the tracks of a late frame to the newest."""
-        tracks = moment.tracks
-        for k, after in enumerate(self._moments):
-            if after.time_s > moment.time_s:
-                left_s = min(after.time_s - moment.time_s, after.ways.interval_s)
-                tracks = tracks.carried(after.ways.part(1.0 - left_s / (after.ways.interval_s or 1.0), 1.0))
-                self._moments[k] = replace(after, tracks=tracks)
-
-    def _note_loss(self, tracks: Tracks) -> None:
-        """Declare the flight lost after too many refusals or too much uncertainty."""
-        track = tracks.best
-        if self._fixed or track is None:
-            return
-        self._frames_lost += self._lost
-        if not self._lost and (track.is_lost or self._is_vague(track)):
-            self._lost = True
-            self._errors.forget()  # a wrong or outdated bias would keep frames refused

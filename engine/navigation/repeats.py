@@ -15,37 +15,39 @@ _SAMPLES = 1 << 16  # pixels of a picture that enter its digest
 
 
 @dataclass(frozen=True, slots=True)
-class _Picture:
-    """The last new picture: its digest, and the time and way since then; None if the way was not measured."""
+class Picture:
+    """The last new picture. Its digest is kept in its place, since buffers are reused.
 
-    digest: tuple[object, ...] | None
+    Attributes:
+        digest: of its pixels.
+        since_s: time since then.
+        moved_m: (2,) way since then, east and north; None if it was not measured.
+    """
+
+    digest: tuple[object, ...]
     since_s: float
     moved_m: Array | None
 
+    @classmethod
+    def of(cls, frame: Frame) -> Picture:
+        """The frame's own, as a new one."""
+        return cls(_digest(frame), 0.0, np.zeros(2))
 
-class Repeats:
-    """Remembers the last new picture by its digest, since buffers are reused, and the way since then."""
+    def next(self, frame: Frame, ways: Ways) -> Picture:
+        """The last new picture at the next frame, which this is the way to."""
+        new, step = Picture.of(frame), ways.told or ways.seen
+        if new.digest != self.digest:
+            return new
+        moved_m = None if step is None or self.moved_m is None else self.moved_m + step.moved_m
+        return Picture(self.digest, self.since_s + ways.interval_s, moved_m)
 
-    def __init__(self) -> None:
-        self._last = self._next = _Picture(None, 0.0, None)
-
-    def refusal(self, frame: Frame, ways: Ways) -> NoFix | None:
-        """Refuse a picture that repeats the last one although the vehicle has moved since; else None."""
-        last, digest, step = self._last, _digest(frame), ways.told or ways.seen
-        if digest != last.digest:
-            self._next = _Picture(digest, 0.0, np.zeros(2))
+    def refusal(self, frame: Frame) -> NoFix | None:
+        """Refuse a frame that repeats it although the vehicle has moved since; else None."""
+        moved_m = 0.0 if self.moved_m is None else float(np.hypot(*self.moved_m))
+        if moved_m < _MIN_M:
             return None
-        moved_m = None if step is None or last.moved_m is None else last.moved_m + step.moved_m
-        self._next = _Picture(digest, last.since_s + ways.interval_s, moved_m)
-        if moved_m is None or np.hypot(*moved_m) < _MIN_M:
-            return None
-        ago = f"{self._next.since_s:.1f} s and {np.hypot(*moved_m):.1f} m ago"
-        detail = f"the picture repeats the one {ago}"
+        detail = f"the picture repeats the one {self.since_s:.1f} s and {moved_m:.1f} m ago"
         return NoFix(reason=Reason.FAILED, detail=detail, timestamp_ns=frame.timestamp_ns)
-
-    def take(self) -> None:
-        """Remember the picture last asked about: its frame was matched."""
-        self._last = self._next
 
 
 def _digest(frame: Frame) -> tuple[object, ...]:

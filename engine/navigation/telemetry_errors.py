@@ -139,20 +139,17 @@ class TelemetryErrors:
         (roll, pitch, heading), (a, b, c) = self._mean[_ANGLES].tolist(), sigmas[_ANGLES].tolist()
         return Bias(roll, pitch, heading, (a, b, c))
 
-    def corrected(self, frame: Frame, time_s: float, *, late: bool, refusals: int = 0) -> Frame:
+    def corrected(self, frame: Frame, time_s: float, refusals: int = 0) -> Frame:
         """The frame with the attitude at its capture and the height that pictures measured.
 
         If frames are refused, heading and height may be off by more than a match tolerates. Then both are
         searched, less often each time that fails, and after a fix until enough fixes have confirmed them.
 
         Args:
-            frame: the newest, or a late one.
-            time_s: time of the newest frame on any one clock.
-            late: whether the frame is a late one, whose turn rates are unknown.
+            frame: the newest.
+            time_s: its time on any one clock.
             refusals: number of refusals in a row before it.
         """
-        if late:
-            return self.without_errors(frame)
         self._follow(frame, time_s)
         turn = self._turn
         shown = self.without_errors(frame, _NO_RATES_DPS if turn is None else turn.angles_deg / turn.interval_s)
@@ -179,7 +176,7 @@ class TelemetryErrors:
         """A frame without the errors known so far; what is not known of them widens its standard deviations.
 
         Args:
-            frame: the newest or a late one.
+            frame: the newest.
             rates_dps: (3,) of roll, pitch and heading; 0 if they are unknown.
 
         Returns:

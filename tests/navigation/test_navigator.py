@@ -247,48 +247,14 @@ def test_its_state_and_age_are_told():
 # Stamps
 
 
-@pytest.mark.parametrize("stamp", [3.0, 1.0, 0.9, 0.0])
-def test_a_frame_that_came_before_or_is_too_old_is_an_error_and_changes_nothing(stamp):
+@pytest.mark.parametrize("stamp", [3.0, 2.9, 0.0])
+def test_a_frame_that_is_not_newer_is_an_error_and_changes_nothing(stamp):
     run = flown((10.0, 20.0), (10.0, 20.0), None, seconds=[1.0, 3.0])
-    again = r"a frame that did not come before, got \d+ again"
-    old = r"1000000000 or later \(3000000000 was the newest frame\), got "
-    with pytest.raises(TelemetryError, match=rf"^timestamp_ns: expected {again if stamp >= 1.0 else old}"):
+    with pytest.raises(TelemetryError, match=r"^timestamp_ns: expected later than the last frame's 3000000000"):
         run.navigator.update(at(stamp, STILL))
     assert len(run.priors) == 2
     run.navigator.update(at(4.0, STILL))
     assert_prior(run.priors[2], 10.0, 20.0, pytest.approx(math.hypot(1.0, drift_m(1.0)), rel=0.1))
-
-
-def test_a_late_frame_is_matched_where_the_vehicle_was_and_moves_nothing_back():
-    """Half way between frames at 10 m and 14 m east."""
-    places = (10.0, 20.0), (14.0, 20.0), (12.2, 20.0), None
-    run = flown(*places, seconds=[1.0, 2.0, 1.5, 3.0], velocity=(4.0, 0.0))
-    assert run.fixed == [0, 1, 2]
-    sigma_m = math.hypot(1.0, 0.25, 0.5 * math.sqrt(1.5), 0.03 * 4.0)  # of half the way, and of the stamps
-    assert_prior(run.priors[2], 12.0, 20.0, sigma_m, moved=(0.0, 0.0))
-    newest = run.predictions[2]
-    assert_prior(run.priors[3], newest.east_m + 4.0, 20.0, pytest.approx(math.hypot(1.0, drift_m(1.0)), rel=0.1))
-
-
-def test_a_late_fix_that_is_newer_than_the_last_one_is_applied_at_its_capture_time():
-    """The frame of second 2 was refused; one of 1.5 s says that the vehicle is 1 m north of dead reckoning."""
-    places = (10.0, 20.0), None, (12.0, 21.0), None
-    run = flown(*places, seconds=[1.0, 2.0, 1.5, 3.0], velocity=(4.0, 0.0))
-    assert run.ends[2] == "fix"
-    predicted = run.predictions[2]
-    assert (predicted.east_m, predicted.north_m) == pytest.approx((14.0, 21.0), abs=0.1)
-    assert predicted.sigma_m < 1.4  # 2.0 without it
-    assert run.ages_s[2] == pytest.approx(0.5)
-    assert run.priors[3].east_m == pytest.approx(predicted.east_m + 4.0, abs=0.1)
-
-
-def test_a_late_frame_that_contradicts_the_track_is_refused_and_counts_for_nothing():
-    places = (10.0, 20.0), (10.0, 20.0), (90.0, 20.0), None, None
-    run = flown(*places, seconds=[1.0, 2.0, 1.5, 1.2, 3.0])
-    assert run.ends[2:4] == ["inconsistent", "low_score"]
-    assert run.states[3] == "TRACKING"
-    before = run.predictions[3]
-    assert_prior(run.priors[4], 10.0, 20.0, pytest.approx(math.hypot(before.sigma_m, drift_m(1.0)), rel=0.1))
 
 
 # What is handed on

@@ -266,7 +266,7 @@ def test_odometry_flies_at_the_height_that_fixes_showed(monkeypatch):
     errors, flown = navigator._errors, frame(picture((0.0, 0.0)))
     higher = a_fix(up_m=1.2 * HEIGHT_M)
     for _ in range(5):
-        errors.corrected(flown, 0.0, late=False)
+        errors.corrected(flown, 0.0)
         errors.note(higher, 0.0)
     for k in range(2):
         navigator.update(frame(picture((5.0 * k, 0.0)), k * INTERVAL_S))

@@ -1,4 +1,4 @@
-"""Lasting errors of the telemetry: learnt from fixes within their own sigmas, taken off new and late frames."""
+"""Lasting errors of the telemetry: learnt from fixes within their own sigmas, taken off new frames."""
 
 import math
 from dataclasses import replace
@@ -53,7 +53,7 @@ def flown(off=(0.0, 0.0, 0.0), *, lag_s=0.0, off_m=0.0, frames=100, seed=1, nois
     errors, rng, shown = TelemetryErrors(options or NavigatorOptions()), np.random.default_rng(seed), []
     for k in range(frames):
         time_s = k * INTERVAL_S
-        shown.append(errors.corrected(frame_at(time_s, off, lag_s, off_m, **changes), time_s, late=False))
+        shown.append(errors.corrected(frame_at(time_s, off, lag_s, off_m, **changes), time_s))
         up_m = GROUND_M + HEIGHT_M + rng.normal(0.0, 0.5) if measured else None
         errors.note(fix_of(angles(time_s) + rng.normal(0.0, noise_deg, 3), up_m), ground_m)
     return errors, shown
@@ -63,7 +63,7 @@ def taught(frames, attitude_at):
     """What is learnt of frames at times, whose fixes measure these attitudes exactly."""
     errors = TelemetryErrors(NavigatorOptions())
     for time_s, frame in frames:
-        errors.corrected(frame, time_s, late=False)
+        errors.corrected(frame, time_s)
         errors.note(fix_of(attitude_at(time_s)), GROUND_M)
     return errors.calibration
 
@@ -126,7 +126,7 @@ def test_a_calm_flight_is_as_it_was():
     errors = TelemetryErrors(NavigatorOptions())
     for k in range(5):
         frame = replace(CALM, timestamp_ns=k * 100_000_000)
-        assert errors.corrected(frame, 0.1 * k, late=False) is frame
+        assert errors.corrected(frame, 0.1 * k) is frame
         errors.note(fix_of((0.0, 0.0, 40.0)), GROUND_M)
 
 
@@ -159,8 +159,8 @@ def test_frames_far_apart_have_no_rate_and_stamps_of_another_unit_a_bounded_one(
     errors = TelemetryErrors(NavigatorOptions())
     for k in range(4):
         frame = frame_at(2.0 * k, lag_s=0.1)
-        assert errors.corrected(frame, 2.0 * k, late=False) is frame
-    turned = errors.corrected(frame_at(6.2, timestamp_ns=6_000_000_200), 6.2, late=False)  # that was milliseconds
+        assert errors.corrected(frame, 2.0 * k) is frame
+    turned = errors.corrected(frame_at(6.2, timestamp_ns=6_000_000_200), 6.2)  # that was milliseconds
     assert turned.tilt_sigma_deg <= 181.0
     assert turned.heading_sigma_deg <= 181.0
 
@@ -180,7 +180,7 @@ def test_a_bias_that_changes_is_followed():
 
 def test_one_wild_attitude_moves_it_by_little():
     errors, _ = flown(noise_deg=0.0)
-    errors.corrected(frame_at(10.0), 10.0, late=False)
+    errors.corrected(frame_at(10.0), 10.0)
     errors.note(fix_of(angles(10.0) + np.array([20.0, -20.0, 90.0])), GROUND_M)
     known = errors.calibration.attitude
     assert max(abs(known.roll_deg), abs(known.pitch_deg)) < 0.5
@@ -190,9 +190,9 @@ def test_one_wild_attitude_moves_it_by_little():
 @pytest.mark.parametrize(("stage", "noise_deg"), [("refined", 0.6), ("fine", 2.0)])
 def test_an_unsure_attitude_counts_less(stage, noise_deg):
     errors = TelemetryErrors(NavigatorOptions())
-    errors.corrected(CALM, 0.0, late=False)
+    errors.corrected(CALM, 0.0)
     errors.note(fix_of((2.0, 0.0, 40.0), stage=stage), GROUND_M)
-    errors.corrected(CALM, 0.0, late=False)
+    errors.corrected(CALM, 0.0)
     assert errors.calibration.attitude.roll_deg == pytest.approx(2.0 / (1.0 + noise_deg**2), rel=1e-6)  # by hand
 
 
@@ -234,7 +234,7 @@ def is_doubted(frame):
 def refused(frames, frame=CALM):
     """In which of so many frames that are all refused heading and height are doubted."""
     errors = TelemetryErrors(NavigatorOptions())
-    shown = [errors.corrected(frame, 0.2 * k, late=False, refusals=k) for k in range(frames)]
+    shown = [errors.corrected(frame, 0.2 * k, refusals=k) for k in range(frames)]
     return errors, [k for k, one in enumerate(shown) if is_doubted(one)]
 
 
@@ -252,7 +252,7 @@ def test_after_a_fix_frames_are_doubted_until_three_fixes_settled_what_is_off():
     doubted = []
     for k in range(6):
         errors.note(fix_of((0.0, 0.0, 30.0)), GROUND_M)
-        shown = errors.corrected(CALM, 1.0 + 0.2 * k, late=False)
+        shown = errors.corrected(CALM, 1.0 + 0.2 * k)
         doubted.append(is_doubted(shown))
     assert doubted == [True, True, False, False, False, False]
     assert shown.heading_deg == pytest.approx(30.0, abs=0.6)
@@ -266,17 +266,9 @@ def test_nothing_is_known_before_a_fix_nor_after_a_jump():
         assert (found.attitude, found.height_m, found.height_factor, found.height_sigma_m) == (None,) * 4
 
 
-def test_a_late_frame_is_corrected_and_teaches_nothing():
-    errors, _ = flown((0.0, 0.0, 8.0))
-    before = errors.calibration
-    shown = errors.corrected(replace(CALM, timestamp_ns=0), 0.0, late=True)
-    assert shown.heading_deg == pytest.approx(32.0, abs=0.6)
-    assert errors.calibration == before
-
-
-def test_the_navigator_takes_it_off_new_and_late_frames_and_forgets_it_when_it_leads_nowhere():
+def test_the_navigator_takes_it_off_new_frames_and_forgets_it_when_it_leads_nowhere():
     measured = fix_of((0.0, 0.0, -6.0), HEIGHT_M)
-    matcher = ScriptedMatcher(*[measured] * 31, *[None] * 15, site=a_site(ground_at=lambda _: 0.0))
+    matcher = ScriptedMatcher(*[measured] * 30, *[None] * 15, site=a_site(ground_at=lambda _: 0.0))
 
     def level_at(time_s):
         return replace(at(time_s, (0.0, 0.0), HEIGHT_M), roll_deg=0.0, pitch_deg=0.0)
@@ -285,8 +277,6 @@ def test_the_navigator_takes_it_off_new_and_late_frames_and_forgets_it_when_it_l
     for k in range(30):
         navigator.update(level_at(0.1 * k))
     assert navigator.calibration.attitude.heading_deg == pytest.approx(-6.0, abs=0.3)
-    assert matcher.frames[-1].heading_deg == pytest.approx(354.0, abs=0.3)
-    navigator.update(level_at(2.55))  # a late one
     assert matcher.frames[-1].heading_deg == pytest.approx(354.0, abs=0.3)
     for k in range(15):
         navigator.update(level_at(3.0 + 0.1 * k))

@@ -134,10 +134,13 @@ def test_a_covariance_stays_one_whatever_happens(legs):
 
 
 def test_a_way_in_two_parts_is_the_whole_way():
-    step = Step(np.array([10.0, 0.0]), np.array([4.0, 0.0]), np.array([6.0, 2.0]), 0.5, 0.3)
-    ways, track = Ways(2.0, told=step), a_track(velocity=(3.0, 1.0))
-    whole = track.carried(ways, OPTIONS)
-    parts = track.carried(ways.part(0.0, 0.3), OPTIONS).carried(ways.part(0.3, 1.0), OPTIONS)
+    begin, between, end = np.array([[4.0, 0.0], [4.6, 0.6], [6.0, 2.0]])
+    whole = a_track(velocity=(3.0, 1.0)).carried(
+        Ways(2.0, told=Step(np.array([10.0, 0.0]), begin, end, 0.5, 0.3)), OPTIONS
+    )
+    parts = a_track(velocity=(3.0, 1.0))
+    parts = parts.carried(Ways(0.6, told=Step(np.array([3.0, 0.0]), begin, between, 0.5, 0.09)), OPTIONS)
+    parts = parts.carried(Ways(1.4, told=Step(np.array([7.0, 0.0]), between, end, 0.5, 0.21)), OPTIONS)
     assert parts.en_m == pytest.approx(whole.en_m)
     assert parts.velocity_mps == pytest.approx(whole.velocity_mps)
     assert parts.covariance == pytest.approx(whole.covariance)
@@ -349,7 +352,7 @@ def test_a_right_velocity_costs_no_fix_and_is_believed(rate_hz):
     for seed in range(6):
         refused, navigator = measured(rate_hz=rate_hz, seed=seed)
         assert refused == 0
-        assert navigator._moments[-1].tracks.best.trusts_velocity
+        assert navigator._last.tracks.best.trusts_velocity
 
 
 @pytest.mark.parametrize("fault", FAULTS)

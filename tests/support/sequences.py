@@ -1,6 +1,6 @@
 """Sequences of frames as nobody should send them, flown over a tiny map.
 
-Gaps, duplicates, reordered and backward stamps, NaN priors, flat, black and saturated frames, wrong shapes and
+Gaps, duplicate and backward stamps, NaN priors, flat, black and saturated frames, wrong shapes and
 types, impossible telemetry.
 """
 
