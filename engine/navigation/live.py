@@ -24,7 +24,7 @@ _log = logging.getLogger("scenematch")
 
 _JOIN_S = 5.0  # closing waits this long for abandoned workers, then leaves them behind
 _MAX_MS = 60_000.0  # of any wait in flight
-_LOOK_S = 0.02  # polling interval of a clock of another speed while something is due
+_LOOK_S = 0.02  # longest wait while something is due, since a simulator's clock may be faster
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,8 +33,8 @@ class LiveOptions:
 
     Attributes:
         deadline_ms: age since capture by which a frame is answered.
-        patience_ms: time beyond the deadline after which a worker counts as hanging and is replaced. A worker that
-            creates its navigator has this long from its start, doubled after each that hung while creating one.
+        patience_ms: time beyond the deadline after which a worker counts as hanging and is replaced; also the
+            pause after a navigator could not be created.
         realtime: how to schedule the worker and the watchdog; None leaves scheduling unchanged.
     """
 
@@ -89,7 +89,7 @@ class Live:
 
     Args:
         make_navigator: creates a navigator that starts at a prior, or anywhere if that is None; called once by the
-            constructor, and by every replacement worker in its own thread.
+            constructor, and in a worker's thread after the last one died or hung.
         deliver: called with each answer, one at a time, from one of the engine's threads.
         start: where the flight begins.
         options: settings.
@@ -122,8 +122,6 @@ class Live:
         self._waiting: _Job | None = None
         self._working: _Job | None = None
         self._number = 0  # of the current worker
-        self._creating_since_ns: int | None = None  # start of creation; None with a navigator or in a pause
-        self._hung_creations = 0  # in a row
         self._counts = dict.fromkeys(Counts.__dataclass_fields__, 0)
         self._closed = False
         self._threads: list[threading.Thread] = []
@@ -183,16 +181,12 @@ class Live:
 
     def _work(self, navigator: Navigator | None, number: int) -> None:
         """The worker: takes the newest frame, matches it, and delivers the result if it is not too late."""
-        if navigator is None:
-            navigator = self._create_navigator(number)
-        if navigator is None:
-            self._replace(number)
-            return
         load = LoadWatch(self._options.realtime)
         while True:
+            navigator = navigator or self._create_navigator()
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting is not None or self._closed or self._number != number)
-                if self._waiting is None or self._number != number:
+                if self._waiting is None or self._number != number or navigator is None:
                     return
                 job, self._working, self._waiting = self._waiting, self._waiting, None
                 self._changed.notify_all()
@@ -208,23 +202,20 @@ class Live:
                     self._last = (result, job.captured_ns, navigator)
             self._answer(job, result)
             if not alive:
-                self._replace(number)
-                return
+                navigator = None
+                with self._changed:
+                    self._counts["workers_replaced"] += 1
 
-    def _create_navigator(self, number: int) -> Navigator | None:
-        """A navigator that starts at the last fix; None, after a pause, if creating it failed."""
-        navigator = None
-        try:
-            navigator = self._make_navigator(self._resume())
-        except Exception:
-            _log.exception("make_navigator failed; tried again after %g ms", self._options.patience_ms)
-        with self._changed:
-            if self._number == number:  # not replaced meanwhile
-                self._creating_since_ns, self._hung_creations = None, 0
-            if navigator is None:
-                pause_s = self._options.patience_ms * 1e-3
-                self._changed.wait_for(lambda: self._closed or self._number != number, timeout=pause_s)
-        return navigator
+    def _create_navigator(self) -> Navigator | None:
+        """A navigator that starts at the last fix; one that fails is tried again after a pause, until closing."""
+        while not self._closed:
+            try:
+                return self._make_navigator(self._resume())
+            except Exception:
+                _log.exception("make_navigator failed; tried again after %g ms", self._options.patience_ms)
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed, timeout=self._options.patience_ms * 1e-3)
+        return None
 
     def _match(self, navigator: Navigator, job: _Job) -> tuple[Result, bool]:
         """The result of one frame, and whether the navigator is still usable."""
@@ -254,10 +245,8 @@ class Live:
                     self._waiting = None
                 if not due and not hung:
                     left_ms = min([hangs_in_ms, *(self._options.deadline_ms - self._age_ms(job) for job in jobs)])
-                    wait_s = max(left_ms, 0.0) * 1e-3 if math.isfinite(left_ms) else None
-                    if wait_s is not None and {self._clock_ns, self._machine_ns} != {time.monotonic_ns}:
-                        wait_s = min(wait_s, _LOOK_S)
-                    self._changed.wait(wait_s)
+                    wait_s = min(max(left_ms, 0.0) * 1e-3, _LOOK_S)
+                    self._changed.wait(wait_s if math.isfinite(left_ms) else None)
                     continue
             for job in due:
                 self._answer(job, _refusal(job, Reason.LATE, "no answer by the deadline"))
@@ -265,15 +254,11 @@ class Live:
                 self._replace(number)
 
     def _hangs_in_ms(self) -> float:
-        """Time until the worker counts as hanging, on an answered frame or while creating its navigator."""
-        deadline_ms, patience_ms = self._options.deadline_ms, self._options.patience_ms
-        if self._creating_since_ns is not None:
-            creating_for_ms = (self._machine_ns() - self._creating_since_ns) * 1e-6
-            # A slow creation would never finish if each attempt got the same time.
-            return (deadline_ms + patience_ms) * 2.0**self._hung_creations - creating_for_ms
+        """Time until the worker counts as hanging on a frame that was answered without it."""
         if self._working is None or not self._working.answered:
             return math.inf
-        return deadline_ms + patience_ms - (self._machine_ns() - self._working.submitted_ns) * 1e-6
+        since_ns = self._machine_ns() - self._working.submitted_ns
+        return self._options.deadline_ms + self._options.patience_ms - since_ns * 1e-6
 
     def _answer(self, job: _Job, result: Result) -> None:
         """Deliver one answer per frame; a late fix becomes a refusal."""
@@ -295,15 +280,12 @@ class Live:
                 _log.exception("deliver failed")
 
     def _replace(self, number: int) -> None:
+        """Abandon a worker that hangs, and start another."""
         with self._changed:
-            if self._number != number:
-                return
             self._working = None
             self._changed.notify_all()
             if self._closed:
                 return
-            self._hung_creations += self._creating_since_ns is not None
-            self._creating_since_ns = self._machine_ns()
             self._number += 1
             self._counts["workers_replaced"] += 1
         self._start_thread(self._work, None, number + 1)
