@@ -195,7 +195,7 @@ class Affine:
         middle = self._camera.matrix[:2, 2]
         moved_m = self._ground_m(earlier, back[:, :2] @ middle + back[:, 2]) - self._ground_m(frame, middle)
         interval_s = ((frame.timestamp_ns or 0) - (earlier.timestamp_ns or 0)) * 1e-9
-        return GroundMotion(interval_s, moved_m, np.eye(2), 0.0, 1.0, int(good.sum()))
+        return GroundMotion(interval_s, moved_m, np.eye(2), 0.0, 1.0)
 
     def _ground_m(self, frame: Frame, xy_px: Array) -> Array:
         ray = np.linalg.inv(self._camera.matrix) @ [*xy_px, 1.0]

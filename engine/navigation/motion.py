@@ -62,7 +62,6 @@ class GroundMotion:
         lasting_share: lasting error as a share of the way, from height and heading.
         drift: factor by which a step adds more variance to a long way than alone, because some errors last for
             several steps.
-        points: number of points that agreed.
     """
 
     interval_s: float
@@ -70,7 +69,6 @@ class GroundMotion:
     noise_m2: Array
     lasting_share: float
     drift: float
-    points: int
 
     @property
     def velocity_mps(self) -> Array:

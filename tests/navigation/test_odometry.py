@@ -186,7 +186,7 @@ def test_the_way_after_a_picture_that_repeats_is_unknown():
 
 # Dead reckoning
 
-MOTION = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0, 100)
+MOTION = GroundMotion(1.0, np.array([3.0, 4.0]), 0.04 * np.eye(2), 0.02, 1.0)
 START = Prior(east_m=0.0, north_m=0.0, sigma_m=2.0)
 
 
