@@ -236,6 +236,11 @@ def position_of(prior: Prior, site: OrthoMap) -> PositionEstimate:
     return PositionEstimate(np.asarray(place_m[:2], np.float64), prior.sigma_m)
 
 
+def place_of(fix: Fix) -> PositionEstimate:
+    """A fix's position relative to the map, for comparison with other fixes on it."""
+    return PositionEstimate(en_m(fix), fix.relative_sigma_m, on_map=True)
+
+
 def en_m(fix: Fix) -> Array:
     """East and north of a fix.
 

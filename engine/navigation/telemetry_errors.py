@@ -34,7 +34,6 @@ _MAX_INTERVAL_S = 0.5  # between frames; over longer ones the turn rates are unk
 _MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
 _MAX_LAG_DEG = 180.0  # timestamps in a wrong unit make rates of any size
 _MIN_SIGMAS = 2.0  # of an angle's error before it is corrected: every frame's matching allows for less
-_SEARCH_GROWTH = 1.5  # of the refusals in a row before the next search
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +116,6 @@ class TelemetryErrors:
         self._turn: _Turn | None = None  # from the frame before to the newest
         self._seen: _Seen | None = None  # what the newest frame's fix measured
         self._height_m: float | None = None
-        self._next_search = MIN_FRAMES  # refusals in a row at which heading and height are searched
         self._settling = 0  # further fixes needed before a search's result is applied
         self._searched = False  # whether the newest frame is the first of a search
 
@@ -143,7 +141,7 @@ class TelemetryErrors:
         """The frame with the attitude at its capture and the height that pictures measured.
 
         If frames are refused, heading and height may be off by more than a match tolerates. Then both are
-        searched, less often each time that fails, and after a fix until enough fixes have confirmed them.
+        searched, half as often each time that fails, and after a fix until enough fixes have confirmed them.
 
         Args:
             frame: the newest.
@@ -155,13 +153,12 @@ class TelemetryErrors:
         shown = self.without_errors(frame, _NO_RATES_DPS if turn is None else turn.angles_deg / turn.interval_s)
         if frame.heading_deg is None or self._height_m is None:
             return shown
-        self._searched = refusals >= self._next_search
+        runs, rest = divmod(refusals, MIN_FRAMES)
+        self._searched = rest == 0 and runs.bit_count() == 1  # after 3, 6, 12, 24 ...
         if self._searched:
-            self._next_search, self._settling = math.ceil(_SEARCH_GROWTH * refusals), MIN_FRAMES
+            self._settling = MIN_FRAMES
         elif refusals:
             self._settling = 0
-        else:
-            self._next_search = MIN_FRAMES
         return self._doubted(shown) if self._settling else shown
 
     def _doubted(self, frame: Frame) -> Frame:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engine.navigation.motion import Array, PositionEstimate, Step, Ways, en_m, velocity_of
+from engine.navigation.motion import Array, PositionEstimate, Step, Ways, en_m, place_of, velocity_of
 from engine.navigation.tracks import MIN_FRAMES, Track
 from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason
@@ -61,7 +61,7 @@ class _Course:
 
     def continued(self, fix: Fix) -> _Course:
         """The course with one more match, which replaces a position from another source than the map."""
-        track, place = self.track, PositionEstimate(en_m(fix), fix.relative_sigma_m, on_map=True)
+        track, place = self.track, place_of(fix)
         if track.fix is None:
             begun, sigma_mps = Track.begun(place, 0.0, 0, fix), math.sqrt(track.covariance[2, 2])
             track = begun.with_velocity(track.velocity_mps, sigma_mps)
@@ -168,7 +168,7 @@ class TrackGuard:
         fix = _match(result)
         if fix is None:
             return False
-        track = self._track or self._begun(_position(fix))
+        track = self._track or self._begun(place_of(fix))
         self.distance_m = float(np.hypot(*(en_m(fix) - track.track.filtered_m)))
         contradicts = self._contradicts(track.estimate, fix)
         was_disputed = self.is_disputed
@@ -178,7 +178,7 @@ class TrackGuard:
             if self._rival is not None and continues:
                 self._rival = replace(self._rival, course=self._rival.course.continued(fix))
             else:
-                begun = self._begun(_position(fix), fix, self._unknown_mps)
+                begun = self._begun(place_of(fix), fix, self._unknown_mps)
                 self._rival = _Rival(replace(begun, matches=1), fix, track)
             if not (self.is_disputed and self._is_right(self._rival, track, fix)):
                 return False
@@ -225,7 +225,3 @@ def _match(result: Fix | NoFix) -> Fix | None:
     if isinstance(result, Fix):
         return result
     return result.match if result.reason is Reason.INCONSISTENT else None
-
-
-def _position(fix: Fix) -> PositionEstimate:
-    return PositionEstimate(en_m(fix), fix.relative_sigma_m, on_map=True)

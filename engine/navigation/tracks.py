@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from engine.matching.evidence import RELIABILITY, nats_of, needed_nats
-from engine.navigation.motion import Array, PositionEstimate, Step, Ways, en_m
+from engine.navigation.motion import Array, PositionEstimate, Step, Ways, en_m, place_of
 from engine.options import NavigatorOptions
 from engine.values import CHANCE, RISK, Fix
 
@@ -312,7 +312,7 @@ class Tracks:
         A match that is more probable by itself than by any account begins one.
         """
         fix = match.fix
-        place = PositionEstimate(en_m(fix), fix.relative_sigma_m, on_map=True)
+        place = place_of(fix)
         owners, others = self._owners(match)
         best = max((ratio for ratio, _ in owners), default=0.0)
         with_it, right, wrong = [], [], [0.0, *(each.log_odds for each in others)]

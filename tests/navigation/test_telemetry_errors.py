@@ -239,7 +239,7 @@ def refused(frames, frame=CALM):
 
 
 def test_refused_frames_are_doubted_ever_more_rarely():
-    assert refused(100)[1] == [3, 5, 8, 12, 18, 27, 41, 62, 93]
+    assert refused(100)[1] == [3, 6, 12, 24, 48, 96]
 
 
 def test_a_frame_without_heading_or_height_has_nothing_to_doubt():
