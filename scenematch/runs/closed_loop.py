@@ -30,7 +30,7 @@ from scenematch.simulator import FlightStyle, Town, picture_at
 from scenematch.simulator.faults import FAULT_KINDS, Fault
 from scenematch.simulator.flight import NADIR_PITCH_DEG, reach_m, truth_at
 from scenematch.simulator.light import Image
-from scenematch.simulator.loop import ClosedLoop
+from scenematch.simulator.loop import FRAME_RATE_HZ, ClosedLoop
 from scenematch.simulator.pilot import plan_rounds
 from scenematch.simulator.quadrotor import State
 from scenematch.simulator.town import generator
@@ -110,7 +110,7 @@ def fly_closed_loop(
     prepare_folder(out, force, (*FOLDER_OWNED, *LOOP_OWNED))
     with open_view(matcher, live_view) as view:
         seconds = 60.0 * loop.minutes
-        count = int(seconds * flight.options.frame_rate_hz)
+        count = int(seconds * FRAME_RATE_HZ)
         frames = progress.track(_fly(flight, seconds, view), count, "flying")
         lat, lon = map(float, site.frame.geodetic_from_enu(*flight.flown.start_m[:2]))
         # Written while it flies.
@@ -121,7 +121,7 @@ def fly_closed_loop(
 
 def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: Progress) -> dict[str, Any]:
     """Write track, record, figures of merit and report of a finished flight."""
-    flown, latency_ms = flight.flown, 1e3 * flight.options.latency_s
+    flown, latency_ms = flight.flown, 1e3 * flight.latency_s
     answers = [(picture_name(k), answer) for k, answer in enumerate(flown.answers)]
     rows = [track_row(name, answer.result, latency_ms=latency_ms, deadline_met=None) for name, answer in answers]
     write_track(out / TRACK, rows)
@@ -161,7 +161,7 @@ def plan_closed_loop(
 
 def _fly(flight: ClosedLoop, seconds: float, view: LiveView | None) -> Iterator[tuple[str, Frame]]:
     """The names and frames of a flight in progress, each shown once it is answered."""
-    latency_ms = 1e3 * flight.options.latency_s
+    latency_ms = 1e3 * flight.latency_s
     for k, frame in enumerate(flight.fly(seconds)):
         if view is not None:
             answer = flight.flown.answers[-1]

@@ -3,11 +3,11 @@
 If fixes fail:
 
 - No fix: the filter propagates on the IMU alone, and the vehicle follows its route while the estimate's sigma
-stays below ``hold_sigma_m``.
+stays below 5 m.
 - Above that it holds: it slows down on its route and hovers by the estimate, until fixes have brought the sigma
   below half of that limit. Then it returns to where it left the route and continues.
-- Above ``give_up_sigma_m`` the estimate is too uncertain to hover by: the flight is handed over to the pilot.
-- A fix that contradicts the filter by chi-square is not fused. After ``max_contradictions`` such fixes in a row,
+- Above 20 m the estimate is too uncertain to hover by: the flight is handed over to the pilot.
+- A fix that contradicts the filter by chi-square is not fused. After 15 such fixes in a row,
 either the filter or the engine is wrong, and the flight is handed over too.
 """
 
@@ -17,7 +17,7 @@ import enum
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -25,12 +25,12 @@ import numpy as np
 from engine.geo import Array, attitude_from_rotation
 from engine.navigation.navigator import Matcher, Navigator
 from engine.navigation.state import NavigatorState
-from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason, check_positive
+from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason
 from scenematch.simulator import ekf
 from scenematch.simulator.faults import Fault, ShiftedMap
 from scenematch.simulator.light import Image
-from scenematch.simulator.pilot import Gains, Pilot, Route, Setpoint
-from scenematch.simulator.quadrotor import STEP_S, Airframe, State, Wind, WindField, advance, hovering, shaken
+from scenematch.simulator.pilot import Pilot, Route, Setpoint
+from scenematch.simulator.quadrotor import STEP_S, State, Wind, WindField, advance, hovering, shaken
 from scenematch.simulator.sensors import Instruments, SensorSuite, steps_between
 from scenematch.simulator.vehicle import START_NS
 
@@ -38,12 +38,21 @@ __all__ = [
     "ClosedLoop",
     "Fault",
     "LoopAnswer",
-    "LoopOptions",
     "LoopResult",
     "LoopSample",
     "Mode",
-    "fly_closed_loop",
 ]
+
+FRAME_RATE_HZ, LATENCY_S = 5.0, 0.12
+"""Of the camera, and from the capture of a frame to the arrival of its fix."""
+_START_SIGMA_M = 3.0  # standard deviation of the position at the start, per axis
+# Horizontal sigma of the estimate above which the vehicle holds, and above which the flight is handed over.
+_HOLD_SIGMA_M, _GIVE_UP_SIGMA_M = 5.0, 20.0
+_RESUME_M = 5.0  # largest estimated distance from the route at which the vehicle continues after a hold
+_PACE_CHANGE_PER_S = 0.25  # how fast it slows down along its route and speeds up again; 1 takes a second
+_GATE = 18.4  # chi-square of two degrees of freedom, beyond which a fix contradicts the filter
+_MAX_CONTRADICTIONS = 15  # in a row, at which the flight is handed over
+_HEALTHY_S = 1.0  # largest age of the last fix, beyond its latency, at which the engine counts as healthy
 
 RenderCallback = Callable[[State], Image]
 """Returns the camera's picture at a state of the vehicle."""
@@ -55,51 +64,6 @@ class Mode(enum.Enum):
     FOLLOW = "follow"
     HOLD = "hold"
     HANDED_OVER = "handed_over"
-
-
-@dataclass(frozen=True, kw_only=True)
-class LoopOptions:
-    """Settings of the closed-loop flight.
-
-    Attributes:
-        airframe: of the vehicle.
-        wind: mean and gusts.
-        sensors: on board.
-        gains: of the position controller.
-        frame_rate_hz: of the camera.
-        latency_s: from the capture of a frame to the arrival of its fix.
-        start_sigma_m: standard deviation of the position at the start, per axis.
-        hold_sigma_m: horizontal sigma of the estimate above which the vehicle holds.
-        give_up_sigma_m: horizontal sigma of the estimate above which the flight is handed over.
-        resume_m: largest estimated distance from the route at which the vehicle continues after a hold.
-        pace_change_per_s: how fast it slows down along its route and speeds up again; 1 takes a second.
-        gate: chi-square of two degrees of freedom, beyond which a fix contradicts the filter.
-        max_contradictions: fixes in a row that contradict the filter, at which the flight is handed over.
-        healthy_s: largest age of the last fix, beyond its latency, at which the engine counts as healthy.
-
-    Raises:
-        OptionError: a value is not above 0.
-    """
-
-    airframe: Airframe = field(default_factory=Airframe)
-    wind: Wind = field(default_factory=Wind)
-    sensors: SensorSuite = field(default_factory=SensorSuite)
-    gains: Gains = field(default_factory=Gains)
-    frame_rate_hz: float = 5.0
-    latency_s: float = 0.12
-    start_sigma_m: float = 3.0
-    hold_sigma_m: float = 5.0
-    give_up_sigma_m: float = 20.0
-    resume_m: float = 5.0
-    pace_change_per_s: float = 0.25
-    gate: float = 18.4
-    max_contradictions: int = 15
-    healthy_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        names = ("latency_s", "start_sigma_m", "hold_sigma_m", "give_up_sigma_m", "resume_m")
-        check_positive(self, *names, "pace_change_per_s", "gate", "max_contradictions", "healthy_s")
-        steps_between(self.frame_rate_hz)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,42 +135,19 @@ class LoopResult:
         return np.array([row.estimate.position_m - row.truth.position_m for row in self.record])
 
 
-def fly_closed_loop(
-    route: Route,
-    camera: RenderCallback,
-    matcher: Matcher,
-    *,
-    seed: int = 1,
-    seconds: float | None = None,
-    fault: Fault | None = None,
-    options: LoopOptions | None = None,
-) -> LoopResult:
-    """Fly a route by the engine's fixes.
+class ClosedLoop:
+    """A flight by the engine's fixes, frame by frame.
 
     Args:
         route: the route to fly, relative to the origin of the matcher's map, up from its ground.
         camera: takes the pictures.
         matcher: matches them; a :class:`engine.matching.matcher.SceneMatcher`, or a stand-in.
         seed: of wind, vibration and all sensors.
-        seconds: maximum duration; None flies as long as the route takes without holding. A handover ends the
-            flight.
         fault: injected failure.
-        options: settings.
-
-    Raises:
-        OptionError: an option is out of range.
-    """
-    loop = ClosedLoop(route, camera, matcher, seed=seed, fault=fault, options=options)
-    for _ in loop.fly(seconds):
-        pass
-    return loop.flown
-
-
-class ClosedLoop:
-    """A closed-loop flight in progress, frame by frame; the arguments are those of :func:`fly_closed_loop`.
+        latency_s: from the capture of a frame to the arrival of its fix.
 
     Attributes:
-        options: as given.
+        latency_s: as given.
         fault: as given.
         flown: the flight so far.
     """
@@ -219,16 +160,16 @@ class ClosedLoop:
         *,
         seed: int = 1,
         fault: Fault | None = None,
-        options: LoopOptions | None = None,
+        latency_s: float = LATENCY_S,
     ) -> None:
-        fault, options = fault or Fault(), options or LoopOptions()
         air, sensors, start, self._shakes = np.random.default_rng(np.random.SeedSequence([seed, 0xC1])).spawn(4)
-        self._route, self._camera, self.fault, self.options = route, camera, fault, options
+        self._route, self._camera, self.fault, self.latency_s = route, camera, fault or Fault(), latency_s
+        self._suite = SensorSuite()
         self._map = ShiftedMap(matcher)
-        self._air, self._pilot = WindField(options.wind, air), Pilot(options.gains)
-        self._instruments = Instruments(options.sensors, sensors)
+        self._air, self._pilot = WindField(Wind(), air), Pilot()
+        self._instruments = Instruments(self._suite, sensors)
         self._state = hovering(route.position_m[0], float(route.heading_deg[0]))
-        self._history = ekf.History(self._initial_estimate(start), options.sensors, 1.0 + options.latency_s)
+        self._history = ekf.History(self._initial_estimate(start), self._suite, 1.0 + latency_s)
         self._navigator: Navigator | None = self._new_engine()
         self._clock_s, self._pace, self._plan = 0.0, 1.0, route.at(0.0)
         self._kicks = deque(route.kicks_s)
@@ -241,10 +182,11 @@ class ClosedLoop:
 
     def _initial_estimate(self, rng: np.random.Generator) -> ekf.FilterState:
         """The state at rest, with errors drawn from the filter's own covariance."""
-        sigma, white = self.options.start_sigma_m, rng.standard_normal(5)
+        white = rng.standard_normal(5)
         heading = self._instruments.heading_deg(self._state)
         attitude = Attitude(ekf.START_TILT_DEG * white[3], ekf.START_TILT_DEG * white[4], heading)
-        return ekf.initial_state(self._state.position_m + sigma * white[:3], sigma, attitude, self.options.sensors)
+        position_m = self._state.position_m + _START_SIGMA_M * white[:3]
+        return ekf.initial_state(position_m, _START_SIGMA_M, attitude, self._suite)
 
     def _new_engine(self) -> Navigator:
         """A navigator that starts from the filter's estimate."""
@@ -253,8 +195,13 @@ class ClosedLoop:
         return Navigator(self._map, Prior(east_m=east, north_m=north, sigma_m=estimate.sigma_m))
 
     def fly(self, seconds: float | None = None) -> Iterator[Frame]:
-        """Fly; yields every frame as given to the engine, after its answer."""
-        every = steps_between(self.options.frame_rate_hz)
+        """Fly; yields every frame as given to the engine, after its answer.
+
+        Args:
+            seconds: maximum duration; None flies as long as the route takes without holding. A handover ends the
+                flight.
+        """
+        every = steps_between(FRAME_RATE_HZ)
         for k in range(1, round((self._route.duration_s if seconds is None else seconds) / STEP_S) + 1):
             self._step(k)
             if k % every == 0:
@@ -269,19 +216,19 @@ class ClosedLoop:
 
     def _step(self, k: int) -> None:
         """The ``k``-th step of :data:`scenematch.simulator.quadrotor.STEP_S`."""
-        options, estimate = self.options, self._history.now
+        estimate = self._history.now
         target = self._plan = self._target()
         while self._kicks and self._clock_s >= self._kicks[0]:
             self._kicks.popleft()
-            self._state = shaken(self._state, options.airframe, self._shakes)
+            self._state = shaken(self._state, self._shakes)
         wanted = self._pilot.steer(target, estimate.position_m, estimate.velocity_mps)
-        self._state, felt = advance(self._state, wanted, target.heading_deg, options.airframe, self._air.next())
+        self._state, felt = advance(self._state, wanted, target.heading_deg, self._air.next())
         self._history.advance(self._instruments.imu(felt))
         self._sense(k)
 
     def _target(self) -> Setpoint:
         """The setpoint; during a hold, the route's clock slows to a stop and later runs again."""
-        faster = self.options.pace_change_per_s * (1.0 if self._mode is Mode.FOLLOW else -1.0)
+        faster = _PACE_CHANGE_PER_S * (1.0 if self._mode is Mode.FOLLOW else -1.0)
         pace = min(max(self._pace + faster * STEP_S, 0.0), 1.0)
         change, self._pace = (pace - self._pace) / STEP_S, pace
         self._clock_s += pace * STEP_S
@@ -289,7 +236,7 @@ class ClosedLoop:
 
     def _sense(self, k: int) -> None:
         """Read barometer and compass."""
-        suite, instruments, state = self.options.sensors, self._instruments, self._state
+        suite, instruments, state = self._suite, self._instruments, self._state
         now_s = self._history.now.time_s
         if k % steps_between(suite.barometer.rate_hz) == 0:
             height_m = instruments.height_m(state)
@@ -315,7 +262,7 @@ class ClosedLoop:
             result = self._navigator.update(frame)
             self.flown.resets += self._navigator.reset_count - before
         state = None if self._navigator is None else self._navigator.state
-        answer = LoopAnswer(stamp_ns, self._state, result, state, time_s + self.options.latency_s)
+        answer = LoopAnswer(stamp_ns, self._state, result, state, time_s + self.latency_s)
         self.flown.answers.append(answer)
         self._pending.append(answer)
         return frame
@@ -343,21 +290,21 @@ class ClosedLoop:
                 self._gate(answer.result, answer)
 
     def _choose_mode(self) -> None:
-        estimate, options = self._history.now, self.options
+        estimate = self._history.now
         sigma_m = estimate.sigma_m
         off_m = float(np.hypot(*(estimate.position_m - self._plan.position_m)[:2]))
-        if self._contradictions >= options.max_contradictions or sigma_m > options.give_up_sigma_m:
+        if self._contradictions >= _MAX_CONTRADICTIONS or sigma_m > _GIVE_UP_SIGMA_M:
             self._mode = Mode.HANDED_OVER
-        elif sigma_m > options.hold_sigma_m:
+        elif sigma_m > _HOLD_SIGMA_M:
             self._mode = Mode.HOLD
-        elif sigma_m < 0.5 * options.hold_sigma_m and off_m < options.resume_m:
+        elif sigma_m < 0.5 * _HOLD_SIGMA_M and off_m < _RESUME_M:
             self._mode = Mode.FOLLOW
 
     def _gate(self, fix: Fix, answer: LoopAnswer) -> None:
         """Fuse a fix if it passes the chi-square gate; otherwise count it."""
         captured_s = answer.truth.time_s
         self._last_fix_s = captured_s
-        if ekf.fix_chi_square(self._history.at(captured_s), fix) > self.options.gate:
+        if ekf.fix_chi_square(self._history.at(captured_s), fix) > _GATE:
             self._contradictions += 1
             return
         self._contradictions = 0
@@ -366,7 +313,7 @@ class ClosedLoop:
 
     def _record(self) -> None:
         """Add a row to the record."""
-        state, options = self._state, self.options
-        healthy = state.time_s - self._last_fix_s - options.latency_s <= options.healthy_s
+        state = self._state
+        healthy = state.time_s - self._last_fix_s - self.latency_s <= _HEALTHY_S
         row = LoopSample(state.time_s, state, self._history.now, self._plan.position_m, self._mode, healthy)
         self.flown.record.append(row)

@@ -9,11 +9,17 @@ import numpy as np
 
 from engine.errors import OptionError
 from engine.geo import Array
-from engine.values import check_positive
 from scenematch.simulator.quadrotor import STEP_S
 from scenematch.simulator.vehicle import COURSE_STEP_S, FlightStyle, course
 
-__all__ = ["Gains", "Pilot", "Route", "Setpoint", "plan_rounds", "plan_route"]
+__all__ = ["Pilot", "Route", "Setpoint", "plan_rounds", "plan_route"]
+
+# Gains horizontally twice and vertically, those of PX4's multicopter position control (MPC_XY_P and its siblings).
+_POSITION_PER_S = np.array([0.95, 0.95, 1.0])  # velocity per error of the position
+_VELOCITY_PER_S = np.array([1.8, 1.8, 4.0])  # acceleration per error of the velocity
+_INTEGRAL_PER_S2 = np.array([0.4, 0.4, 2.0])  # acceleration per second of that error, which compensates the wind
+MAX_CORRECTION_MPS, MAX_ACCELERATION_MPS2 = 3.0, 2.0
+"""Largest velocity commanded for an error of the position, and largest horizontal acceleration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,45 +122,10 @@ def plan_rounds(half_m: tuple[float, float], seconds: float, style: FlightStyle 
     return route
 
 
-@dataclass(frozen=True, kw_only=True)
-class Gains:
-    """Gains of the cascade, by default those of PX4's multicopter position control (MPC_XY_P and its siblings).
-
-    Attributes:
-        position_per_s: velocity per error of the position, horizontally (MPC_XY_P).
-        velocity_per_s: acceleration per error of the velocity (MPC_XY_VEL_P_ACC).
-        integral_per_s2: acceleration per second of that error, which compensates the wind (MPC_XY_VEL_I_ACC).
-        height_per_s: as ``position_per_s``, vertically (MPC_Z_P).
-        climb_per_s: as ``velocity_per_s`` (MPC_Z_VEL_P_ACC).
-        climb_integral_per_s2: as ``integral_per_s2`` (MPC_Z_VEL_I_ACC).
-        max_correction_mps: largest velocity commanded for an error of the position.
-        max_acceleration_mps2: largest horizontal acceleration; gentler than MPC_ACC_HOR.
-
-    Raises:
-        OptionError: a value is not above 0.
-    """
-
-    position_per_s: float = 0.95
-    velocity_per_s: float = 1.8
-    integral_per_s2: float = 0.4
-    height_per_s: float = 1.0
-    climb_per_s: float = 4.0
-    climb_integral_per_s2: float = 2.0
-    max_correction_mps: float = 3.0
-    max_acceleration_mps2: float = 2.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
-
-
 class Pilot:
     """Follows setpoints by the estimated position and velocity; its integral compensates the wind."""
 
-    def __init__(self, gains: Gains | None = None) -> None:
-        self._gains = g = gains or Gains()
-        self._position = np.array([g.position_per_s, g.position_per_s, g.height_per_s])
-        self._velocity = np.array([g.velocity_per_s, g.velocity_per_s, g.climb_per_s])
-        self._integral = np.array([g.integral_per_s2, g.integral_per_s2, g.climb_integral_per_s2])
+    def __init__(self) -> None:
         self._wind = np.zeros(3)
 
     def steer(self, target: Setpoint, position_m: Array, velocity_mps: Array) -> Array:
@@ -168,15 +139,16 @@ class Pilot:
         Returns:
             (3,) m/s^2.
         """
-        limit = self._gains.max_correction_mps
-        towards = np.clip(self._position * (target.position_m - position_m), -limit, limit)
+        towards = np.clip(
+            _POSITION_PER_S * (target.position_m - position_m), -MAX_CORRECTION_MPS, MAX_CORRECTION_MPS
+        )
         error = target.velocity_mps + towards - velocity_mps
-        wanted = target.acceleration_mps2 + self._velocity * error + self._wind
+        wanted = target.acceleration_mps2 + _VELOCITY_PER_S * error + self._wind
         flat = math.hypot(wanted[0], wanted[1])
-        if flat > self._gains.max_acceleration_mps2:
-            wanted[:2] *= self._gains.max_acceleration_mps2 / flat
-            self._wind[2] += self._integral[2] * STEP_S * error[2]
+        if flat > MAX_ACCELERATION_MPS2:
+            wanted[:2] *= MAX_ACCELERATION_MPS2 / flat
+            self._wind[2] += _INTEGRAL_PER_S2[2] * STEP_S * error[2]
         else:  # the integral would wind up at the limit
-            self._wind += self._integral * STEP_S * error
+            self._wind += _INTEGRAL_PER_S2 * STEP_S * error
         self._wind = np.clip(self._wind, -2.0, 2.0)
         return np.asarray(wanted)

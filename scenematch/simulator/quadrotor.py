@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engine.errors import OptionError
 from engine.geo import Array, attitude_from_rotation, enu_from_body
-from engine.values import Attitude, check_positive
+from engine.values import Attitude
 from scenematch.simulator.rotations import rotation, rotation_vector
 from scenematch.simulator.vehicle import GRAVITY_MPS2
 
-__all__ = ["Airframe", "IdealImu", "State", "Wind", "WindField", "advance", "hovering"]
+__all__ = ["IdealImu", "State", "Wind", "WindField", "advance", "hovering"]
 
 
 STEP_S = 0.01
@@ -28,42 +27,15 @@ GRAVITY = np.array([0.0, 0.0, -GRAVITY_MPS2])
 _PEAK_OF_SWING = 0.71  # first peak after an impulse over impulse / frequency, at a damping of 0.25
 
 
-@dataclass(frozen=True, kw_only=True)
-class Airframe:
-    """The vehicle: the size of a 3DR Iris, with the 1.5 kg of Gazebo's model.
-
-    Attributes:
-        mass_kg: of the vehicle with its battery.
-        max_thrust_n: of all four rotors.
-        thrust_lag_s: time constant of the rotors.
-        drag_per_s: drag per mass and airspeed; with 0.1, flying 8.5 m/s takes 5 degrees of tilt.
-        swing_rps: natural frequency of roll and pitch under control, in radians per second.
-        swing_damping: share of critical damping of the same; 0.25 rings for about half a second.
-        yaw_rps: natural frequency of the heading, which is critically damped.
-        max_tilt_deg: largest tilt that the controller commands.
-        shake_deg: largest swing excited by a start or a stop.
-
-    Raises:
-        OptionError: a value is not above 0, or the thrust is below the weight.
-    """
-
-    mass_kg: float = 1.5
-    max_thrust_n: float = 30.0
-    thrust_lag_s: float = 0.05
-    drag_per_s: float = 0.1
-    swing_rps: float = 10.0
-    swing_damping: float = 0.25
-    yaw_rps: float = 3.0
-    max_tilt_deg: float = 25.0
-    shake_deg: float = 7.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
-        if self.max_thrust_n <= self.mass_kg * GRAVITY_MPS2:
-            raise OptionError(
-                f"max_thrust_n: expected more than the weight of {self.mass_kg * GRAVITY_MPS2:.1f} N, "
-                f"got {self.max_thrust_n}"
-            )
+# The vehicle: the size of a 3DR Iris, with the 1.5 kg of Gazebo's model.
+_MAX_THRUST_MPS2 = 20.0  # of all four rotors, per mass
+_THRUST_LAG_S = 0.05  # time constant of the rotors
+_DRAG_PER_S = 0.1  # drag per mass and airspeed: flying 8.5 m/s takes 5 degrees of tilt
+SWING_RPS, SWING_DAMPING = 10.0, 0.25
+"""Natural frequency of roll and pitch under control, and its share of critical damping: rings half a second."""
+_YAW_RPS = 3.0  # natural frequency of the heading, which is critically damped
+MAX_TILT_DEG, SHAKE_DEG = 25.0, 7.0
+"""Largest tilt that the controller commands, and largest swing excited by a start or a stop."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,20 +48,12 @@ class Wind:
         gust_sd_mps: standard deviation of each horizontal component; the vertical one has half of it.
         gust_time_s: how long a gust lasts: each component is a Gauss-Markov process, which has the spectrum of
             Dryden's longitudinal gusts (MIL-F-8785C).
-
-    Raises:
-        OptionError: a value is not finite, or ``gust_time_s`` is not above 0.
     """
 
     mean_east_mps: float = 2.5
     mean_north_mps: float = 1.5
     gust_sd_mps: float = 0.8
     gust_time_s: float = 3.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, "gust_time_s")
-        if not all(map(math.isfinite, (self.mean_east_mps, self.mean_north_mps, self.gust_sd_mps))):
-            raise OptionError(f"wind: expected finite numbers, got {self}")
 
 
 class WindField:
@@ -161,23 +125,22 @@ def hovering(position_m: Array, heading_deg: float) -> State:
     return State(0.0, np.asarray(position_m, float), np.zeros(3), attitude, np.zeros(3), GRAVITY_MPS2)
 
 
-def aim(acceleration_mps2: Array, heading_deg: float, airframe: Airframe) -> tuple[Array, Array]:
+def aim(acceleration_mps2: Array, heading_deg: float) -> tuple[Array, Array]:
     """The attitude that gives an acceleration in still air, and the force per mass it needs.
 
-    If the force would tilt the vehicle beyond ``max_tilt_deg``, only its horizontal component is reduced; the
+    If the force would tilt the vehicle beyond :data:`MAX_TILT_DEG`, only its horizontal component is reduced; the
     rotors never push down.
 
     Args:
         acceleration_mps2: (3,) east, north, up.
         heading_deg: clockwise from north.
-        airframe: its tilt limit.
 
     Returns:
         enu_from_body (3, 3), and the force per mass (3,) in m/s^2.
     """
     force = acceleration_mps2 - GRAVITY
     force[2] = max(force[2], 0.3 * GRAVITY_MPS2)
-    flat, max_flat = math.hypot(force[0], force[1]), force[2] * math.tan(math.radians(airframe.max_tilt_deg))
+    flat, max_flat = math.hypot(force[0], force[1]), force[2] * math.tan(math.radians(MAX_TILT_DEG))
     if flat > max_flat:
         force[:2] *= max_flat / flat
     down = -force / np.linalg.norm(force)
@@ -187,29 +150,25 @@ def aim(acceleration_mps2: Array, heading_deg: float, airframe: Airframe) -> tup
     return np.column_stack([np.cross(right, down), right, down]), force
 
 
-def advance(
-    state: State, acceleration_mps2: Array, heading_deg: float, airframe: Airframe, air_mps: Array
-) -> tuple[State, IdealImu]:
+def advance(state: State, acceleration_mps2: Array, heading_deg: float, air_mps: Array) -> tuple[State, IdealImu]:
     """One step of :data:`STEP_S`.
 
     Args:
         state: at its beginning.
         acceleration_mps2: (3,) that the controller commands.
         heading_deg: that the controller commands.
-        airframe: of the vehicle.
         air_mps: (3,) velocity of the air.
 
     Returns:
         State: at its end.
         IdealImu: the IMU's measurement during the step.
     """
-    wanted, force = aim(acceleration_mps2, heading_deg, airframe)
+    wanted, force = aim(acceleration_mps2, heading_deg)
     up = -state.enu_from_body[:, 2]
-    max_thrust = airframe.max_thrust_n / airframe.mass_kg
-    thrust = state.thrust_mps2 + (min(float(force @ up), max_thrust) - state.thrust_mps2) * (
-        1.0 - math.exp(-STEP_S / airframe.thrust_lag_s)
+    thrust = state.thrust_mps2 + (min(float(force @ up), _MAX_THRUST_MPS2) - state.thrust_mps2) * (
+        1.0 - math.exp(-STEP_S / _THRUST_LAG_S)
     )
-    pushed = thrust * up - airframe.drag_per_s * (state.velocity_mps - air_mps)
+    pushed = thrust * up - _DRAG_PER_S * (state.velocity_mps - air_mps)
     acceleration = pushed + GRAVITY
     half = state.enu_from_body @ rotation(0.5 * STEP_S * state.rates_rps)
     return State(
@@ -217,7 +176,7 @@ def advance(
         state.position_m + STEP_S * state.velocity_mps + 0.5 * STEP_S**2 * acceleration,
         state.velocity_mps + STEP_S * acceleration,
         state.enu_from_body @ rotation(STEP_S * state.rates_rps),
-        state.rates_rps + STEP_S * _swing(state, wanted, airframe),
+        state.rates_rps + STEP_S * _swing(state, wanted),
         thrust,
     ), IdealImu(half.T @ pushed, state.rates_rps)
 
@@ -227,21 +186,21 @@ def next_time_s(time_s: float) -> float:
     return (round(time_s / STEP_S) + 1) * STEP_S
 
 
-def _swing(state: State, wanted: Array, airframe: Airframe) -> Array:
+def _swing(state: State, wanted: Array) -> Array:
     """Angular acceleration (3,): the controlled attitude is a damped oscillator about the commanded one."""
     error = rotation_vector(state.enu_from_body.T @ wanted)
     error[2] = np.clip(error[2], -0.5, 0.5)  # the yaw rate is limited
-    spring = np.array([airframe.swing_rps, airframe.swing_rps, airframe.yaw_rps])
-    damping = np.array([airframe.swing_damping, airframe.swing_damping, 1.0])
+    spring = np.array([SWING_RPS, SWING_RPS, _YAW_RPS])
+    damping = np.array([SWING_DAMPING, SWING_DAMPING, 1.0])
     return np.asarray(spring**2 * error - 2.0 * damping * spring * state.rates_rps)
 
 
-def shaken(state: State, airframe: Airframe, rng: np.random.Generator) -> State:
+def shaken(state: State, rng: np.random.Generator) -> State:
     """The vehicle after the impulse of a start or a stop: a swing in roll and pitch, mostly in pitch.
 
-    Its first peak is 0.6 to 1 of ``shake_deg``.
+    Its first peak is 0.6 to 1 of :data:`SHAKE_DEG`.
     """
-    peak = math.radians(airframe.shake_deg) * rng.uniform(0.6, 1.0)
+    peak = math.radians(SHAKE_DEG) * rng.uniform(0.6, 1.0)
     direction = rng.uniform(-0.9, 0.9)
-    kick = peak * airframe.swing_rps / _PEAK_OF_SWING * np.array([math.sin(direction), math.cos(direction), 0.0])
+    kick = peak * SWING_RPS / _PEAK_OF_SWING * np.array([math.sin(direction), math.cos(direction), 0.0])
     return replace(state, rates_rps=state.rates_rps + kick)

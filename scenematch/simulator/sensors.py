@@ -9,7 +9,6 @@ import numpy as np
 
 from engine.errors import OptionError
 from engine.geo import Array, wrap_heading_deg
-from engine.values import check_positive
 from scenematch.simulator.quadrotor import STEP_S, IdealImu, State
 
 
@@ -29,9 +28,6 @@ class Imu:
         gyro_walk: driving noise of their bias, in rad/s^2 per root Hz.
         gyro_time_s: correlation time of that bias.
         gyro_start_rps: standard deviation of the bias at the start.
-
-    Raises:
-        OptionError: a value is not above 0.
     """
 
     accel_noise: float = 0.004
@@ -43,9 +39,6 @@ class Imu:
     gyro_time_s: float = 1000.0
     gyro_start_rps: float = 1.0e-3
 
-    def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Compass:
@@ -55,17 +48,11 @@ class Compass:
         rate_hz: samples per second.
         noise_deg: white noise.
         bias_deg: standard deviation of the constant error left by iron and calibration.
-
-    Raises:
-        OptionError: a value is not above 0.
     """
 
     rate_hz: float = 10.0
     noise_deg: float = 0.7
     bias_deg: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,18 +64,12 @@ class Barometer:
         noise_m: white noise.
         drift_m: standard deviation of the drift (Gauss-Markov), which is 0 at the start.
         drift_time_s: its correlation time.
-
-    Raises:
-        OptionError: a value is not above 0.
     """
 
     rate_hz: float = 20.0
     noise_m: float = 0.3
     drift_m: float = 1.0
     drift_time_s: float = 200.0
-
-    def __post_init__(self) -> None:
-        check_positive(self, *self.__dataclass_fields__)
 
 
 def steps_between(rate_hz: float) -> int:

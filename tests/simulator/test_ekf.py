@@ -11,7 +11,7 @@ from engine import Attitude, StateError
 from engine.geo import enu_from_body
 from scenematch.simulator import ekf
 from scenematch.simulator.ekf import STATES, FilterState, History, fuse_fix, fuse_heading, fuse_height
-from scenematch.simulator.quadrotor import STEP_S, Airframe, IdealImu, Wind, WindField, advance, hovering, shaken
+from scenematch.simulator.quadrotor import STEP_S, IdealImu, Wind, WindField, advance, hovering, shaken
 from scenematch.simulator.rotations import rotation, rotation_vector
 from scenematch.simulator.sensors import Instruments, SensorSuite
 from tests.support.fixes import a_fix
@@ -125,9 +125,9 @@ def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
     air = WindField(Wind(), rng)
     for k in range(500):
         if k % 250 == 0:
-            state = shaken(state, Airframe(), rng)
+            state = shaken(state, rng)
         wanted = np.array([1.0, math.cos(k / 60), 0.1])
-        state, felt = advance(state, wanted, 200.0 + 0.1 * k, Airframe(), air.next())
+        state, felt = advance(state, wanted, 200.0 + 0.1 * k, air.next())
         estimate = ekf.predict(estimate, felt, SUITE)
     np.testing.assert_allclose(estimate.position_m, state.position_m, atol=1e-6)
     np.testing.assert_allclose(estimate.enu_from_body, state.enu_from_body, atol=1e-9)
@@ -139,7 +139,7 @@ def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
 def fly(seed, seconds, fixes_until_s=math.inf):
     """A flight of turns: every second the filter's error (17,), covariance, and the sigma of the position."""
     winds, sensors, start, shakes = np.random.default_rng(seed).spawn(4)
-    air, carried, frame = WindField(Wind(), winds), Instruments(SUITE, sensors), Airframe()
+    air, carried = WindField(Wind(), winds), Instruments(SUITE, sensors)
     state, off = hovering(np.array([0.0, 0.0, 150.0]), 0.0), start.standard_normal(8)
     state = replace(state, velocity_mps=0.1 * off[:3])
     believed = Attitude(0.5 * off[3], 0.5 * off[4], carried.heading_deg(state))
@@ -147,9 +147,9 @@ def fly(seed, seconds, fixes_until_s=math.inf):
     pending, rows = [], []
     for k in range(1, round(seconds / STEP_S) + 1):
         if k % 300 == 0:
-            state = shaken(state, frame, shakes)
+            state = shaken(state, shakes)
         wanted = np.array([math.cos(0.01 * k), math.sin(0.007 * k), 0.0])
-        state, felt = advance(state, wanted, 0.2 * k, frame, air.next())
+        state, felt = advance(state, wanted, 0.2 * k, air.next())
         history.advance(carried.imu(felt))
         if k % 5 == 0:
             height_m = carried.height_m(state)

@@ -7,7 +7,7 @@ import pytest
 
 from engine import Frame, NavigatorState, NoFix, OptionError, OrthoMap, Prior, Reason, Window
 from scenematch.simulator.faults import Fault, ShiftedMap
-from scenematch.simulator.loop import LoopOptions, Mode, fly_closed_loop
+from scenematch.simulator.loop import ClosedLoop, Mode
 from scenematch.simulator.pilot import plan_rounds
 from scenematch.simulator.vehicle import START_NS, FlightStyle
 from tests.support.fixes import a_fix
@@ -43,8 +43,9 @@ ROUTE = plan_rounds((60.0, 50.0), 60.0, FlightStyle(height_agl_m=120.0))
 
 
 def fly(seconds, fault=None, seed=3, matcher=None, **options):
-    given = {"seed": seed, "seconds": seconds, "fault": fault, "options": LoopOptions(**options)}
-    return fly_closed_loop(ROUTE, picture, matcher or Scripted(seed), **given)
+    loop = ClosedLoop(ROUTE, picture, matcher or Scripted(seed), seed=seed, fault=fault, **options)
+    assert all(isinstance(frame, Frame) for frame in loop.fly(seconds))
+    return loop.flown
 
 
 def distance(errors):
