@@ -18,7 +18,7 @@ from engine import Fix
 from scenematch.simulator import plan_flight
 from tests.support import towns
 from tests.support.paths import NO_SHARED, SHARED
-from tests.support.towns import drawn_once, drawn_town, site_of
+from tests.support.towns import drawn_flight, drawn_once, drawn_town, site_of
 
 hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
 hypothesis.settings.load_profile("tests")
@@ -80,7 +80,7 @@ def sim_town():
 @pytest.fixture(scope="session")
 def sim_flight(sim_town):
     """The first 24 frames of the paper's flight over a simulated town."""
-    return plan_flight(1, town=sim_town, frames=24).draw()
+    return drawn_flight(plan_flight(1, town=sim_town, frames=24))
 
 
 @pytest.fixture(scope="session")

@@ -1,33 +1,26 @@
-"""A flight: its frames, read one at a time, with the telemetry of each; and the writer of a flight folder."""
+"""A flight: its frames, read one at a time, with the telemetry of each."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from engine.camera import Camera
 from engine.errors import TelemetryError
-from engine.geo import wrap_heading_deg
-from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
-from engine.values import Frame, Prior, Truth
+from engine.values import Frame, Prior
 from scenematch.files.frames import VIDEO_SUFFIXES, FrameSource, VideoFile, open_frames
-from scenematch.files.geotiff import write_geotiff
 from scenematch.files.logs.readers import is_log, open_log, stamp_frames
 from scenematch.files.photos import photo_telemetry
 from scenematch.files.resampling import rows_and_sources_at
 from scenematch.files.ros.bags import BagFrames, is_bag
-from scenematch.files.telemetry import TelemetryRow, open_telemetry, write_telemetry
-from scenematch.files.truth import write_truth
+from scenematch.files.telemetry import TelemetryRow, open_telemetry
 
-__all__ = ["Flight", "FlightFrame", "open_flight", "write_flight_folder"]
-
-_JPEG_QUALITY = 95
+__all__ = ["Flight", "FlightFrame", "camera_info", "open_flight"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +98,10 @@ class Flight:
 
 
 def _frame(image: NDArray[np.uint8], row: TelemetryRow) -> Frame:
-    return Frame(image, **{name: getattr(row, name) for name in _SHARED})
+    return Frame(image, **{name: getattr(row, name) for name in FRAME_COLUMNS})
 
 
-_SHARED = [each.name for each in fields(Frame) if each.name in TelemetryRow.__dataclass_fields__]
+FRAME_COLUMNS = [each.name for each in fields(Frame) if each.name in TelemetryRow.__dataclass_fields__]
 """What a frame and a row of telemetry both hold."""
 
 
@@ -186,77 +179,6 @@ def subtitles_beside(frames: str | Path) -> Path | None:
         return None
     beside = (path.with_suffix(suffix) for suffix in (".SRT", ".srt"))
     return next((file for file in beside if file.is_file()), None)
-
-
-def write_flight_folder(
-    directory: str | Path,
-    *,
-    frames: Iterable[tuple[str, Frame]],
-    truth: Iterable[Truth],
-    camera: Camera,
-    ortho_rgb: NDArray[np.uint8],
-    pixel_to_crs: ArrayLike,
-    crs_epsg: int,
-    surface_m: NDArray[Any] | None = None,
-    start: Prior | None = None,
-    georeference_sigma_m: float | None = None,
-    slope_sigma_deg: float | None = None,
-) -> None:
-    """Write a flight folder: frames, telemetry.csv, truth.csv, camera.yaml, map.tif and dsm.tif.
-
-    Args:
-        directory: the folder, created if it does not exist.
-        frames: file name (.jpg or .png) and stamped frame, consumed one at a time before ``truth``.
-        truth: the true states, in the order of time.
-        camera: intrinsics and mount.
-        ortho_rgb: map, (H, W, 3) or grey (H, W), uint8.
-        pixel_to_crs: (2, 3) affine transform from the map's pixel centres (x, y, 1) to the CRS.
-        crs_epsg: EPSG code of the CRS.
-        surface_m: (H, W) heights in metres on the map's grid, or None.
-        start: prior in latitude and longitude for the first row of the telemetry.
-        georeference_sigma_m: georeferencing accuracy that map.tif states, or None.
-        slope_sigma_deg: slope accuracy that dsm.tif states, or None.
-
-    Raises:
-        TelemetryError: a frame has no timestamp, or a file cannot be written.
-        MapError: map.tif or dsm.tif cannot be written.
-    """
-    directory = Path(directory)
-    (directory / "frames").mkdir(parents=True, exist_ok=True)
-    rows: list[TelemetryRow] = []
-    for name, frame in frames:
-        _write_image(directory / "frames" / name, frame)
-        rows.append(_telemetry_row(name, frame, start if not rows else None))
-    write_telemetry(directory / "telemetry.csv", rows)
-    write_truth(directory / "truth.csv", list(truth))
-    (directory / "camera.yaml").write_text(camera_info(camera), encoding="utf-8")
-    tags = {} if georeference_sigma_m is None else {GEOREFERENCE_TAG: georeference_sigma_m}
-    write_geotiff(directory / "map.tif", ortho_rgb, pixel_to_crs, crs_epsg, tags=tags)
-    if surface_m is not None:
-        tags = {} if slope_sigma_deg is None else {SLOPE_TAG: slope_sigma_deg}
-        heights_m = np.asarray(surface_m, np.float32)
-        write_geotiff(directory / "dsm.tif", heights_m, pixel_to_crs, crs_epsg, tags=tags)
-
-
-def _telemetry_row(name: str, frame: Frame, prior: Prior | None) -> TelemetryRow:
-    if frame.timestamp_ns is None:
-        raise TelemetryError(f"{name}: timestamp_ns: expected a stamp to write into telemetry.csv, got None")
-    known: dict[str, Any] = {each: getattr(frame, each) for each in _SHARED}
-    if frame.heading_deg is not None:
-        known["heading_deg"] = wrap_heading_deg(frame.heading_deg)
-    if prior is not None:
-        known |= {"lat_deg": prior.lat_deg, "lon_deg": prior.lon_deg, "sigma_m": prior.sigma_m}
-    return TelemetryRow(frame=name, **known)
-
-
-def _write_image(path: Path, frame: Frame) -> None:
-    from PIL import Image
-
-    image = frame.image if isinstance(frame.image, np.ndarray) else frame.image.cpu().numpy()
-    try:
-        Image.fromarray(image).save(path, quality=_JPEG_QUALITY, subsampling=0)
-    except (OSError, ValueError) as error:
-        raise TelemetryError(f"{path}: cannot be written: {error}") from None
 
 
 def camera_info(camera: Camera) -> str:

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.values import Frame, Prior, Truth
-from scenematch.files.flight import write_flight_folder
+from engine.geo import wrap_heading_deg
+from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
+from engine.values import Frame, Truth
+from scenematch.files.flight import FRAME_COLUMNS, camera_info
+from scenematch.files.geotiff import write_geotiff
+from scenematch.files.telemetry import TelemetryRow, write_telemetry
+from scenematch.files.truth import write_truth
 from scenematch.runs.arguments import check_between, check_choice
 from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder
@@ -29,6 +35,7 @@ LOOP_OWNED = ("loop.csv", "loop.json", *OWNED)
 START_SIGMA_M = 10.0
 MAX_PITCH_DEG = -30.0
 """Largest pitch of the camera: 60 degrees from the vertical."""
+_JPEG_QUALITY = 95
 _HEIGHT_M = FlightStyle().height_agl_m
 _TOWN_PX, _GSD_M_PER_PX = (900, 1000), 0.53
 
@@ -152,17 +159,33 @@ def write_folder(
     lat_deg: float,
     lon_deg: float,
 ) -> None:
-    """Write the folder of a flight over a town; its telemetry begins with a prior at a latitude and longitude."""
-    write_flight_folder(
-        folder,
-        frames=frames,
-        truth=truth,
-        camera=camera,
-        ortho_rgb=town.ortho,
-        pixel_to_crs=town.pixel_to_crs,
-        crs_epsg=town.crs_epsg,
-        surface_m=town.surface_m,
-        start=Prior(lat_deg=lat_deg, lon_deg=lon_deg, sigma_m=START_SIGMA_M),
-        georeference_sigma_m=EXACT,
-        slope_sigma_deg=EXACT,
-    )
+    """Write the folder of a flight: frames, telemetry.csv, truth.csv, camera.yaml, map.tif and dsm.tif.
+
+    Args:
+        folder: created if it does not exist.
+        town: provides the map and the surface model.
+        camera: intrinsics and mount.
+        frames: file name and stamped frame, consumed one at a time before ``truth``.
+        truth: the true states, in the order of time.
+        lat_deg: of the prior with which the telemetry begins.
+        lon_deg: of the same.
+    """
+    folder = Path(folder)
+    (folder / "frames").mkdir(parents=True, exist_ok=True)
+    rows: list[TelemetryRow] = []
+    for name, frame in frames:
+        Image.fromarray(np.asarray(frame.image)).save(folder / "frames" / name, quality=_JPEG_QUALITY, subsampling=0)
+        rows.append(_telemetry_row(name, frame))
+    rows[0] = replace(rows[0], lat_deg=lat_deg, lon_deg=lon_deg, sigma_m=START_SIGMA_M)
+    write_telemetry(folder / "telemetry.csv", rows)
+    write_truth(folder / "truth.csv", list(truth))
+    (folder / "camera.yaml").write_text(camera_info(camera), encoding="utf-8")
+    grid = town.pixel_to_crs, town.crs_epsg
+    write_geotiff(folder / "map.tif", town.ortho, *grid, tags={GEOREFERENCE_TAG: EXACT})
+    write_geotiff(folder / "dsm.tif", town.surface_m, *grid, tags={SLOPE_TAG: EXACT})
+
+
+def _telemetry_row(name: str, frame: Frame) -> TelemetryRow:
+    known: dict[str, Any] = {column: getattr(frame, column) for column in FRAME_COLUMNS}
+    known["heading_deg"] = wrap_heading_deg(known["heading_deg"])
+    return TelemetryRow(frame=name, **known)

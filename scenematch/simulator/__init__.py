@@ -1,7 +1,7 @@
 """The software-in-the-loop flight: a simulated town, the camera over it, the vehicle and its sensors."""
 
 from scenematch.simulator.conditions import CONDITIONS, Condition
-from scenematch.simulator.flight import FlightPlan, SimulatedFlight, TownOptions, picture_at, plan_flight
+from scenematch.simulator.flight import FlightPlan, TownOptions, picture_at, plan_flight
 from scenematch.simulator.light import LIGHTS, Light
 from scenematch.simulator.optics import ExposureMotion, Optics, take_picture
 from scenematch.simulator.raster_world import world_from_map
@@ -20,7 +20,6 @@ __all__ = [
     "Motion",
     "Optics",
     "SensorNoise",
-    "SimulatedFlight",
     "Town",
     "TownOptions",
     "World",

@@ -186,27 +186,6 @@ class FlightPlan:
             for k, stamp in enumerate(self.timestamps_ns)
         ]
 
-    def draw(self) -> SimulatedFlight:
-        """Render all pictures at once; :meth:`iter_frames` keeps only one at a time."""
-        return SimulatedFlight(self.town, self.camera, list(self.iter_frames()), self.truth_rows())
-
-
-@dataclass(frozen=True)
-class SimulatedFlight:
-    """A flight with rendered pictures.
-
-    Attributes:
-        town: map, surface model and world.
-        camera: that took the frames.
-        frames: pictures with noisy telemetry in them.
-        truth: the exact poses, row for row with the frames.
-    """
-
-    town: Town
-    camera: Camera
-    frames: list[Frame]
-    truth: list[Truth]
-
 
 def paper_camera(pitch_deg: float = NADIR_PITCH_DEG) -> Camera:
     """The paper's camera, 300 x 300 px with 60 degrees.

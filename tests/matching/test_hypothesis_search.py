@@ -10,7 +10,7 @@ from engine.matching import hypothesis_search
 from engine.options import NccOptions
 from engine.window import SPREAD_SIGMAS
 from scenematch.simulator import FlightStyle, SensorNoise, plan_flight
-from tests.support.towns import drawn_town, site_of
+from tests.support.towns import drawn_flight, drawn_town, site_of
 
 EXACT = SensorNoise(**dict.fromkeys(SensorNoise.__dataclass_fields__, 0.0))
 PLACES = (0, 5, 9, 13)
@@ -27,7 +27,7 @@ KNOWN = pytest.mark.parametrize(
 def flight():
     """A flight whose telemetry is the truth: what is off, the tests put there."""
     plan = plan_flight(3, town=drawn_town(1), frames=14, noise=EXACT, style=FlightStyle(peak_tilt_deg=6.9))
-    return plan.draw()
+    return drawn_flight(plan)
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,14 @@ import inspect
 import pickle
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 
 from engine import OrthoMap
-from scenematch.simulator import Town, build_town
+from scenematch.simulator import FlightPlan, Town, build_town
 
 kept_in: Path | None = None
 """The folder that the workers of a run share."""
@@ -22,6 +23,12 @@ kept_in: Path | None = None
 def drawn_town(seed: int = 1) -> Town:
     """The town of a seed, drawn once a process (two seconds): nobody writes into it."""
     return drawn_once(seed)
+
+
+def drawn_flight(plan: FlightPlan) -> SimpleNamespace:
+    """A planned flight with its pictures: town, camera, frames and truth."""
+    frames, truth = list(plan.iter_frames()), plan.truth_rows()
+    return SimpleNamespace(town=plan.town, camera=plan.camera, frames=frames, truth=truth)
 
 
 def drawn_once(*seed: Any, **options: Any) -> Town:
