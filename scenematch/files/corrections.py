@@ -64,11 +64,6 @@ class Corrections:
         return self == Corrections()
 
     @classmethod
-    def from_facts(cls, values: Any) -> Corrections:
-        """From its fields as JSON holds them; None uses the defaults."""
-        return cls() if values is None else cls(**{**values, "columns": tuple(values.get("columns", ()))})
-
-    @classmethod
     def from_texts(cls, texts: Sequence[str]) -> Corrections:
         """From NAME=VALUE each: a field by its name, or one of the columns.
 

@@ -176,6 +176,8 @@ def _value(kind: Any, value: Any, name: str) -> Any:
         if not isinstance(value, dict):
             raise OptionError(f"{name}: expected tables [{name}.NAME], got {value!r}")
         return {key: _value(typing.get_args(kind)[1], item, f"{name}.{key}") for key, item in value.items()}
+    if kind is Any:
+        return value
     if value == NONE and isinstance(kind, types.UnionType):
         return None
     plain = _plain(kind)

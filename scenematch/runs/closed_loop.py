@@ -186,7 +186,7 @@ def _record(
         method=loop.method,
         profile="engine",
         device=device,
-        origin={"lat_deg": site.frame.lat_deg, "lon_deg": site.frame.lon_deg},
+        origin=site.frame,
         ground_m=site.ground_m,
         ground_amsl_m=town.datum_amsl_m + site.ground_m,
         more={"scene": world.facts(), "closed_loop": {"minutes": loop.minutes, "fault": loop.fault}},

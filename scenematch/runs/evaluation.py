@@ -10,7 +10,6 @@ from typing import Any
 from engine.errors import EngineError, OptionError, TelemetryError
 from engine.matching.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
-from scenematch.files.corrections import Corrections
 from scenematch.files.settings import nested, options_from_mapping
 from scenematch.files.track import TrackRow, read_track
 from scenematch.report.finished_track import FinishedTrack
@@ -100,7 +99,7 @@ def recorded_files(record: RunRecord) -> FlightFiles:
     names = {each.name for kind in (MapInput, CameraInput, FlightFiles) for each in fields(kind)} - {"truth"}
     values = {name: getattr(record, name) for name in names & {each.name for each in fields(RunRecord)}}
     unset = {"log_offset_s": record.log_offset_s or 0.0, "every": record.every or 1}
-    return FlightFiles.from_flat(**values | unset | {"corrections": Corrections.from_facts(record.corrections)})
+    return FlightFiles.from_flat(**values | unset | {"corrections": record.corrections})
 
 
 def report(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from engine.errors import EngineError, TelemetryError
+from engine.errors import OptionError, TelemetryError
+from engine.geo import LocalFrame
 from scenematch.files.corrections import Corrections
+from scenematch.files.settings import options_from_mapping
 from scenematch.report.metrics import Ground
 
 PATHS = ("map", "surface", "camera", "frames", "telemetry", "truth", "frame_stamps")
@@ -40,7 +40,7 @@ class RunRecord:
         mount: of the camera, by name.
         camera_pitch_deg: of the camera.
         scale_calibration: whether the calibration was scaled to the pictures.
-        corrections: of the telemetry, by name; None without any.
+        corrections: of the telemetry.
         heights: frames by the source of their height, if the telemetry is a log or the photographs' own.
         method: "ncc", "sift", "auto" or "learned".
         profile: "engine" or "paper".
@@ -48,23 +48,20 @@ class RunRecord:
         start: where the flight began, as typed.
         budget_ms: of a frame.
         changed: settings that are not the defaults, by name.
-        origin: ``lat_deg`` and ``lon_deg`` of the plane of the track.
+        origin: of the plane of the track.
         ground_m: height of the ground on the map.
         ground_amsl_m: the same above the sea, by the telemetry.
         surface_datum: vertical system of the heights, if the file states heights above the sea.
         diagnosis: errors found in the inputs if few frames were fixed, sentences by cause.
         more: other contents of the file, by name.
-
-    Raises:
-        TelemetryError: a value has the wrong type.
     """
 
     map: str
-    surface: str | None
+    surface: str | None = None
     camera: str | None = None
     frames: str | None = None
     telemetry: str | None = None
-    truth: str | None
+    truth: str | None = None
     frame_stamps: str | None = None
     log_offset_s: float | None = None
     image_topic: str | None = None
@@ -77,28 +74,20 @@ class RunRecord:
     mount: str | None = None
     camera_pitch_deg: float | None = None
     scale_calibration: bool = False
-    corrections: Mapping[str, Any] | None = None
-    heights: Mapping[str, int] = field(default_factory=dict)
+    corrections: Corrections = field(default_factory=Corrections)
+    heights: dict[str, int] = field(default_factory=dict)
     method: str
     profile: str
     device: str | None = None
     start: str | None = None
     budget_ms: float | None = None
-    changed: Mapping[str, Any] = field(default_factory=dict)
-    origin: Mapping[str, float]
+    changed: dict[str, Any] = field(default_factory=dict)
+    origin: LocalFrame
     ground_m: float
-    ground_amsl_m: float | None
+    ground_amsl_m: float | None = None
     surface_datum: str | None = None
-    diagnosis: Mapping[str, str] | None = None
-    more: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for each in fields(self):
-            value, (kind, _, none) = getattr(self, each.name), str(each.type).partition(" | ")
-            expected, holds = _TABLES.get(each.name) or _KINDS[kind]
-            if not (holds(value) or (none and value is None)):
-                or_null = " or null" if none else ""
-                raise TelemetryError(f"{each.name}: expected {expected}{or_null}, got {_shown(value)}")
+    diagnosis: dict[str, str] = field(default_factory=dict)
+    more: dict[str, Any] = field(default_factory=dict)
 
     @property
     def ground(self) -> Ground:
@@ -109,6 +98,8 @@ class RunRecord:
         """The record as JSON values."""
         values = asdict(self)
         more: dict[str, Any] = values.pop("more")
+        values["corrections"] = None if self.corrections.changes_nothing else values["corrections"]
+        values["diagnosis"] = self.diagnosis or None
         return values | more
 
 
@@ -122,61 +113,12 @@ def read_record(path: Path) -> RunRecord:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))["settings"]
         known = {each.name for each in fields(RunRecord)} - {"more"}
+        given = {name: value for name, value in values.items() if name in known and value is not None}
         more = {name: value for name, value in values.items() if name not in known}
-        return RunRecord(**{name: value for name, value in values.items() if name in known}, more=more)
+        return options_from_mapping(RunRecord, given | {"more": more})
     except FileNotFoundError:
         raise TelemetryError(f"{path}: expected the summary of a finished track, got no such file") from None
-    except TelemetryError as error:
+    except OptionError as error:
         raise TelemetryError(f"{wrong}; settings, {error}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise TelemetryError(f"{wrong}, got something else") from None
-
-
-def _are_corrections(value: object) -> bool:
-    try:
-        Corrections.from_facts(value)
-    except (EngineError, TypeError, AttributeError):
-        return False
-    return True
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str) and value != "" and "\0" not in value
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_place(value: object) -> bool:
-    if not isinstance(value, Mapping):
-        return False
-    lat_deg: Any = value.get("lat_deg")
-    lon_deg: Any = value.get("lon_deg")
-    return _is_number(lat_deg) and _is_number(lon_deg) and abs(lat_deg) <= 90.0 and abs(lon_deg) <= 360.0
-
-
-def _is_table(value: object, kind: type) -> bool:
-    return isinstance(value, Mapping) and all(isinstance(each, kind) for each in value.values())
-
-
-_KINDS: dict[str, tuple[str, Callable[[object], bool]]] = {
-    "str": ("a text", _is_text),
-    "float": ("a number", _is_number),
-    "int": ("a whole number above 0", lambda value: type(value) is int and value >= 1),
-    "bool": ("true or false", lambda value: isinstance(value, bool)),
-}
-"""What a field holds, in words and as a test, by its type."""
-_TABLES: dict[str, tuple[str, Callable[[object], bool]]] = {
-    "origin": ("lat_deg and lon_deg on the Earth", _is_place),
-    "corrections": ("corrections of the telemetry", _are_corrections),
-    "heights": ("counts by source", lambda value: _is_table(value, int)),
-    "diagnosis": ("sentences", lambda value: _is_table(value, str)),
-    **dict.fromkeys(("changed", "more"), ("a table", lambda value: _is_table(value, object))),
-}
-"""The same of tables, by name."""
-
-
-def _shown(value: object) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 40 else f"{text[:40]}..."

@@ -174,7 +174,8 @@ def write_folder(
     (folder / "frames").mkdir(parents=True, exist_ok=True)
     rows: list[TelemetryRow] = []
     for name, frame in frames:
-        Image.fromarray(np.asarray(frame.image)).save(folder / "frames" / name, quality=_JPEG_QUALITY, subsampling=0)
+        picture = Image.fromarray(np.asarray(frame.image))
+        picture.save(folder / "frames" / name, quality=_JPEG_QUALITY, subsampling=0)
         rows.append(_telemetry_row(name, frame))
     rows[0] = replace(rows[0], lat_deg=lat_deg, lon_deg=lon_deg, sigma_m=START_SIGMA_M)
     write_telemetry(folder / "telemetry.csv", rows)

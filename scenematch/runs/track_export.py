@@ -72,7 +72,7 @@ def _at_truth(folder: Path, track: list[TrackRow], path: Path) -> list[PoseRow]:
     Heights are in the datum of the surface model, as compared in ``summary.json``.
     """
     record = read_record(folder / SUMMARY)
-    ground, frame = record.ground, LocalFrame(**record.origin)
+    ground, frame = record.ground, record.origin
     fixes = [row for row in track if row.fixed]
     truth = open_truth(path, track[0].timestamp_ns)
     heights_m = height_pairs_m(fixes, truth, ground)[:, 1] + ground.ground_m

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,15 +101,15 @@ def _fixed_share(rows: Sequence[TrackRow]) -> float:
 
 def _diagnosis(
     files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, share: float, progress: Progress
-) -> dict[str, str] | None:
-    """Errors found in the inputs; None if the check fails, which must not lose the track."""
+) -> dict[str, str]:
+    """Errors found in the inputs; none if the check fails, which must not lose the track."""
     progress.message(f"{share:.0%} of the frames were fixed: looking for errors in the inputs")
     try:
         found = diagnose_flight(files, settings.start, inputs=inputs, progress=progress)
     except (EngineError, MemoryError, KeyboardInterrupt):
-        return None
+        return {}
     if not found.findings and share >= _FEW_SHARE:
-        return None
+        return {}
     return dict(as_rows(found, corrected=not files.corrections.changes_nothing))
 
 
@@ -121,7 +121,6 @@ def _record(files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, d
     given |= {
         "log_offset_s": files.log_offset_s or None,
         "every": files.every if files.every > 1 else None,
-        "corrections": None if files.corrections.changes_nothing else asdict(files.corrections),
     }
     return RunRecord(
         **given,
@@ -132,7 +131,7 @@ def _record(files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, d
         start=settings.start,
         budget_ms=settings.budget_ms,
         changed=changed(settings),
-        origin={"lat_deg": inputs.site.frame.lat_deg, "lon_deg": inputs.site.frame.lon_deg},
+        origin=inputs.site.frame,
         ground_m=inputs.site.ground_m,
         ground_amsl_m=ground_amsl_m(inputs.flight.rows),
         surface_datum=inputs.site.surface_datum,

@@ -1,8 +1,7 @@
 """Corrections of telemetry: units, signs, swapped columns, offsets and a clock, and what is refused."""
 
-import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 
@@ -86,9 +85,3 @@ def test_a_yaw_in_radians_keeps_its_sign_though_it_was_read_as_a_heading(yaw_rad
     expected = math.degrees(yaw_rad) % 360.0
     assert corrected(row, angles="radians").heading_deg == pytest.approx(expected)
     assert corrected(row, columns=("heading_deg=57.29577951*heading_deg",)).heading_deg == pytest.approx(expected)
-
-
-def test_facts_are_read_as_they_were_written():
-    given = Corrections(columns=("roll_deg=-roll_deg",), offset_s=0.3)
-    assert Corrections.from_facts(json.loads(json.dumps(asdict(given)))) == given
-    assert Corrections.from_facts(None) == Corrections()

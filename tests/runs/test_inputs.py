@@ -10,6 +10,7 @@ from PIL import Image
 
 from engine.camera import Camera, mount_rotation
 from engine.errors import CalibrationError, MapError, OptionError, TelemetryError
+from engine.geo import LocalFrame
 from scenematch import BridgeFiles, CameraInput, Corrections, FlightFiles, MapInput
 from scenematch.cli.app import run
 from scenematch.files.flight import camera_info
@@ -117,7 +118,7 @@ def load(files):
 
 
 def test_the_camera_is_that_of_the_photographs_or_of_a_field_of_view(photos):
-    own = load(FlightFiles(map="m.tif", frames=photos))
+    own = load(FlightFiles.from_flat(map="m.tif", frames=photos))
     assert own.focal_px == pytest.approx(400.0 * 24.0 / np.hypot(36.0, 24.0))
     assert np.allclose(own.mount, mount_rotation())
     lens = {"hfov_deg": 90.0, "mount": "nadir-tail", "camera_pitch_deg": -70.0}
@@ -136,7 +137,7 @@ def test_a_mount_counts_more_than_the_calibrations(photos, tmp_path):
 
 def test_where_a_gimbal_says_where_the_camera_looks_a_mount_is_refused(tmp_path):
     photograph(tmp_path / "a.jpg", xmp=gimbal(), tags={FOCAL_35MM: 24})
-    load(FlightFiles(map="m.tif", frames=tmp_path))
+    load(FlightFiles.from_flat(map="m.tif", frames=tmp_path))
     with pytest.raises(CalibrationError, match="mount: expected nadir, since the telemetry's gimbal angles"):
         load(FlightFiles.from_flat(map="m.tif", frames=tmp_path, mount="nadir-tail"))
     photograph(tmp_path / "a.jpg", xmp=gimbal("+0.0", "+0.0", "+0.0"), tags={FOCAL_35MM: 24})
@@ -260,7 +261,7 @@ def test_a_calibration_is_scaled_on_request_and_said(photos, calibration):
 
 
 def test_without_the_request_another_size_is_refused_and_the_request_named(photos, calibration, map_file, capsys):
-    files = FlightFiles(map="m.tif", frames=photos, camera=calibration)
+    files = FlightFiles.from_flat(map="m.tif", frames=photos, camera=calibration)
     flight = files.open_flight()
     with pytest.raises(CalibrationError, match=r"0\.jpg: camera: calibrated for 640 x 480, .*`scale_calibration`"):
         check_pictures(flight, files.load_camera(flight))
@@ -277,7 +278,7 @@ def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
     files = FlightFiles.from_flat(map="m.tif", frames=photos, camera=calibration, scale_calibration=True)
     with pytest.raises(CalibrationError, match="a part may have been cut off"):
         load(files)
-    unscaled = FlightFiles(map="m.tif", frames=photos, camera=calibration)
+    unscaled = FlightFiles.from_flat(map="m.tif", frames=photos, camera=calibration)
     flight = unscaled.open_flight()
     with pytest.raises(CalibrationError, match="320 x 240; their aspect ratios differ: give the calibration of"):
         check_pictures(flight, unscaled.load_camera(flight))
@@ -296,6 +297,6 @@ def test_a_record_gives_the_same_files(photos, given, camera):
     given = {"map": "/m.tif", "frames": str(photos)} | given
     record = RunRecord(
         **(given | {"camera": camera}), surface=None, truth=None, method="ncc", profile="engine",
-        origin={"lat_deg": 48.0, "lon_deg": 16.0}, ground_m=0.0, ground_amsl_m=None,
+        origin=LocalFrame(48.0, 16.0), ground_m=0.0, ground_amsl_m=None,
     )  # fmt: skip
     assert recorded_files(record) == FlightFiles.from_flat(**given)
