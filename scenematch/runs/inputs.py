@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +38,13 @@ FOLDER_LAYOUT = {
 _OPTIONAL = ("surface", "camera", "telemetry", "truth")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, init=False)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FlightFiles:
     """The files of one flight.
 
     Attributes:
-        map: the map with its surface, or just the path of the map.
-        camera: the camera, or the path of its calibration; None uses a bag's own, or the photographs' EXIF.
+        map: the map with its surface.
+        camera: the camera; without a calibration, a bag's own is used, or the photographs' EXIF.
         frames: folder of pictures, video or bag.
         telemetry: telemetry.csv or a log; None uses the bag's own, the subtitles beside a video, or the pictures'
             EXIF.
@@ -61,54 +61,36 @@ class FlightFiles:
     """
 
     map: MapInput
-    camera: CameraInput
+    camera: CameraInput = field(default_factory=CameraInput)
     frames: Path
-    telemetry: Path | None
-    truth: Path | None
-    frame_stamps: Path | None
-    log_offset_s: float
-    image_topic: str | None
-    odometry_topic: str | None
-    every: int
-    corrections: Corrections
+    telemetry: Path | None = None
+    truth: Path | None = None
+    frame_stamps: Path | None = None
+    log_offset_s: float = 0.0
+    image_topic: str | None = None
+    odometry_topic: str | None = None
+    every: int = 1
+    corrections: Corrections = field(default_factory=Corrections)
 
-    def __init__(
-        self,
-        *,
-        map: MapInput | StrPath,  # noqa: A002 - what the file is, as everywhere
-        frames: StrPath,
-        camera: CameraInput | StrPath | None = None,
-        telemetry: StrPath | None = None,
-        truth: StrPath | None = None,
-        frame_stamps: StrPath | None = None,
-        log_offset_s: float = 0.0,
-        image_topic: str | None = None,
-        odometry_topic: str | None = None,
-        every: int = 1,
-        corrections: Corrections | None = None,
-    ) -> None:
-        check_between("log_offset_s", log_offset_s, -MAX_OFFSET_S, MAX_OFFSET_S)
-        camera = CameraInput.of(camera)
-        if telemetry is None:
-            telemetry = subtitles_beside(frames)
+    def __post_init__(self) -> None:
+        for name in ("frames", "telemetry", "truth", "frame_stamps"):
+            path = getattr(self, name)
+            object.__setattr__(self, name, None if path is None else Path(path))
+        check_between("log_offset_s", self.log_offset_s, -MAX_OFFSET_S, MAX_OFFSET_S)
+        check_every(self.every)
+        frames, camera, telemetry = self.frames, self.camera, self.telemetry or subtitles_beside(self.frames)
         if camera.camera is None and is_bag(frames):
             camera = replace(camera, camera=frames)
-        if camera.camera is None and camera.hfov_deg is None and Path(frames).suffix.lower() in VIDEO_SUFFIXES:
+        object.__setattr__(self, "telemetry", telemetry)
+        object.__setattr__(self, "camera", camera)
+        if camera.camera is None and camera.hfov_deg is None and frames.suffix.lower() in VIDEO_SUFFIXES:
             raise OptionError("camera: expected a calibration, or `hfov_deg`: a video contains neither")
-        if (frame_stamps is not None or log_offset_s) and (telemetry is None or not is_log(telemetry)):
+        if (self.frame_stamps is not None or self.log_offset_s) and (telemetry is None or not is_log(telemetry)):
             raise OptionError(f"frame_stamps, log_offset_s: expected a log as telemetry, got {telemetry}")
-        if image_topic is not None and not is_bag(frames):
+        if self.image_topic is not None and not is_bag(frames):
             raise OptionError(f"image_topic: expected a bag as frames, got {frames}")
-        if odometry_topic is not None and not is_bag(telemetry or frames):
+        if self.odometry_topic is not None and not is_bag(telemetry or frames):
             raise OptionError(f"odometry_topic: expected a bag as telemetry, got {telemetry or frames}")
-        check_every(every)
-        paths = {"frames": frames, "telemetry": telemetry, "truth": truth, "frame_stamps": frame_stamps}
-        values = {name: None if path is None else Path(path) for name, path in paths.items()} | {
-            "map": MapInput.of(map), "camera": camera, "log_offset_s": log_offset_s, "image_topic": image_topic,
-            "odometry_topic": odometry_topic, "every": every, "corrections": corrections or Corrections(),
-        }  # fmt: skip
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
 
     @classmethod
     def from_flat(cls, **values: Any) -> FlightFiles:

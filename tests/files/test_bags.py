@@ -90,7 +90,7 @@ def test_pictures_come_back_byte_for_byte(bag):
 
 def test_a_flight_comes_back(bag):
     path, frames, truth = bag
-    files = FlightFiles(map="m.tif", frames=path, truth=path)
+    files = FlightFiles.from_flat(map="m.tif", frames=path, truth=path)
     flight = files.open_flight()
     camera = files.load_camera(flight)
     assert (camera.width_px, camera.height_px, camera.distortion_model) == (31, 23, "plumb_bob")
