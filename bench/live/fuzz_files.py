@@ -23,7 +23,7 @@ from bench.inputs.log_files import S, dataflash_flight, ulog_flight
 from engine.camera import Camera
 from engine.errors import EngineError
 from engine.values import Frame, Prior
-from scenematch.files.export import WRITERS, pose_rows
+from scenematch.files.export import WRITERS
 from scenematch.files.flight import _frame, open_flight
 from scenematch.files.logs.readers import open_log
 from scenematch.files.resampling import UTC_FROM_NS, rows_and_sources_at, truth_from_log
@@ -92,7 +92,7 @@ def use_truth(path: Path) -> None:
 
 
 def use_track(path: Path) -> None:
-    rows = pose_rows(read_track(path))
+    rows = read_track(path)
     for write in WRITERS.values():
         with suppress(EngineError):
             write(rows)

@@ -120,7 +120,7 @@ def cells_of(cls: type[Any], row: CsvRow, bounds: Mapping[str, Bounds] = {}) -> 
 
     Args:
         cls: dataclass of texts and numbers; those that may be None are None if blank.
-        row: has a column for each field.
+        row: has columns named after some of its fields.
         bounds: ranges by column.
     """
     readers: dict[str, Callable[[str], Any]] = {
@@ -130,7 +130,7 @@ def cells_of(cls: type[Any], row: CsvRow, bounds: Mapping[str, Bounds] = {}) -> 
         "bool | None": lambda name: {"true": True, "false": False}.get(row.values[name]),
         "float | None": lambda name: row.number(name, bounds.get(name, ANY)),
     }
-    return {each.name: readers[str(each.type)](each.name) for each in fields(cls)}
+    return {each.name: readers[str(each.type)](each.name) for each in fields(cls) if each.name in row.values}
 
 
 def quoted(text: str) -> str:

@@ -1,4 +1,7 @@
-"""track.csv: the result of every frame, one row each, written during the run."""
+"""track.csv: the result of every frame, one row each, written during the run.
+
+notes.csv has details of the same frames that track.csv lacks, needed to redraw a report.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,25 @@ from typing import TextIO
 
 from engine.errors import TelemetryError
 from engine.values import Fix, NoFix, Reason
-from scenematch.files.tables import LONGITUDE, NOT_NEGATIVE, QUARTER_TURN, CsvRow, cell_text, cells_of, read_table
+from scenematch.files.tables import (
+    LONGITUDE,
+    NOT_NEGATIVE,
+    QUARTER_TURN,
+    CsvRow,
+    cell_text,
+    cells_of,
+    read_table,
+    write_table,
+)
 
-__all__ = ["TrackRow", "TrackWriter", "read_track", "track_row", "write_track"]
+__all__ = ["TrackRow", "TrackWriter", "read_track", "track_row", "with_notes", "write_notes", "write_track"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackRow:
-    """One row of track.csv; what is unknown is None. The fields are the columns, in their order.
+    """The result of one frame; what is unknown is None.
+
+    The fields are the columns of track.csv, then those of notes.csv, in their order.
 
     Attributes:
         timestamp_ns: capture time of the frame.
@@ -39,6 +53,22 @@ class TrackRow:
         window_height_px: height of the map window that was searched.
         latency_ms: from the frame's arrival to its result.
         deadline_met: whether the result came within the budget; None without a budget.
+        state: state of the navigator after the frame, see :class:`engine.navigation.navigator.NavigatorState`.
+        window_x0_px: first column of the map window that was searched.
+        window_y0_px: first row of the map window that was searched.
+        heading_deg: heading of the match, clockwise from true north.
+        stage: last stage of the search that the budget allowed.
+        confidence: probability that the fix is correct.
+        detail: one sentence with figures on why the frame was refused.
+        sigma_up_m: standard deviation of the height, if it was measured.
+        roll_deg: roll of the whole pose, if measured; positive right side down.
+        pitch_deg: the same; positive nose up.
+        roll_sigma_deg: standard deviation of the roll, if known; so are the next two.
+        pitch_sigma_deg: of the pitch.
+        heading_sigma_deg: of the heading.
+        protection_level_m: radius that contains the vehicle except with a probability of at most 1e-4; None if no
+            bound holds.
+        alt_amsl_m: height above mean sea level, which neither file has; an export may know it.
     """
 
     timestamp_ns: int | None
@@ -59,6 +89,21 @@ class TrackRow:
     window_height_px: int | None = None
     latency_ms: float | None = None
     deadline_met: bool | None = None
+    state: str | None = None
+    window_x0_px: int | None = None
+    window_y0_px: int | None = None
+    heading_deg: float | None = None
+    stage: str | None = None
+    confidence: float | None = None
+    detail: str | None = None
+    sigma_up_m: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    roll_sigma_deg: float | None = None
+    pitch_sigma_deg: float | None = None
+    heading_sigma_deg: float | None = None
+    protection_level_m: float | None = None
+    alt_amsl_m: float | None = None
 
     @property
     def fixed(self) -> bool:
@@ -66,8 +111,12 @@ class TrackRow:
         return self.status == "fix"
 
 
-COLUMNS = tuple(f.name for f in fields(TrackRow))
+_NAMES = tuple(f.name for f in fields(TrackRow))
+COLUMNS = _NAMES[: _NAMES.index("state")]
 """The header of track.csv."""
+NOTE_COLUMNS = ("frame", *_NAMES[len(COLUMNS) : -1])
+"""The header of notes.csv."""
+_LATER = NOTE_COLUMNS[NOTE_COLUMNS.index("sigma_up_m") :]  # columns of notes.csv that older runs lack
 _POSITION = ("lat_deg", "lon_deg", "east_m", "north_m", "sigma_east_m", "sigma_north_m", "covariance_en_m2")
 _BOUNDS = {"lat_deg": QUARTER_TURN, "lon_deg": LONGITUDE} | dict.fromkeys(
     ("sigma_east_m", "sigma_north_m", "latency_ms"), NOT_NEGATIVE
@@ -77,7 +126,14 @@ _DECIMALS = {"lat_deg": 9, "lon_deg": 9, "covariance_en_m2": 6} | dict.fromkeys(
 )
 
 
-def track_row(name: str, result: Fix | NoFix, *, latency_ms: float | None, deadline_met: bool | None) -> TrackRow:
+def track_row(
+    name: str,
+    result: Fix | NoFix,
+    *,
+    latency_ms: float | None,
+    deadline_met: bool | None,
+    state: str | None = None,
+) -> TrackRow:
     """The row of one frame's result.
 
     Args:
@@ -85,6 +141,7 @@ def track_row(name: str, result: Fix | NoFix, *, latency_ms: float | None, deadl
         result: the fix or the refusal.
         latency_ms: time from the frame's arrival to its result.
         deadline_met: whether that was within the budget; None without a budget.
+        state: state of the navigator after it.
     """
     window = result.window
     row = TrackRow(
@@ -95,12 +152,18 @@ def track_row(name: str, result: Fix | NoFix, *, latency_ms: float | None, deadl
         method=result.method,
         window_width_px=None if window is None else window.width_px,
         window_height_px=None if window is None else window.height_px,
+        window_x0_px=None if window is None else window.x0,
+        window_y0_px=None if window is None else window.y0,
         latency_ms=latency_ms,
         deadline_met=deadline_met,
+        state=state,
     )
     if isinstance(result, NoFix):
-        return replace(row, reason=result.reason.value)
-    covariance = result.covariance_m2
+        return replace(row, reason=result.reason.value, detail=result.detail or None)
+    covariance, level_m = result.covariance_m2, result.protection_level_m()
+    # If no height was measured, roll and pitch are the telemetry's or unknown.
+    tilt = None if result.up_m is None else result.attitude
+    roll_sigma_deg, pitch_sigma_deg, heading_sigma_deg = result.attitude_sigma_deg or (None, None, None)
     return replace(
         row,
         lat_deg=float(result.lat_deg),
@@ -111,6 +174,16 @@ def track_row(name: str, result: Fix | NoFix, *, latency_ms: float | None, deadl
         sigma_east_m=math.sqrt(covariance[0, 0]),
         sigma_north_m=math.sqrt(covariance[1, 1]),
         covariance_en_m2=float(covariance[0, 1]),
+        heading_deg=None if result.attitude is None else float(result.attitude.heading_deg),
+        stage=result.stage,
+        confidence=None if result.confidence is None else float(result.confidence),
+        sigma_up_m=None if result.up_m is None else math.sqrt(covariance[2, 2]),
+        roll_deg=None if tilt is None else float(tilt.roll_deg),
+        pitch_deg=None if tilt is None else float(tilt.pitch_deg),
+        roll_sigma_deg=roll_sigma_deg,
+        pitch_sigma_deg=pitch_sigma_deg,
+        heading_sigma_deg=heading_sigma_deg,
+        protection_level_m=level_m if math.isfinite(level_m) else None,
     )
 
 
@@ -188,3 +261,25 @@ def _row(csv_row: CsvRow) -> TrackRow:
         if status == "fix" and not csv_row.values[column]:
             raise csv_row.error(column, "a number, since the row is a fix")
     return TrackRow(**cells_of(TrackRow, csv_row, _BOUNDS))
+
+
+def write_notes(path: str | Path, rows: Iterable[TrackRow]) -> None:
+    """Write notes.csv.
+
+    Raises:
+        TelemetryError: the file cannot be written.
+    """
+    write_table(path, NOTE_COLUMNS, ([cell_text(getattr(row, name), 4) for name in NOTE_COLUMNS] for row in rows))
+
+
+def with_notes(rows: Iterable[TrackRow], path: str | Path) -> list[TrackRow]:
+    """The rows of a track with what notes.csv says of their frames; without that file as they are.
+
+    Raises:
+        TelemetryError: the file cannot be read, or a cell is not what its column holds.
+    """
+    if not Path(path).is_file():
+        return list(rows)
+    required = [name for name in NOTE_COLUMNS if name not in _LATER]
+    notes = {csv_row.text("frame"): csv_row for csv_row in read_table(path, required, _LATER)}
+    return [replace(row, **cells_of(TrackRow, notes[row.frame])) if row.frame in notes else row for row in rows]

@@ -19,7 +19,6 @@ from engine.orthomap import OrthoMap
 from engine.values import Frame, Window
 from engine.window import level_crop, level_for
 from scenematch.files.flight import Flight, FlightFrame
-from scenematch.files.notes import FrameNote
 from scenematch.files.track import TrackRow
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.metrics import TrackErrors
@@ -101,18 +100,18 @@ def explain_frames(track: FinishedTrack, flight: Flight, matcher: SceneMatcher) 
     """Match some frames of a track again, each in the window of its run, and draw the results.
 
     Args:
-        track: with notes.
+        track: its rows have their notes.
         flight: the flight that was tracked.
         matcher: the matcher of the run, or an equal one.
 
     Raises:
         TelemetryError: a frame can no longer be read.
     """
-    notes, errors = track.notes or (), track.errors
+    errors = track.errors
     out = []
     for index in choose_frames(track.rows, errors):
         item, row = flight.read(index), track.rows[index]
-        explained = match_again(matcher, item.frame, row, notes[index])
+        explained = match_again(matcher, item.frame, row)
         places_m = (errors.truth_en_m[index], errors.fix_en_m[index])
         out.append(SliderFrame(index, _images(item, explained, row.fixed, matcher.site, places_m)))
     return out
@@ -150,24 +149,21 @@ def jpeg_data_uri(image: Image, max_bytes: int = _MAX_BYTES) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
 
 
-def match_again(
-    matcher: SceneMatcher, frame: Frame, row: TrackRow, note: FrameNote
-) -> tuple[Window, Explanation] | None:
+def match_again(matcher: SceneMatcher, frame: Frame, row: TrackRow) -> tuple[Window, Explanation] | None:
     """Match a frame again in the window of its run.
 
     Args:
         matcher: the matcher of the run, or an equal one.
         frame: the frame as it was matched.
-        row: its row of the track.
-        note: its note.
+        row: its row of the track, with its notes.
 
     Returns:
         The window and the explanation, or None if the window is unknown or the frame cannot be matched.
     """
-    window = run_window(row, note)
+    window = run_window(row)
     if window is None:
         return None
-    matched = _as_matched(frame, row, note, matcher.site)
+    matched = _as_matched(frame, row, matcher.site)
     method = row.method if row.method in ("ncc", "sift", "learned") else None
     try:
         return window, matcher.explain(matched, window, method)
@@ -218,22 +214,22 @@ def _window_image(
     return replace(_slider_image(crop, caption, alt), overlay="".join(marks))
 
 
-def run_window(row: TrackRow, note: FrameNote) -> Window | None:
+def run_window(row: TrackRow) -> Window | None:
     """The window that the run searched for a frame; None if unknown."""
-    corner, size = (note.window_x0_px, note.window_y0_px), (row.window_width_px, row.window_height_px)
+    corner, size = (row.window_x0_px, row.window_y0_px), (row.window_width_px, row.window_height_px)
     if corner[0] is None or corner[1] is None or size[0] is None or size[1] is None:
         return None
     return Window(corner[0], corner[1], size[0], size[1])
 
 
-def _as_matched(frame: Frame, row: TrackRow, note: FrameNote, site: OrthoMap) -> Frame:
+def _as_matched(frame: Frame, row: TrackRow, site: OrthoMap) -> Frame:
     """The frame with the height and heading of its match if the telemetry had none."""
     height_m, heading_deg = frame.height_agl_m, frame.heading_deg
     if height_m is None and row.up_m is not None and row.lat_deg is not None and row.lon_deg is not None:
         above_m = row.up_m - site.ground_at(site.pixel_from_geodetic(row.lat_deg, row.lon_deg))
         height_m = above_m if above_m > 0.0 else None
     return replace(
-        frame, height_agl_m=height_m, heading_deg=note.heading_deg if heading_deg is None else heading_deg
+        frame, height_agl_m=height_m, heading_deg=row.heading_deg if heading_deg is None else heading_deg
     )
 
 

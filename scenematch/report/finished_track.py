@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from engine.geo import Array
 from engine.orthomap import OrthoMap
 from engine.values import Truth
-from scenematch.files.notes import FrameNote
 from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow
 from scenematch.report.loop_record import LoopRecord
@@ -26,12 +25,11 @@ class FinishedTrack:
     """A finished track with all inputs of its report; the arrays have one element per row.
 
     Attributes:
-        rows: the track.
+        rows: the track, with its notes if the run left them.
         truth: in the order of time, or None.
         site: the map.
         ground: level of the ground.
         summary: contents of summary.json, its settings included.
-        notes: one per row, or None if the run left none.
         telemetry: of the flight, or None if no longer known.
         loop: plan and estimate of a closed loop, or None.
     """
@@ -41,7 +39,6 @@ class FinishedTrack:
     site: OrthoMap
     ground: Ground
     summary: Mapping[str, Any]
-    notes: Sequence[FrameNote] | None
     telemetry: Sequence[TelemetryRow] | None = None
     loop: LoopRecord | None = None
 
@@ -62,6 +59,11 @@ class FinishedTrack:
         """Method and profile, in words."""
         method = str(self.settings["method"])
         return f"{method.upper() if method != 'auto' else 'NCC and SIFT'}, {self.settings['profile']} profile"
+
+    @cached_property
+    def has_notes(self) -> bool:
+        """Whether the run left notes on every frame."""
+        return all(row.state is not None for row in self.rows)
 
     @cached_property
     def is_timed(self) -> bool:

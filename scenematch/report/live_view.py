@@ -27,7 +27,6 @@ from engine.navigation.navigator import Navigator
 from engine.navigation.state import NavigatorState
 from engine.orthomap import OrthoMap
 from engine.values import Fix, Frame, NoFix, Window
-from scenematch.files.notes import frame_note
 from scenematch.files.resampling import UTC_FROM_NS
 from scenematch.files.track import track_row
 from scenematch.report.explain import (
@@ -110,7 +109,7 @@ class LiveView:
         stream = self._stream
         self._set_time(index, frame.timestamp_ns)
         word = "dead" if state is None else state.value
-        entities = self._match_entities(name, frame, result, word, latency_ms)
+        entities = self._match_entities(name, frame, result, latency_ms)
         for entity in (*PICTURES, *PLACES):
             stream.log(entity, entities.get(entity) or rr.Clear(recursive=False))
         image = np.asarray(frame.image, np.uint8)
@@ -144,16 +143,14 @@ class LiveView:
         else:
             self._stream.set_time("capture", duration=np.timedelta64(stamp_ns, "ns"))
 
-    def _match_entities(
-        self, name: str, frame: Frame, result: Fix | NoFix, state: str, latency_ms: float
-    ) -> dict[str, Any]:
+    def _match_entities(self, name: str, frame: Frame, result: Fix | NoFix, latency_ms: float) -> dict[str, Any]:
         """Archetypes of a frame's match, by entity."""
         site = self._matcher.site
         seen: dict[str, Any] = {}
         if isinstance(result, Fix):
             seen["world/ellipse"] = ellipsoid(self._position_m(result, frame), result.covariance_m2)
         row = track_row(name, result, latency_ms=latency_ms, deadline_met=None)
-        explained = match_again(self._matcher, frame, row, frame_note(name, result, state))
+        explained = match_again(self._matcher, frame, row)
         if explained is None:
             return seen
         window, found = explained

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from scenematch.files.notes import FrameNote
 from scenematch.files.track import TrackRow
 from scenematch.report.explain import SliderFrame, run_window
 from scenematch.report.finished_track import FinishedTrack
@@ -103,7 +102,7 @@ def _when(track: FinishedTrack) -> str:
     charts = draw_charts(track)
     if not charts:
         return "<p>There are no frames.</p>"
-    errors, states = track.errors, {note.state for note in track.notes or ()}
+    errors, states = track.errors, {row.state for row in track.rows}
     marks = [
         (True, "fix", '<path class="dots fix" d="M11 7h0"/>'),
         (errors.beyond.any(), "fix beyond three of its sigmas", '<path class="dots beyond" d="M11 7h0"/>'),
@@ -158,17 +157,17 @@ def _choice(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
 def _frame_data(shown: SliderFrame, track: FinishedTrack, track_map: TrackMap) -> dict[str, Any]:
     """The data of one frame for the page's script."""
     i = shown.index
-    row, note = track.rows[i], track.notes[i] if track.notes else None
+    row = track.rows[i]
     beyond = bool(track.errors.beyond[i])
     position_m = track.errors.fix_en_m[i] if row.fixed else track.refused_en_m[i]
-    window = None if note is None else run_window(row, note)
+    window = run_window(row)
     reason = (row.reason or "").replace("_", " ")
     return {
         "name": row.frame,
         "kind": "beyond" if beyond else "fix" if row.fixed else "refused",
         "answer": ("Fix beyond three of its sigmas" if beyond else "Fix") if row.fixed else f"Refused: {reason}",
-        "detail": None if note is None else note.detail,
-        "facts": _facts(i, row, note, track),
+        "detail": row.detail,
+        "facts": _facts(i, row, track),
         "t": round(float(track.time[i]), 3),
         "xy": [round(float(v), 1) for v in track_map.drawing_xy(position_m)]
         if np.isfinite(position_m).all()
@@ -181,7 +180,7 @@ def _frame_data(shown: SliderFrame, track: FinishedTrack, track_map: TrackMap) -
     }
 
 
-def _facts(i: int, row: TrackRow, note: FrameNote | None, track: FinishedTrack) -> list[tuple[str, str]]:
+def _facts(i: int, row: TrackRow, track: FinishedTrack) -> list[tuple[str, str]]:
     """Figures of one frame by name."""
     stated = None
     if row.sigma_east_m is not None and row.sigma_north_m is not None:
@@ -194,9 +193,9 @@ def _facts(i: int, row: TrackRow, note: FrameNote | None, track: FinishedTrack) 
         ("in its sigmas", f"{sigmas:.1f}" if np.isfinite(sigmas) else None),
         ("stated sigma", stated),
         ("score", None if row.score is None else f"{row.score:.3f}"),
-        ("confidence", None if note is None or note.confidence is None else f"{note.confidence:.3f}"),
-        ("method", f"{row.method or '-'}" + (f", {note.stage}" if note is not None and note.stage else "")),
-        ("navigator", None if note is None else note.state),
+        ("confidence", None if row.confidence is None else f"{row.confidence:.3f}"),
+        ("method", f"{row.method or '-'}" + (f", {row.stage}" if row.stage else "")),
+        ("navigator", row.state),
         ("latency", None if row.latency_ms is None else f"{row.latency_ms:.1f} ms"),
     ]
     return [(name, value) for name, value in facts if value is not None]

@@ -72,12 +72,12 @@ def _answers(track: FinishedTrack) -> Chart:
     level = np.array([kinds.index(answer) for answer in answers], np.float64)
     area = ChartArea(track.time_limits, (len(kinds) - 0.5, -0.5), left=150.0)
     fixed, beyond = track.fixed, track.errors.beyond
-    marks = [area.strip(track.time, [note.state for note in track.notes])] if track.notes else []
+    marks = [area.strip(track.time, [row.state or "" for row in track.rows])] if track.has_notes else []
     for kind, chosen in (("refused", ~fixed), ("fix", fixed & ~beyond), ("beyond", beyond)):
         marks.append(dots(area.points(track.time[chosen], level[chosen]), kind))
     names = [kind.replace("_", " ") for kind in kinds]
     chart = area.svg("Answers over time", track.time_label, marks, rows=names, timed=True)
-    return "Answers, over the state of the navigator" if track.notes else "Answers", chart
+    return "Answers, over the state of the navigator" if track.has_notes else "Answers", chart
 
 
 def _height(track: FinishedTrack) -> Chart:
@@ -125,7 +125,7 @@ def _latency(track: FinishedTrack, latency_ms: Array, budget_ms: float | None) -
 def _attitude(track: FinishedTrack) -> list[Chart]:
     """Charts of roll, pitch and heading, those without data left out.
 
-    The notes have the attitudes of the fixes; the telemetry belongs to the rows by frame name.
+    The rows have the attitudes of the fixes; the telemetry belongs to the rows by frame name.
     """
     rows = track.rows
     if len(rows) < 2:
@@ -135,7 +135,7 @@ def _attitude(track: FinishedTrack) -> list[Chart]:
     true = truth_per_row(rows, track.truth or [])
     charts = []
     for name, words in _ANGLES.items():
-        fix = column(track.notes or [None] * len(rows), name)
+        fix = column(rows, name)
         charts.append(_angle_chart(words, fix, column(stated, name), column(true, name), track))
     return [chart for chart in charts if chart is not None]
 

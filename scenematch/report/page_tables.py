@@ -35,7 +35,7 @@ def draw_refusals(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:
         known = set(indices)
         position = next((k for k, item in enumerate(shown) if item.index in known), None)
         index = indices[0] if position is None else shown[position].index
-        detail = (track.notes[index].detail if track.notes else None) or "-"
+        detail = track.rows[index].detail or "-"
         button = (
             "" if position is None else f'<button class="goto" type="button" data-goto="{position}">show</button>'
         )

@@ -15,8 +15,7 @@ from engine.matching.matcher import SceneMatcher
 from engine.navigation.state import NavigatorState
 from engine.orthomap import OrthoMap
 from engine.values import Frame, Truth
-from scenematch.files.notes import frame_note, write_notes
-from scenematch.files.track import track_row, write_track
+from scenematch.files.track import TrackRow, track_row, write_notes, write_track
 from scenematch.report.loop_record import summarise_loop, write_loop_csv
 from scenematch.runs.arguments import check_between, check_choice
 from scenematch.runs.evaluation import evaluate
@@ -30,7 +29,7 @@ from scenematch.simulator import FlightStyle, Town, picture_at
 from scenematch.simulator.faults import FAULT_KINDS, Fault
 from scenematch.simulator.flight import NADIR_PITCH_DEG, reach_m, truth_at
 from scenematch.simulator.light import Image
-from scenematch.simulator.loop import FRAME_RATE_HZ, ClosedLoop
+from scenematch.simulator.loop import FRAME_RATE_HZ, ClosedLoop, LoopAnswer
 from scenematch.simulator.pilot import plan_rounds
 from scenematch.simulator.quadrotor import State
 from scenematch.simulator.town import generator
@@ -122,12 +121,9 @@ def fly_closed_loop(
 def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: Progress) -> dict[str, Any]:
     """Write track, record, figures of merit and report of a finished flight."""
     flown, latency_ms = flight.flown, 1e3 * flight.latency_s
-    answers = [(picture_name(k), answer) for k, answer in enumerate(flown.answers)]
-    rows = [track_row(name, answer.result, latency_ms=latency_ms, deadline_met=None) for name, answer in answers]
+    rows = [_row(k, answer, latency_ms) for k, answer in enumerate(flown.answers)]
     write_track(out / TRACK, rows)
-    states = [NavigatorState.LOST if answer.state is None else answer.state for _, answer in answers]
-    notes = [frame_note(name, a.result, state.value) for (name, a), state in zip(answers, states, strict=True)]
-    write_notes(out / NOTES, notes)
+    write_notes(out / NOTES, rows)
     write_loop_csv(out / LOOP, flown)
     write_json(out / SUMMARY, {"settings": record.facts()})
     summary = evaluate(out, force=True, progress=progress)  # like any finished track
@@ -135,6 +131,11 @@ def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: P
     figures |= {name: summary[name] for name in ("availability", "wrong_over_10m", "false_fixes")}
     write_json(out / "loop.json", figures | {"settings": record.facts()})
     return figures | {"folder": str(out.resolve())}
+
+
+def _row(index: int, answer: LoopAnswer, latency_ms: float) -> TrackRow:
+    state = (answer.state or NavigatorState.LOST).value
+    return track_row(picture_name(index), answer.result, latency_ms=latency_ms, deadline_met=None, state=state)
 
 
 def plan_closed_loop(

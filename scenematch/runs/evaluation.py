@@ -172,4 +172,4 @@ def _finished(folder: Path, site: OrthoMap, record: RunRecord) -> FinishedTrack:
     rows = read_track(folder / TRACK)
     truth = open_run_truth(record.truth, rows)
     summary = summarise(rows, truth, frame=site.frame, ground=record.ground) | {"settings": record.facts()}
-    return FinishedTrack(rows, truth, site, record.ground, summary, None)
+    return FinishedTrack(rows, truth, site, record.ground, summary)

@@ -12,9 +12,8 @@ from engine.matching.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
 from engine.values import Truth
 from scenematch.files.flight import Flight
-from scenematch.files.notes import read_notes
 from scenematch.files.resampling import UTC_FROM_NS
-from scenematch.files.track import TrackRow
+from scenematch.files.track import TrackRow, with_notes
 from scenematch.report.explain import explain_frames
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.loop_record import read_loop_csv
@@ -62,10 +61,9 @@ def write_results(
         )
     write_json(out / SUMMARY, summary)
     if report:
-        notes = read_notes(out / NOTES) if (out / NOTES).is_file() else None
         is_loop = "closed_loop" in summary["settings"]  # a loop.csv may be another run's
         loop = read_loop_csv(out / LOOP) if is_loop and (out / LOOP).is_file() else None
-        track = FinishedTrack(rows, truth, site, record.ground, summary, notes, telemetry, loop)
+        track = FinishedTrack(with_notes(rows, out / NOTES), truth, site, record.ground, summary, telemetry, loop)
         _write_page(out / PAGE, track, frames)
     return summary
 
@@ -84,7 +82,7 @@ def _write_page(path: Path, track: FinishedTrack, frames: ReportFrames) -> None:
     """Write the report, with some frames matched again if possible."""
     if frames.flight is None or frames.matcher is None:
         return write_page(path, track, why_not=f"No frames are shown: {frames.why_missing}")
-    if track.notes is None or [note.frame for note in track.notes] != [row.frame for row in track.rows]:
+    if not track.has_notes:
         return write_page(path, track, why_not=f"No frames are shown: the run left no {NOTES} of its windows.")
     try:
         shown = explain_frames(track, frames.flight, frames.matcher)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from engine.errors import TelemetryError
 from engine.geo import LocalFrame
 from engine.values import Truth
-from scenematch.files.export import WRITERS, PoseRow, pose_rows, segments, tum_rows
+from scenematch.files.export import WRITERS, segments, tum_rows
 from scenematch.files.logs.readers import open_truth
-from scenematch.files.notes import read_notes
-from scenematch.files.track import TrackRow, read_track
+from scenematch.files.track import TrackRow, read_track, with_notes
 from scenematch.report.metrics import height_pairs_m, truth_per_row
 from scenematch.runs.arguments import check_choice
 from scenematch.runs.output import StrPath, check_file
@@ -59,14 +59,14 @@ def export_track(
     return facts | ({"left_out": fixes - len(tum_rows(rows))} if kind == "tum" else {})
 
 
-def _poses(folder: Path, track: list[TrackRow]) -> list[PoseRow]:
-    """The track with the rest of each pose from the run's notes."""
-    notes = read_notes(folder / NOTES) if (folder / NOTES).is_file() else None
+def _poses(folder: Path, track: list[TrackRow]) -> list[TrackRow]:
+    """The track with the rest of each pose from the run's notes, and heights above the sea if it has those."""
+    rows = with_notes(track, folder / NOTES)
     is_amsl = (folder / SUMMARY).is_file() and read_record(folder / SUMMARY).surface_datum is not None
-    return pose_rows(track, notes, is_amsl=is_amsl)
+    return [replace(row, alt_amsl_m=row.up_m) for row in rows] if is_amsl else rows
 
 
-def _at_truth(folder: Path, track: list[TrackRow], path: Path) -> list[PoseRow]:
+def _at_truth(folder: Path, track: list[TrackRow], path: Path) -> list[TrackRow]:
     """The rows of the fixes with the true pose at each time, if known.
 
     Heights are in the datum of the surface model, as compared in ``summary.json``.
@@ -86,10 +86,10 @@ def _at_truth(folder: Path, track: list[TrackRow], path: Path) -> list[PoseRow]:
     return true_rows
 
 
-def _true_row(row: TrackRow, at: Truth, frame: LocalFrame, up_m: float) -> PoseRow:
+def _true_row(row: TrackRow, at: Truth, frame: LocalFrame, up_m: float) -> TrackRow:
     """The true pose at the time of a fix; a height that is not a number is unknown."""
     east_m, north_m = map(float, frame.enu_from_geodetic(at.lat_deg, at.lon_deg))
     names = ("lat_deg", "lon_deg", "alt_amsl_m", "roll_deg", "pitch_deg", "heading_deg")
     known = {name: getattr(at, name) for name in names} | {"up_m": up_m if math.isfinite(up_m) else None}
     own = {name: getattr(row, name) for name in ("timestamp_ns", "frame", "status")}
-    return PoseRow(**own, **known, east_m=east_m, north_m=north_m)
+    return TrackRow(**own, **known, east_m=east_m, north_m=north_m)

@@ -15,10 +15,9 @@ from engine.navigation.navigator import Navigator
 from engine.options import ACCEPT_ALL
 from engine.values import Fix, NoFix, Prior, Reason
 from scenematch.files.flight import FlightFrame
-from scenematch.files.notes import frame_note, write_notes
 from scenematch.files.settings import changed
 from scenematch.files.telemetry import ground_amsl_m
-from scenematch.files.track import TrackRow, TrackWriter, read_track, track_row
+from scenematch.files.track import TrackRow, TrackWriter, read_track, track_row, write_notes
 from scenematch.runs.arguments import parse_budget, parse_position
 from scenematch.runs.checking import as_rows, diagnose_flight
 from scenematch.runs.inputs import FlightFiles, FlightInputs, open_inputs
@@ -157,7 +156,7 @@ def _follow(
         use_priors: whether to use the telemetry's own positions; a given start replaces them.
         view: receives each frame once it is answered.
     """
-    notes = []
+    rows = []
     with TrackWriter(out / TRACK) as writer:
         for index, item in enumerate(frames):
             prior = item.prior if use_priors else None
@@ -165,11 +164,13 @@ def _follow(
             result = _update(navigator, item, prior)
             latency_ms = (time.perf_counter() - begin) * 1e3
             met = None if budget is None else latency_ms <= budget.total_ms
-            writer.write(track_row(item.name, result, latency_ms=latency_ms, deadline_met=met))
-            notes.append(frame_note(item.name, result, navigator.state.value))
+            state = navigator.state
+            row = track_row(item.name, result, latency_ms=latency_ms, deadline_met=met, state=state.value)
+            writer.write(row)
+            rows.append(row)
             if view is not None:
-                view.show(index, item.name, item.frame, result, navigator.state, latency_ms)
-    write_notes(out / NOTES, notes)
+                view.show(index, item.name, item.frame, result, state, latency_ms)
+    write_notes(out / NOTES, rows)
 
 
 def _update(navigator: Navigator, item: FlightFrame, prior: Prior | None) -> Fix | NoFix:

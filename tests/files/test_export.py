@@ -15,8 +15,7 @@ from engine.errors import TelemetryError
 from engine.geo import enu_from_body
 from scenematch.cli.app import run
 from scenematch.files import export
-from scenematch.files.notes import FrameNote
-from scenematch.files.track import write_track
+from scenematch.files.track import TrackRow, with_notes, write_notes, write_track
 from tests.support.commands import refusal as refusal_of
 
 T0 = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
@@ -24,7 +23,7 @@ GPX = "{http://www.topografix.com/GPX/1/1}"
 
 
 def fix(k, lat_deg=32.5, lon_deg=35.25, *, start_ns=T0, up_m=None, **more):
-    return export.PoseRow(
+    return TrackRow(
         timestamp_ns=None if start_ns is None else start_ns + k * 250_000_000, frame=f"<{k}>&.png", status="fix",
         lat_deg=lat_deg + k * 1e-5, lon_deg=lon_deg - k * 2e-5, east_m=1.5 * k, north_m=-0.5 * k, up_m=up_m,
         sigma_east_m=0.25, sigma_north_m=0.5, covariance_en_m2=0.01, score=0.8, method="ncc", **more,
@@ -32,7 +31,7 @@ def fix(k, lat_deg=32.5, lon_deg=35.25, *, start_ns=T0, up_m=None, **more):
 
 
 def refusal(k):
-    return export.PoseRow(timestamp_ns=T0 + k * 250_000_000, frame=f"{k}.png", status="no_fix", reason="low_score")
+    return TrackRow(timestamp_ns=T0 + k * 250_000_000, frame=f"{k}.png", status="no_fix", reason="low_score")
 
 
 RUNS = ([0, 1], [3], [6, 7, 8])
@@ -129,11 +128,11 @@ def test_tum_has_whole_poses_and_leaves_out_what_is_none():
     assert np.loadtxt(io.StringIO(export.to_tum([flat, level])), ndmin=2)[:, 3].tolist() == [150.0]
 
 
-def test_notes_complete_the_pose_of_a_fix_and_of_no_refusal():
+def test_notes_complete_the_pose_of_a_fix(tmp_path):
     known = {"heading_deg": 12.5, "roll_deg": -1.0, "pitch_deg": 2.0, "sigma_up_m": 0.3}
-    notes = [FrameNote(frame=row.frame, state="tracking", **known) for row in ROWS[:3]]
-    rows = export.pose_rows(ROWS[:4], notes)
-    assert [row.angles_deg for row in rows] == [(-1.0, 2.0, 12.5)] * 2 + [None] * 2
+    write_notes(tmp_path / "notes.csv", [replace(row, state="tracking", **known) for row in ROWS[:2]])
+    rows = with_notes(ROWS[:4], tmp_path / "notes.csv")
+    assert [export.angles_deg(row) for row in rows] == [(-1.0, 2.0, 12.5)] * 2 + [None] * 2
     point = json.loads(export.to_geojson(rows))["features"][1]["properties"]
     assert {name: point[name] for name in known} == known
     assert json.loads(export.to_geojson(rows))["features"][-1]["properties"]["sigma_up_m"] is None

@@ -1,6 +1,7 @@
 """Telemetry, truth, frames, flights, tracks and GeoTIFF: what is read, what is written, what is refused."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from PIL import Image
 
 from engine import CalibrationError, Camera, DtypeError, MapError, OptionError, ShapeError
 from engine.values import Frame, NoFix, Prior, Reason, Truth, Window
-from scenematch.files.flight import open_flight, write_flight_folder
+from scenematch.files.flight import open_flight
 from scenematch.files.frames import open_frames, read_image
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.telemetry import (
@@ -21,8 +22,9 @@ from scenematch.files.telemetry import (
     read_telemetry,
     write_telemetry,
 )
-from scenematch.files.track import COLUMNS, TrackRow, TrackWriter, read_track, track_row, write_track
+from scenematch.files.track import COLUMNS, NOTE_COLUMNS, TrackRow, TrackWriter, read_track, track_row, write_track
 from scenematch.files.truth import interpolate_truth, read_truth, write_truth
+from scenematch.runs.simulation import write_folder
 from tests.support.fixes import a_fix
 from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
@@ -366,7 +368,9 @@ def test_a_camera_of_another_size_is_refused_up_front(folder):
 
 
 AFFINE = [[0.5, 0.0, 600_000.25], [0.0, -0.5, 3_600_000.75]]
-WORLD = {"ortho_rgb": picture(9, (20, 10)), "pixel_to_crs": AFFINE, "crs_epsg": 32636}
+TOWN = SimpleNamespace(
+    ortho=picture(9, (20, 10)), surface_m=np.zeros((10, 20), np.float32), pixel_to_crs=AFFINE, crs_epsg=32636
+)
 
 
 def test_a_written_flight_folder_reads_back(tmp_path):
@@ -376,9 +380,7 @@ def test_a_written_flight_folder_reads_back(tmp_path):
     frames = [
         (f"{i:06d}.png", Frame(picture(i), i * 10**8, 150.0 + i, -90.0, 1.0, 2.0, 3.0, 4.0)) for i in range(3)
     ]
-    start = Prior(lat_deg=32.0, lon_deg=35.0, sigma_m=5.0)
-    more = {"truth": truth, "camera": camera, "surface_m": np.zeros((10, 20)), "start": start}
-    write_flight_folder(tmp_path, frames=frames, **WORLD, **more)
+    write_folder(tmp_path, TOWN, camera, frames, truth, 32.0, 35.0)
     loaded = Camera.load(tmp_path / "camera.yaml")
     for name in ("matrix", "distortion", "mount"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(camera, name))
@@ -386,16 +388,10 @@ def test_a_written_flight_folder_reads_back(tmp_path):
     assert [item.frame.height_agl_m for item in flight] == [150.0, 151.0, 152.0]
     assert flight[0].frame.heading_deg == 270.0
     assert (flight[2].frame.image == 2).all()
-    assert [item.prior for item in flight] == [start, None, None]
+    assert [item.prior for item in flight] == [Prior(lat_deg=32.0, lon_deg=35.0, sigma_m=10.0), None, None]
     assert read_truth(tmp_path / "truth.csv") == truth
     with rasterio.open(tmp_path / "map.tif") as ortho, rasterio.open(tmp_path / "dsm.tif") as surface:
         assert (ortho.count, ortho.crs.to_epsg(), surface.dtypes) == (3, 32636, ("float32",))
-
-
-def test_a_frame_without_a_stamp_cannot_be_written(tmp_path):
-    inputs = {"frames": [("a.png", Frame(picture(1)))], "truth": [], "camera": Camera.from_fov(8, 6, 60.0)}
-    message = refusal(write_flight_folder, tmp_path, **inputs, **WORLD)
-    assert "a.png: timestamp_ns: expected a stamp" in message
 
 
 # -------------------------------------------------------------------------------------------------- GeoTIFF
@@ -476,7 +472,8 @@ def test_a_track_reads_back(tmp_path):
         track_row("b", fix, latency_ms=2.5, deadline_met=True),
     ]
     write_track(tmp_path / "track.csv", rows)
-    assert read_track(tmp_path / "track.csv") == rows
+    noted = dict.fromkeys(NOTE_COLUMNS[1:])
+    assert read_track(tmp_path / "track.csv") == [dataclasses.replace(row, **noted) for row in rows]
     assert [row.fixed for row in rows] == [False, True]
 
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,8 @@ from engine.options import MatcherOptions, NccOptions, SiftOptions
 from engine.values import Reason, Window
 from scenematch import TrackSettings, evaluate
 from scenematch.cli.app import run
-from scenematch.files.notes import FrameNote, frame_note, read_notes, write_notes
 from scenematch.files.settings import changed, nested, options_from_mapping
-from scenematch.files.track import TrackRow, read_track
+from scenematch.files.track import NOTE_COLUMNS, TrackRow, read_track, track_row, with_notes, write_notes
 from scenematch.report.charts import ChartArea, ticks
 from scenematch.report.explain import choose_frames
 from scenematch.report.finished_track import FinishedTrack
@@ -150,11 +150,12 @@ def test_notes_come_back_as_they_were(tmp_path):
     window = Window(3, 4, 50, 60)
     refusal = NoFix(reason=Reason.AMBIGUOUS, detail='0.41 against 0.40, "here"', window=window)
     notes = [
-        frame_note("a.jpg", refusal, "lost"),
-        FrameNote(frame="b.jpg", state="tracking", heading_deg=12.5, stage="fine"),
+        track_row("a.jpg", refusal, latency_ms=None, deadline_met=None, state="lost"),
+        TrackRow(timestamp_ns=1, frame="b.jpg", status="fix", state="tracking", heading_deg=12.5, stage="fine"),
     ]
     write_notes(tmp_path / "notes.csv", notes)
-    assert read_notes(tmp_path / "notes.csv") == notes
+    empty = dict.fromkeys(NOTE_COLUMNS[1:])
+    assert with_notes([replace(row, **empty) for row in notes], tmp_path / "notes.csv") == notes
     assert (notes[0].window_x0_px, notes[0].window_y0_px) == (3, 4)
 
 
@@ -251,7 +252,7 @@ def page_of(flown, tmp_path):
 
     def written(rows):
         summary, site = summarise(rows) | {"settings": settings | {"truth": None}}, OrthoMap.open(settings["map"])
-        write_page(tmp_path / "report.html", FinishedTrack(rows, None, site, Ground(), summary, None))
+        write_page(tmp_path / "report.html", FinishedTrack(rows, None, site, Ground(), summary))
         return (tmp_path / "report.html").read_text(encoding="utf-8")
 
     return written

@@ -13,8 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenematch import TrackSettings, export_track, track
-from scenematch.files.notes import read_notes
-from scenematch.files.track import read_track
+from scenematch.files.track import read_track, with_notes
 from tests.support.runs import bare_runs
 
 FRAMES = 5
@@ -54,7 +53,8 @@ def test_the_attitude_is_that_of_the_fixes_and_near_the_truth(finished):
     (_, _, turns), (_, _, true_turns) = (tum(finished / f"{name}.tum") for name in ("track", "truth"))
     assert np.degrees((turns * true_turns.inv()).magnitude()).max() < 2.0
     assert np.degrees(turns.magnitude()).max() > 1.0  # no identity among them
-    notes = [note for note in read_notes(finished / "notes.csv") if note.roll_deg is not None]
+    rows = with_notes(read_track(finished / "track.csv"), finished / "notes.csv")
+    notes = [row for row in rows if row.roll_deg is not None]
     assert len(notes) == len(turns)
     assert all(note.sigma_up_m > 0.0 for note in notes)
 
