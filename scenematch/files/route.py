@@ -13,7 +13,6 @@ from engine.errors import TelemetryError
 
 _WAYPOINT_COMMANDS = (16, 17, 18, 19, 21, 22, 31, 82)  # MAV_CMD_NAV_* that fly to a latitude and longitude
 _RETURN_COMMAND = 20
-_MAX_NUMBER = 1e9
 
 
 def read_route(path: str | Path) -> NDArray[np.float64]:
@@ -35,92 +34,58 @@ def read_route(path: str | Path) -> NDArray[np.float64]:
     path = Path(path)
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
+        positions = _plan_positions(content) if content.get("fileType") == "Plan" else _line_positions(content)
+        route = np.array(positions, np.float64).reshape(-1, 2)
     except FileNotFoundError:
         raise TelemetryError(f"route: no such file: {path}") from None
-    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise TelemetryError(f"route: {path} cannot be read as JSON: {reason}") from None
-    try:
-        positions = _positions(content)
-    except TelemetryError as error:
-        raise TelemetryError(f"route: {path}: {error}") from None
-    if len(positions) < 2:
-        raise TelemetryError(f"route: {path}: expected two or more waypoints, got {len(positions)}")
-    return np.array(positions, dtype=np.float64)
+    except OSError as error:
+        raise TelemetryError(f"route: {path} cannot be read: {error.strerror}") from None
+    except _MALFORMED:
+        raise TelemetryError(f"route: {path}: expected one GeoJSON LineString, or a QGroundControl plan") from None
+    if len(route) < 2:
+        raise TelemetryError(f"route: {path}: expected two or more waypoints, got {len(route)}")
+    if not (np.abs(route) <= (90.0, 360.0)).all():  # NaN fails too
+        raise TelemetryError(f"route: {path}: expected latitudes within 90 and longitudes within 360 degrees")
+    return route
 
 
-def _positions(content: Any) -> list[tuple[float, float]]:
-    if isinstance(content, dict) and content.get("fileType") == "Plan":
-        return _plan_positions(content)
-    lines = list(_lines(content))
-    if len(lines) != 1:
-        kinds = "a GeoJSON LineString or a QGroundControl plan"
-        raise TelemetryError(f"expected one route, {kinds}, got {len(lines)}")
-    return [_position(point[1::-1], point) for point in map(_numbers, lines[0])]
+_MALFORMED = (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, RecursionError)
 
 
-def _lines(content: Any) -> list[list[Any]]:
+def _line_positions(content: Any) -> list[Any]:
+    """Latitude and longitude of the only LineString."""
+    (line,) = _lines(content)
+    return [point[1::-1] for point in line]
+
+
+def _lines(content: Any) -> list[Any]:
     """Coordinates of all LineStrings, at any depth."""
-    if not isinstance(content, dict):
-        return []
     kind = content.get("type")
-    if kind == "LineString" and isinstance(content.get("coordinates"), list):
+    if kind == "LineString":
         return [content["coordinates"]]
     if kind == "Feature":
-        return _lines(content.get("geometry"))
-    if kind == "FeatureCollection" and isinstance(content.get("features"), list):
-        return [line for one in content["features"] for line in _lines(one)]
-    return []
+        return _lines(content.get("geometry") or {})
+    return [line for one in content.get("features", ()) for line in _lines(one)]
 
 
-def _numbers(point: Any) -> list[Any]:
-    if not isinstance(point, list) or len(point) < 2:
-        raise TelemetryError(f"expected a position [lon, lat], got {str(point)[:60]}")
-    return point
-
-
-def _position(lat_lon: list[Any], source: Any) -> tuple[float, float]:
-    """Check that two values are a latitude and a longitude in degrees."""
-    for value in lat_lon:
-        # Checked before conversion: JSON allows integers beyond floats, and Python's parser accepts NaN.
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _MAX_NUMBER:
-            raise TelemetryError(f"expected a latitude and a longitude in degrees, got {str(source)[:60]}")
-    lat, lon = float(lat_lon[0]), float(lat_lon[1])
-    if abs(lat) > 90.0 or abs(lon) > 360.0:
-        raise TelemetryError(
-            f"expected a latitude within 90 and a longitude within 360 degrees, got {lat:g}, {lon:g}"
-        )
-    return lat, lon
-
-
-def _plan_positions(plan: dict[str, Any]) -> list[tuple[float, float]]:
-    mission = plan.get("mission")
-    if not isinstance(mission, dict) or not isinstance(mission.get("items"), list):
-        raise TelemetryError("expected a plan with mission.items")
-    positions: list[tuple[float, float]] = []
+def _plan_positions(plan: Any) -> list[Any]:
+    """Latitude and longitude of what a plan flies to, and of its home where it returns there."""
+    mission = plan["mission"]
+    positions = []
     for item in _simple_items(mission["items"]):
-        if item.get("command") == _RETURN_COMMAND and isinstance(mission.get("plannedHomePosition"), list):
-            home = _numbers(mission["plannedHomePosition"])
-            positions.append(_position(home[:2], home))
-        params = item.get("params")
-        if item.get("command") not in _WAYPOINT_COMMANDS or not isinstance(params, list) or len(params) < 6:
-            continue
-        if params[4] is None or params[5] is None or (params[4] == 0 and params[5] == 0):
-            continue  # at the vehicle's current position, like a take-off
-        positions.append(_position(params[4:6], params))
+        command, params = item.get("command"), item.get("params")
+        if command == _RETURN_COMMAND:
+            positions.append(mission["plannedHomePosition"][:2])
+        # Neither, or 0 and 0, is at the vehicle's current position, like a take-off.
+        elif command in _WAYPOINT_COMMANDS and None not in params[4:6] and any(params[4:6]):
+            positions.append(params[4:6])
     return positions
 
 
-def _simple_items(items: list[Any]) -> list[dict[str, Any]]:
+def _simple_items(items: Any) -> list[Any]:
     """The simple items of a mission, including those inside surveys."""
-    found: list[dict[str, Any]] = []
+    found = []
     for item in items:
-        if not isinstance(item, dict):
-            raise TelemetryError(f"expected mission items that are objects, got {str(item)[:60]}")
-        nested = item.get("TransectStyleComplexItem")
-        nested = nested.get("Items") if isinstance(nested, dict) else item.get("Items")
-        if isinstance(nested, list):
-            found += _simple_items(nested)
-        else:
-            found.append(item)
+        nested = item.get("TransectStyleComplexItem", item).get("Items")
+        found += [item] if nested is None else _simple_items(nested)
     return found
