@@ -7,7 +7,7 @@ import ipaddress
 import select
 import socket
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from engine.errors import OptionError, require
 
@@ -19,25 +19,6 @@ _MAX_DATAGRAMS = 256  # per call, so that a flood cannot stop the reader's other
 _SYNTAX = "udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 _KINDS = {"udp": "udpin", "udpin": "udpin", "udpout": "udpout", "tcp": "tcp", "tcpout": "tcp", "serial": "serial"}
 """Kinds of links by their names here, in pymavlink and MAVProxy (udp listens), and in MAVSDK (tcpout)."""
-
-
-class Link(Protocol):
-    """A byte link to a vehicle. The constructor opens it; later failures raise OSError.
-
-    Attributes:
-        is_stream: whether a packet may be split between reads; a datagram holds whole packets.
-    """
-
-    is_stream: bool
-
-    def receive(self, timeout_s: float) -> list[tuple[bytes, PeerAddress]]:
-        """Return the received (bytes, sender) pairs, waiting at most ``timeout_s``."""
-
-    def send(self, data: bytes, to: PeerAddress) -> None:
-        """Send one packet; it is dropped while no peer is known."""
-
-    def close(self) -> None:
-        """Release the port."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,3 +174,11 @@ class _Serial:
 
     def close(self) -> None:
         self._port.close()
+
+
+Link = _Udp | _Tcp | _Serial
+"""A byte link to a vehicle; failures after it was opened raise OSError.
+
+``receive`` returns the received (bytes, sender) pairs, waiting at most a time; ``send`` sends one packet, which is
+dropped while no peer is known. ``is_stream`` says whether a packet may be split between reads.
+"""

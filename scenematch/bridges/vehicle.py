@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import Proj
 
 from engine.values import Attitude, Fix, Frame
 
@@ -183,11 +184,6 @@ def north_east_m(lat_deg: float, lon_deg: float, origin: NedOrigin, firmware: st
         east_1e7 = math.remainder(lon_deg - origin.lon_deg, 360.0) * 1e7
         east_m = east_1e7 * _ARDUPILOT_M_PER_1E7_DEG * max(math.cos(middle), 0.01)
         return north_1e7 * _ARDUPILOT_M_PER_1E7_DEG, east_m
-    lat, lat0 = math.radians(lat_deg), math.radians(origin.lat_deg)
-    delta_lon = math.radians(lon_deg - origin.lon_deg)
-    north = math.cos(lat0) * math.sin(lat) - math.sin(lat0) * math.cos(lat) * math.cos(delta_lon)
-    east = math.cos(lat) * math.sin(delta_lon)
-    along = math.sin(lat0) * math.sin(lat) + math.cos(lat0) * math.cos(lat) * math.cos(delta_lon)
-    sine = math.hypot(north, east)
-    factor = math.atan2(sine, along) / sine if sine > 0.0 else 1.0
-    return factor * north * _PX4_EARTH_M, factor * east * _PX4_EARTH_M
+    plane = Proj(proj="aeqd", lat_0=origin.lat_deg, lon_0=origin.lon_deg, R=_PX4_EARTH_M)
+    east_m, north_m = plane(lon_deg, lat_deg)
+    return north_m, east_m
