@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -28,12 +28,11 @@ _USUAL_NS = (5e6, 2e10)
 _FROZEN_SHARE = 0.1
 
 
-class Telemetry(Protocol):
-    """What is known about one picture: a :class:`engine.values.Frame` or a row of telemetry.csv."""
+Telemetry = Any
+"""What is known about one picture: a :class:`engine.values.Frame` or a row of telemetry.csv.
 
-    @property
-    def timestamp_ns(self) -> int | None:
-        """Of the capture; roll_deg, pitch_deg, heading_deg, height_agl_m and velocities are read as well."""
+Its timestamp_ns, roll_deg, pitch_deg, heading_deg, height_agl_m and velocities are read.
+"""
 
 
 def diagnose(

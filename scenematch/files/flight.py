@@ -149,8 +149,7 @@ def open_flight(
         rows, height_sources = rows_and_sources_at(log, *stamp_frames(source, log, frame_stamps, log_offset_s))
     elif telemetry is not None:
         _check_is_table(Path(telemetry))
-        table = open_telemetry(telemetry, source, source.description, columns)
-        rows, remarks = table.rows, table.remarks
+        rows, remarks = open_telemetry(telemetry, source, source.description, columns)
     elif isinstance(source, VideoFile):
         rows = []
     else:

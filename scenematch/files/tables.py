@@ -89,13 +89,6 @@ class CsvRow:
             raise self.error(column, "a whole number")
         return int(text)
 
-    def stamp(self) -> int:
-        """The time stamp in nanoseconds, which must not be blank."""
-        value = self.integer("timestamp_ns")
-        if value is None:
-            raise self.error("timestamp_ns", "whole nanoseconds")
-        return value
-
     def number(self, column: str, bounds: Bounds = ANY) -> float | None:
         """A finite number within ``bounds``, or None if blank; a heading is normalised to [0, 360)."""
         text = self.values[column]

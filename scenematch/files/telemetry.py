@@ -127,24 +127,11 @@ COLUMNS = (*STAMP_COLUMNS, "frame", *BOUNDS)
 _HINT = "; [telemetry_columns] of the settings names those that are ours"
 
 
-@dataclass(frozen=True, slots=True)
-class Telemetry:
-    """The contents of a telemetry.csv.
-
-    Attributes:
-        rows: one per frame.
-        remarks: what was inferred rather than stated by the file, one sentence each.
-    """
-
-    rows: list[TelemetryRow]
-    remarks: list[str]
-
-
 def read_telemetry(
     path: str | Path, frames: Container[str] | None = None, description: str = "a frame that is there"
 ) -> list[TelemetryRow]:
     """The rows of :func:`open_telemetry`."""
-    return open_telemetry(path, frames, description).rows
+    return open_telemetry(path, frames, description)[0]
 
 
 def open_telemetry(
@@ -152,7 +139,7 @@ def open_telemetry(
     frames: Container[str] | None = None,
     description: str = "a frame that is there",
     names: Mapping[str, str] = {},
-) -> Telemetry:
+) -> tuple[list[TelemetryRow], list[str]]:
     """Read telemetry.csv; headings are normalised to [0, 360).
 
     Args:
@@ -160,6 +147,9 @@ def open_telemetry(
         frames: the frame names that are allowed, or None for any.
         description: those names in words, for messages.
         names: the file's column names, by our names in :data:`COLUMNS`; other columns keep our names.
+
+    Returns:
+        One row per frame, and what was inferred rather than stated by the file, one sentence each.
 
     Raises:
         TelemetryError: the file cannot be read, has no rows, or a row is invalid: the message has line and column.
@@ -182,7 +172,7 @@ def open_telemetry(
     read = {names.get(ours, ours) for ours in COLUMNS}
     unread = ", ".join(name for name in csv_rows[0].header if name and name not in read)
     remarks = [remark, unread and f"{Path(path).name}: columns that are not read: {unread}{_HINT}"]
-    return Telemetry(rows, [each for each in remarks if each])
+    return rows, [each for each in remarks if each]
 
 
 def _telemetry_row(csv_row: CsvRow, stamp_ns: int) -> TelemetryRow:

@@ -69,7 +69,7 @@ def read_loop_csv(path: Path) -> LoopRecord:
         TelemetryError: the file cannot be read, or a cell is not what its column holds.
     """
     rows = list(read_table(path, ("timestamp_ns", "healthy", *_PLACES, *_SIGMAS)))
-    stamps_ns = np.array([row.stamp() for row in rows], np.int64)
+    stamps_ns = np.array([row.integer("timestamp_ns") or 0 for row in rows], np.int64)
     places = np.array([[row.required(name) for name in _PLACES] for row in rows], np.float64).reshape(-1, 3, 3)
     sigma_m = np.array([max(map(row.required, _SIGMAS)) for row in rows], np.float64)
     healthy = np.array([row.text("healthy") == "true" for row in rows], np.bool_)

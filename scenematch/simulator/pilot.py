@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from engine.errors import OptionError
 from engine.geo import Array
 from scenematch.simulator.quadrotor import STEP_S
 from scenematch.simulator.vehicle import COURSE_STEP_S, FlightStyle, course
@@ -74,24 +73,16 @@ def plan_route(waypoints_m: Array, style: FlightStyle | None = None) -> Route:
     """Legs at constant height between waypoints with a stop at each, as in the built-in flight.
 
     Args:
-        waypoints_m: (N, 2) east and north.
+        waypoints_m: (N, 2) east and north, two or more, neighbours apart.
         style: speed, acceleration, pauses and height.
 
     Returns:
         Route: from the first waypoint to the last.
-
-    Raises:
-        OptionError: there are fewer than two waypoints, or two in a row are less than 1 m apart.
     """
     style = style or FlightStyle()
-    points = np.asarray(waypoints_m, float)
-    if points.ndim != 2 or points.shape[1:] != (2,) or len(points) < 2 or not np.isfinite(points).all():
-        raise OptionError(f"waypoints_m: expected (N, 2) finite metres with 2 or more rows, got {points.shape}")
-    if (np.hypot(*np.diff(points, axis=0).T) < 1.0).any():
-        raise OptionError("waypoints_m: expected neighbours 1 m apart or more")
-    push, nose, kicks = course(points, style)
+    push, nose, kicks = course(waypoints_m, style)
     speed = np.cumsum(push, axis=0) * COURSE_STEP_S
-    position = points[0] + np.cumsum(speed, axis=0) * COURSE_STEP_S
+    position = waypoints_m[0] + np.cumsum(speed, axis=0) * COURSE_STEP_S
     flat = np.zeros((len(push), 1))
     return Route(
         np.hstack([position, flat + style.height_agl_m]),
@@ -109,12 +100,7 @@ def plan_rounds(half_m: tuple[float, float], seconds: float, style: FlightStyle 
         half_m: half its sides, to the east and to the north.
         seconds: least duration.
         style: speed and height.
-
-    Raises:
-        OptionError: a side is too short for a leg.
     """
-    if min(half_m) < 5.0:
-        raise OptionError(f"half_m: expected 5 m or more, got {half_m[0]:.1f} and {half_m[1]:.1f}")
     corners = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * half_m
     points = corners[:2]
     while (route := plan_route(points, style)).duration_s < seconds:

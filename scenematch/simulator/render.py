@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.errors import OptionError, ShapeError
+from engine.errors import OptionError
 from engine.geo import LocalFrame
 from engine.values import Attitude
 from scenematch.simulator.light import Array, Float32, Image, Light
@@ -76,9 +76,6 @@ class World:
         air: between camera and ground; None if perfectly clear.
         glint: the sun on water; None for none.
         gsd_m_per_px: a pixel in grid metres.
-
-    Raises:
-        ShapeError: the rasters do not fit together.
     """
 
     rgb: Image
@@ -92,15 +89,6 @@ class World:
     gsd_m_per_px: float = field(init=False)
 
     def __post_init__(self) -> None:
-        size, rgb, sides = self.height_m.shape, self.rgb.shape, self.sides.shape
-        if len(size) != 2 or rgb != (*size, 3) or sides != (*size, 4):
-            raise ShapeError(f"world: expected (H, W, 3), (H, W, 4) and (H, W), got {rgb}, {sides} and {size}")
-        water = None if self.glint is None else self.glint.water
-        for name, raster in (("ground_m", self.ground_m), ("water", water)):
-            if raster is not None and raster.shape != size:
-                raise ShapeError(f"{name}: expected {size} as the heights, got {raster.shape}")
-        if self.pixel_to_crs.shape != (2, 3):
-            raise ShapeError(f"pixel_to_crs: expected (2, 3), got {self.pixel_to_crs.shape}")
         area = abs(float(np.linalg.det(self.pixel_to_crs[:, :2])))
         object.__setattr__(self, "gsd_m_per_px", math.sqrt(area))
 

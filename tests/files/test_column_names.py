@@ -22,11 +22,11 @@ PLACE = "[telemetry_columns] of the settings names those that are ours"
 
 def test_named_columns_are_read_and_the_others_told_in_one_line(save):
     names = {ours: theirs for ours, theirs in NAMES.items() if theirs != "Yaw"}
-    found = open_telemetry(save(OTHERS + MORE), names=names)
-    row = found.rows[1]
+    rows, remarks = open_telemetry(save(OTHERS + MORE), names=names)
+    row = rows[1]
     assert (row.timestamp_ns, row.frame, row.height_agl_m, row.heading_deg) == (500_000_000, "1.png", 121.5, None)
     assert (row.lat_deg, row.lon_deg) == (48.5, 16.5)
-    assert found.remarks == ["telemetry.csv: columns that are not read: Yaw, battery; " + PLACE]
+    assert remarks == ["telemetry.csv: columns that are not read: Yaw, battery; " + PLACE]
 
 
 def test_a_missing_required_column_is_told_with_those_that_are_there(save):

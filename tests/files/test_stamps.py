@@ -36,10 +36,10 @@ def stamps(path):
 )
 def test_the_unit_is_recognised_and_said_in_one_line(tmp_path, truth_ns, per_s, word):
     given = [ns / 10**9 if per_s == 1 else ns * per_s // 10**9 for ns in truth_ns]
-    found = open_telemetry(table(tmp_path / "t.csv", given))
-    assert [row.timestamp_ns for row in found.rows] == pytest.approx(truth_ns, abs=0, rel=1e-15)
+    rows, remarks = open_telemetry(table(tmp_path / "t.csv", given))
+    assert [row.timestamp_ns for row in rows] == pytest.approx(truth_ns, abs=0, rel=1e-15)
     said = [] if word is None else [f"t.csv: timestamp_ns is taken as {word}"]
-    assert [remark.split(":")[:2] for remark in found.remarks] == [line.split(":") for line in said]
+    assert [remark.split(":")[:2] for remark in remarks] == [line.split(":") for line in said]
 
 
 @pytest.mark.parametrize(
@@ -47,9 +47,9 @@ def test_the_unit_is_recognised_and_said_in_one_line(tmp_path, truth_ns, per_s, 
 )
 def test_a_name_that_states_the_unit_needs_no_words(tmp_path, column, per_s):
     path = table(tmp_path / "t.csv", [k * 10 * per_s for k in range(5)], column)
-    found = open_telemetry(path)
-    assert found.remarks == []
-    assert [row.timestamp_ns for row in found.rows] == [k * 10**10 for k in range(5)]
+    rows, remarks = open_telemetry(path)
+    assert remarks == []
+    assert [row.timestamp_ns for row in rows] == [k * 10**10 for k in range(5)]
 
 
 def test_microseconds_of_utc_between_photographs_are_not_nanoseconds(tmp_path):
@@ -60,18 +60,18 @@ def test_microseconds_of_utc_between_photographs_are_not_nanoseconds(tmp_path):
 def test_dates_as_python_writes_them(tmp_path):
     start = datetime.datetime(2026, 5, 1, 14, 0, 0, 250_000, datetime.timezone(datetime.timedelta(hours=2)))
     given = [(start + datetime.timedelta(milliseconds=500 * k)).isoformat() for k in range(60)]
-    found = open_telemetry(table(tmp_path / "t.csv", given))
-    assert [row.timestamp_ns for row in found.rows] == UTC_NS
-    assert found.remarks == []
+    rows, remarks = open_telemetry(table(tmp_path / "t.csv", given))
+    assert [row.timestamp_ns for row in rows] == UTC_NS
+    assert remarks == []
 
 
 def test_dates_without_a_zone_are_utc_and_said(tmp_path):
     moments = [datetime.datetime.fromtimestamp(ns / 1e9, datetime.UTC) for ns in UTC_NS]
     given = [moment.strftime("%Y-%m-%d %H:%M:%S.%f")[:-3] for moment in moments]  # as a database writes them
-    found = open_telemetry(table(tmp_path / "t.csv", given))
-    assert [row.timestamp_ns for row in found.rows] == UTC_NS
-    assert found.remarks == ["t.csv: timestamp_ns holds dates without a time zone, taken as UTC"]
-    assert open_telemetry(table(tmp_path / "t.csv", given, "timestamp_utc")).remarks == []
+    rows, remarks = open_telemetry(table(tmp_path / "t.csv", given))
+    assert [row.timestamp_ns for row in rows] == UTC_NS
+    assert remarks == ["t.csv: timestamp_ns holds dates without a time zone, taken as UTC"]
+    assert open_telemetry(table(tmp_path / "t.csv", given, "timestamp_utc"))[1] == []
 
 
 @pytest.mark.parametrize(

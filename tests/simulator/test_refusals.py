@@ -1,22 +1,20 @@
 """What cannot be simulated is refused by the name of the argument."""
 
 import math
-from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
 import pytest
 
-from engine import Attitude, Camera, OptionError, ShapeError
+from engine import Attitude, Camera, OptionError
 from scenematch.runs.simulation import WorldSettings
-from scenematch.simulator import Condition, FlightStyle, Optics, SensorNoise, World, build_town, plan_flight
+from scenematch.simulator import Condition, FlightStyle, Optics, SensorNoise, build_town, plan_flight
 from scenematch.simulator.flight import DRONE_SENSOR, paper_camera
 from scenematch.simulator.light import LIGHTS
 from scenematch.simulator.optics import take_picture
-from scenematch.simulator.pilot import plan_rounds, plan_route
-from scenematch.simulator.render import Glint, render_frame
+from scenematch.simulator.render import render_frame
 from scenematch.simulator.sensors import steps_between
-from tests.support.patches import CAMERA, EPSG, ORIGIN, TO_CRS, patch_world
+from tests.support.patches import CAMERA, ORIGIN, patch_world
 from tests.support.towns import drawn_town
 
 LEVEL = Attitude(0.0, 0.0, 0.0)
@@ -61,9 +59,6 @@ def seen(height_agl_m=150.0, attitude=LEVEL, camera=CAMERA):
         (lambda: Condition(light=LIGHTS["noon"], snow=1.5), r"snow: expected 0 to 1, got 1\.5"),
         (lambda: Condition(light=LIGHTS["noon"], visibility_m=0.0), "visibility_m: expected above 0"),
         (lambda: FlightStyle(acceleration_mps2=2.0), "peak_tilt_deg"),
-        (lambda: plan_route(np.zeros((1, 2))), "waypoints_m"),
-        (lambda: plan_route(np.zeros((3, 2))), "waypoints_m"),
-        (lambda: plan_rounds((4.0, 50.0), 60.0), "half_m"),
         (lambda: FlightStyle(cruise_mps=0.0), "cruise_mps"),
         (lambda: plan_flight(town=drawn_town(), frames=0), "frames"),
         (lambda: plan_flight(town=drawn_town(), rate_hz=0.0), "rate_hz"),
@@ -77,17 +72,3 @@ def seen(height_agl_m=150.0, attitude=LEVEL, camera=CAMERA):
 def test_an_option_that_cannot_be_is_refused(make, words):
     with pytest.raises(OptionError, match=words):
         make()
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda one: World(one.rgb[1:], one.sides, one.height_m, TO_CRS, EPSG), "world: expected"),
-        (lambda one: World(one.rgb, one.sides, one.height_m, TO_CRS[:, :2], EPSG), "pixel_to_crs"),
-        (lambda one: replace(one, ground_m=SMALL), "ground_m: expected"),
-        (lambda one: replace(one, glint=Glint(LIGHTS["noon"], SMALL.astype(np.uint8))), "water: expected"),
-    ],
-)
-def test_rasters_of_a_world_fit_together(make, words):
-    with pytest.raises(ShapeError, match=words):
-        make(world())
