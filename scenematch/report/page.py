@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,9 @@ from scenematch.report.explain import SliderFrame, run_window
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.page_charts import draw_charts
 from scenematch.report.page_map import TrackMap, draw_map, loop_marks, map_of_tracks, track_marks
-from scenematch.report.page_parts import CROSS, charts_with_axis, fill_page, map_with_legend, section
-from scenematch.report.page_tables import draw_inputs, draw_refusals
+from scenematch.report.page_parts import CROSS, Legend, fill_page
+from scenematch.report.page_tables import inputs, refusals, versions
 from scenematch.report.verdict import key_figures, loop_sentence, metres, verdict_of
-
-Legend = list[tuple[str, str]]
 
 
 def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = (), why_not: str = "") -> None:
@@ -32,25 +29,29 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
     """
     track_map = map_of_tracks([track], _view_px(track))
     verdict = verdict_of(track.summary)
-    sentences = [verdict.accuracy, *([loop_sentence(track.loop)] if track.loop else []), verdict.latency]
-    body = [
-        section("Where", _where(track, track_map, bool(shown)), "map-section"),
-        section("When", _when(track)),
-        section("Refusals", draw_refusals(track, shown)),
-        section("Frame by frame", _slider(track, shown, why_not), "frames"),
-        section("Inputs and versions", f'<div class="inputs">\n{draw_inputs(track.settings)}\n</div>'),
-    ]
     subheading = f"{track.method}, {len(track.rows)} frames"
     if track.is_timed and len(track.rows) > 1:
         subheading += f" over {track.time[-1]:.0f} s"
     fill_page(
         path,
+        "track.html",
+        {"box": track_map.box, "frames": [_frame_data(item, track, track_map) for item in shown]},
         heading=track.name,
         subheading=subheading,
         grade=verdict.grade,
-        verdict="\n".join(f"<p>{escape(sentence)}</p>" for sentence in sentences),
-        body=body,
-        data={"box": track_map.box, "frames": [_frame_data(item, track, track_map) for item in shown]},
+        sentences=[verdict.accuracy, *([loop_sentence(track.loop)] if track.loop else []), verdict.latency],
+        drawn=_map(track, track_map),
+        extent_m=track_map.extent_m,
+        map_legend=_map_legend(track, bool(shown)),
+        figures=key_figures(track.summary),
+        charts=draw_charts(track),
+        chart_legend=_chart_legend(track),
+        refusals=refusals(track, shown),
+        choice=_choice(track, shown) if shown else "",
+        why_not=why_not or "No frames are shown.",
+        inputs=inputs(track.settings),
+        changes=list((track.settings.get("changed") or {}).items()),
+        versions=versions(),
     )
 
 
@@ -64,19 +65,15 @@ def _view_px(track: FinishedTrack) -> float:
     return float(np.median(sides)) if sides else 0.0
 
 
-def _where(track: FinishedTrack, track_map: TrackMap, slider: bool) -> str:
-    """The map with its legend, and the key figures."""
+def _map(track: FinishedTrack, track_map: TrackMap) -> str:
+    """The map with the marks of the track."""
     marks = track_marks(track_map, track)
     if track.loop is not None:
         marks[4:4] = loop_marks(track_map, track.loop)  # above the fixes, below the true path
     fixes, beyond = int(track.fixed.sum()), int(track.errors.beyond.sum())
     refused = len(track.rows) - fixes
     label = f"Map with {fixes} fixes, {beyond} of them beyond three sigmas; {refused} refused."
-    drawn = map_with_legend(draw_map(track_map, label, marks), track_map, _map_legend(track, slider))
-    tiles = "\n".join(
-        f"<li><strong>{escape(v)}</strong><span>{escape(k)}</span></li>" for k, v in key_figures(track.summary)
-    )
-    return f'<div class="where">\n<div>\n{drawn}\n</div>\n<ul class="tiles">\n{tiles}\n</ul>\n</div>'
+    return draw_map(track_map, label, marks)
 
 
 def _map_legend(track: FinishedTrack, slider: bool) -> Legend:
@@ -97,11 +94,7 @@ def _map_legend(track: FinishedTrack, slider: bool) -> Legend:
     return [(name, mark) for is_shown, name, mark in marks if is_shown]
 
 
-def _when(track: FinishedTrack) -> str:
-    """The charts over time with their legend."""
-    charts = draw_charts(track)
-    if not charts:
-        return "<p>There are no frames.</p>"
+def _chart_legend(track: FinishedTrack) -> Legend:
     errors, states = track.errors, {row.state for row in track.rows}
     marks = [
         (True, "fix", '<path class="dots fix" d="M11 7h0"/>'),
@@ -112,7 +105,7 @@ def _when(track: FinishedTrack) -> str:
         ("searching" in states, "searching for a first fix", '<rect class="searching" width="22" height="14"/>'),
         ("lost" in states, "lost", '<rect class="lost" width="22" height="14"/>'),
     ]
-    return charts_with_axis(charts, [(name, mark) for is_shown, name, mark in marks if is_shown])
+    return [(name, mark) for is_shown, name, mark in marks if is_shown]
 
 
 # ------------------------------------------------------------------------------------------------ frame by frame
@@ -121,22 +114,6 @@ def _when(track: FinishedTrack) -> str:
 def shows_frames(page: Path) -> bool:
     """Whether an existing page shows frames; False if there is no file."""
     return page.is_file() and 'id="slider"' in page.read_text(encoding="utf-8", errors="replace")
-
-
-def _slider(track: FinishedTrack, shown: Sequence[SliderFrame], why_not: str) -> str:
-    """The slider, or the reason for its absence."""
-    if not shown:
-        return f"<p>{escape(why_not or 'No frames are shown.')}</p>"
-    text = f"{_choice(track, shown)} Move by the slider, the arrow keys, or a click on the map or a chart."
-    return (
-        f'<p class="sub">{text} Each was matched again for this page, in the window that the run used.</p>'
-        '<div class="slider"><button type="button" id="before" aria-label="Frame before">&#9664;</button>'
-        '<input type="range" id="slider" min="0" value="0" aria-label="Frame">'
-        '<button type="button" id="after" aria-label="Next frame">&#9654;</button><div class="strip" id="strip" '
-        'aria-hidden="true"></div></div>'
-        '<div class="facts" id="facts" aria-live="polite"></div><div class="pictures" id="pictures"></div>'
-        "<noscript><p>The slider needs JavaScript; the rest of the page does not.</p></noscript>"
-    )
 
 
 def _choice(track: FinishedTrack, shown: Sequence[SliderFrame]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.metrics import FALSE_SIGMAS, column, figures_in_words
 from scenematch.report.page_charts import Chart
 from scenematch.report.page_map import TrackMap, connected, draw_map, map_of_tracks
-from scenematch.report.page_parts import charts_with_axis, fill_page, map_with_legend, section, table
+from scenematch.report.page_parts import fill_page
 from scenematch.report.verdict import metres, verdict_of
 
 MAX_RUNS = 6
@@ -42,40 +41,39 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
     truth = next((truth for truth in truths if np.isfinite(truth).any()), None)
     true_path = np.empty((0, 2)) if truth is None else connected(track_map, truth)
     marks = [line(true_path, "halo"), *_run_marks(tracks, track_map), line(true_path, "truth")]
-    drawn = draw_map(track_map, f"Map with the tracks of {', '.join(tracks)}.", marks)
-    legend = (
-        [("truth", '<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="truth"/>')] if len(true_path) else []
-    )
-    run_legend = [(name, f'<path class="dots r{index}" d="M11 7h0"/>') for index, name in enumerate(tracks)]
-    body = [
-        section("Figures", _figures(tracks)),
-        section("Where", f"{map_with_legend(drawn, track_map, legend)}\n{_switches(tracks)}", "map-section"),
-        section("When", charts_with_axis(_charts(tracks), run_legend)),
-    ]
+    label = f"Map with the tracks of {', '.join(tracks)}."
+    truth_mark = ("truth", '<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="truth"/>')
     grades = {verdict.grade for verdict in verdicts.values()}
     fill_page(
         path,
+        "runs.html",
+        {"box": track_map.box, "frames": []},
         heading=first.name,
         subheading=f"{len(tracks)} runs: {', '.join(tracks)}",
         grade=next(grade for grade in _GRADES if grade in grades),
-        verdict="\n".join(f"<p><b>{escape(n)}</b>: {escape(v.accuracy)}</p>" for n, v in verdicts.items()),
-        body=body,
-        data={"box": track_map.box, "frames": []},
+        sentences=[(name, verdict.accuracy) for name, verdict in verdicts.items()],
+        figures=_figures(tracks),
+        drawn=draw_map(track_map, label, marks),
+        extent_m=track_map.extent_m,
+        map_legend=[truth_mark] if len(true_path) else [],
+        names=list(tracks),
+        charts=_charts(tracks),
+        run_legend=[(name, f'<path class="dots r{i}" d="M11 7h0"/>') for i, name in enumerate(tracks)],
     )
 
 
-def _figures(tracks: Mapping[str, FinishedTrack]) -> str:
-    """The table of figures of merit, one row per run."""
+def _figures(tracks: Mapping[str, FinishedTrack]) -> list[tuple[str, ...]]:
+    """The table of figures of merit: its head, and one row per run."""
     share = "{:.1%}".format
     columns: dict[str, tuple[str, Callable[[float], str]]] = {
         "fixed": ("availability", share), "median": ("median_m", metres), "95 % below": ("r95_m", metres),
         "largest": ("max_m", metres), "within 3 sigma": ("within_3_sigma", share),
         "NEES": ("nees_mean", "{:.2f}".format), "latency 95 %": ("p95", "{:.1f} ms".format),
     }  # fmt: skip
-    rows = []
+    rows: list[tuple[str, ...]] = [("run", "method", *columns)]
     for name, track in tracks.items():
         rows.append((name, track.method, *figures_in_words(track.summary, columns.values())))
-    return table(("run", "method", *columns), rows)
+    return rows
 
 
 def _run_marks(tracks: Mapping[str, FinishedTrack], track_map: TrackMap) -> list[str]:
@@ -84,16 +82,6 @@ def _run_marks(tracks: Mapping[str, FinishedTrack], track_map: TrackMap) -> list
         f'<g class="run{index}">{line(path, f"r{index} thin")}{dots(path, f"r{index}")}</g>'
         for index, path in enumerate(connected(track_map, track.errors.fix_en_m) for track in tracks.values())
     ]
-
-
-def _switches(tracks: Mapping[str, FinishedTrack]) -> str:
-    """The legend of the runs, each with a box that hides it on map and charts."""
-    items = "".join(
-        f'<li><label><input type="checkbox" data-run="{index}" checked>'
-        f'<svg aria-hidden="true"><path class="dots r{index}" d="M11 7h0"/></svg>{escape(name)}</label></li>'
-        for index, name in enumerate(tracks)
-    )
-    return f'<ul class="legend">{items}</ul>'
 
 
 def _charts(tracks: Mapping[str, FinishedTrack]) -> list[Chart]:
