@@ -70,8 +70,7 @@ class MavlinkBridge:
             agree with it, waits neither for a heartbeat nor for the autopilot's report on its receiver.
         gimbal_mount: (3, 3) mount of a camera on a gimbal that the autopilot reports; None for a fixed camera.
         key: 32-byte key of MAVLink signing; None sends and accepts unsigned packets.
-        watch: called with every answer; must return quickly.
-        on_sent: called with every fix that was sent; must return quickly.
+        watch: called with every answer, and whether its fix was sent; must return quickly.
 
     Raises:
         OSError: the link cannot be opened. Later, a link that fails is reopened.
@@ -90,13 +89,11 @@ class MavlinkBridge:
         resumed: bool = False,
         gimbal_mount: NDArray[np.float64] | None = None,
         key: bytes | None = None,
-        watch: Callable[[Answer], None] | None = None,
-        on_sent: Callable[[Fix], None] | None = None,
+        watch: Callable[[Answer, bool], None] | None = None,
     ) -> None:
         self.telemetry = MavlinkTelemetry(gimbal_mount, options.component_id)
         self._requests = AutopilotRequests(options, origin, with_gimbal=gimbal_mount is not None)
-        self._watch, self._on_sent = watch, on_sent
-        self._connection, self._options, self._origin = connection, options, origin
+        self._watch, self._connection, self._options, self._origin = watch, connection, options, origin
         self._make_navigator, self._key = make_navigator, key
         self._checked_on, self._resumed = site if options.check_gnss else None, resumed
         self._begin = None if start is None or site is None else position_of(start, site)
@@ -172,7 +169,7 @@ class MavlinkBridge:
             if self._options.firmware == "ardupilot" and not self.telemetry.armed:
                 self._keep_ready_to_arm()
         if self._watch is not None:
-            self._watch(answer)
+            self._watch(answer, cause is None)
 
     def _keep_ready_to_arm(self) -> None:
         """Send what ArduPilot requires before arming: a live camera, or a fix from every receiver."""
@@ -218,8 +215,6 @@ class MavlinkBridge:
             return cause
         self._guard.has_fix = True
         self._counters.add_sent(report.age_ms)
-        if self._on_sent is not None:
-            self._on_sent(fix)
         return None
 
     def _awaits_receiver(self) -> bool:

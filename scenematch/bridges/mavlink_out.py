@@ -184,12 +184,16 @@ def _measured_attitude(report: FixReport) -> Attitude | None:
 
 def _angles(report: FixReport) -> tuple[float, float, float]:
     """Roll, pitch and yaw in radians, yaw in [-pi, pi]: as measured by the fix, else the vehicle's."""
-    source = _measured_attitude(report) or report.vehicle
+    roll_deg, pitch_deg, heading_deg = _known_angles_deg(_measured_attitude(report) or report.vehicle)
+    yaw = math.remainder(math.radians(heading_deg), 2.0 * math.pi)
+    return math.radians(roll_deg), math.radians(pitch_deg), yaw
+
+
+def _known_angles_deg(source: Attitude | VehicleState) -> tuple[float, float, float]:
     assert source.roll_deg is not None  # checked by withhold_reason
     assert source.pitch_deg is not None
     assert source.heading_deg is not None
-    yaw = math.remainder(math.radians(source.heading_deg), 2.0 * math.pi)
-    return math.radians(source.roll_deg), math.radians(source.pitch_deg), yaw
+    return source.roll_deg, source.pitch_deg, source.heading_deg
 
 
 def _ned(report: FixReport, firmware: str) -> tuple[float, float, float]:
@@ -236,11 +240,8 @@ def _odometry(report: FixReport, firmware: str) -> Any:
 
 def _body_velocity(velocity: GroundVelocity, vehicle: VehicleState) -> list[float]:
     """Velocity in m/s along the body's axes, by the autopilot's own attitude, which it uses to rotate it back."""
-    assert vehicle.roll_deg is not None  # checked by withhold_reason
-    assert vehicle.pitch_deg is not None
-    assert vehicle.heading_deg is not None
     enu_mps = np.array([velocity.east_mps, velocity.north_mps, vehicle.up_velocity_mps or 0.0])
-    rotation = enu_from_body(vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg)
+    rotation = enu_from_body(*_known_angles_deg(vehicle))
     return [float(v) for v in rotation.T @ enu_mps]
 
 

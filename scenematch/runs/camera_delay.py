@@ -6,20 +6,18 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
-from engine.errors import BackendError, OptionError, TelemetryError, require
+from engine.errors import OptionError, TelemetryError, require
 from engine.navigation.lag import Lag, camera_lag, turn_between
 from engine.options import NavigatorOptions
 from engine.values import Frame, NoFix, Reason
-from scenematch.bridges.links import parse_connection
 from scenematch.bridges.pictures import CapturedImage, capture
 from scenematch.runs.cameras import CameraInput
-from scenematch.runs.mavlink_bridge import MavlinkSettings
+from scenematch.runs.mavlink_bridge import MavlinkSettings, open_bridge
 from scenematch.runs.output import SILENT, Progress
 
 if TYPE_CHECKING:
@@ -61,22 +59,14 @@ def measure_camera_delay(
         TelemetryError: the camera does not open, or its pictures do not agree with the attitude.
     """
     require("pymavlink", "mavlink")
-    from scenematch.bridges.mavlink import MavlinkBridge
-    from scenematch.bridges.packets import read_key
-
     seconds = 20.0 if seconds is None else seconds
     if not 5.0 <= seconds < math.inf:
         raise OptionError(f"seconds: expected 5 or more, got {seconds:g}")
     if camera.camera is None and camera.hfov_deg is None:
         raise OptionError("camera: expected a calibration, or `hfov_deg`")
     model = camera.load_live(camera_source, progress=progress)
-    secret = None if link.key is None else read_key(Path(link.key))
-    connection = parse_connection(link.connect, listen_anywhere=link.listen_anywhere)
-    try:
-        idle: Any = _Idle()
-        bridge = MavlinkBridge(connection, lambda _: idle, link, key=secret)
-    except OSError as error:
-        raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
+    idle: Any = _Idle()
+    bridge = open_bridge(link, lambda _: idle)
     progress.message(f"tilt the vehicle to and fro by some 10 degrees for {seconds:g} s, over textured ground")
     with bridge, closing(capture(camera_source)) as pictures:
         times_s, turns_rad, attitude = _recorded(bridge.telemetry, pictures, model.focal_px, seconds)

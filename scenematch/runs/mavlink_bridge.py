@@ -6,21 +6,23 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError, require
 from engine.matching import METHODS
 from engine.matching.matcher import SceneMatcher
-from engine.navigation.live import LiveOptions
+from engine.navigation.live import Answer, LiveOptions
 from engine.navigation.motion import position_of
+from engine.navigation.navigator import Navigator
 from engine.options import MatcherOptions, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.garbage import no_collection
 from engine.runtime.realtime import Realtime, check_realtime, set_realtime
-from engine.values import Prior
-from scenematch.bridges.links import parse_connection
+from engine.values import Fix, Prior
+from scenematch.bridges.links import Connection, parse_connection
 from scenematch.bridges.parameters import MAX_DELAY_MS, MavlinkOptions
 from scenematch.bridges.pictures import CapturedImage
 from scenematch.bridges.vehicle import NedOrigin
@@ -76,6 +78,10 @@ class MavlinkSettings(MavlinkOptions):
         if not self.set_origin:
             check_unused({"origin_alt_m": self.origin_alt_m}, "set_origin")
         check_between("origin_alt_m", self.origin_alt_m, -_MAX_ALT_M, _MAX_ALT_M)
+
+    def connection(self) -> Connection:
+        """The endpoint of the autopilot."""
+        return parse_connection(self.connect, listen_anywhere=self.listen_anywhere)
 
     def origin(self, site: OrthoMap, start: Prior | None) -> NedOrigin | None:
         """The start of the flight, or the map's centre; None if no origin should be set.
@@ -186,48 +192,84 @@ def run_mavlink_bridge(
     """
     require("pymavlink", "mavlink")
     live_view.check()
-    from scenematch.bridges.mavlink import MavlinkBridge
-    from scenematch.bridges.packets import read_key
-
     settings = settings or BridgeSettings()
-    connection = parse_connection(link.connect, listen_anywhere=link.listen_anywhere)
-    start = parse_position("start", settings.start)
-    key = None if link.key is None else read_key(Path(link.key))
-    speed_mps = settings.navigator.max_speed_mps
-    # With a camera the bridge may start in the air; a replayed flight begins at its start.
-    resumes = files.camera_source is not None
-    last_fix = LastFix(
-        last_fix_file(link.connect, link.system_id, Path(files.map.map).absolute()) if resumes else None
-    )
+    link.connection()
+    start, speed_mps = parse_position("start", settings.start), settings.navigator.max_speed_mps
+    last_fix = _last_fix(files, link)
     in_flight = last_fix.prior(speed_mps) is not None
     if in_flight:
         settings.schedule_this_thread()  # the vehicle waits for its fixes
     matcher = _loaded(files, settings, start, progress, brief=in_flight)
-    site, camera = matcher.site, matcher.camera
     end_on_sigterm()  # before the fork, so that the worker has it from its first instruction
     if supervise:
         check_supervision(matcher.device)
         become_worker(progress)
-    resumed = _resumed(last_fix.prior(speed_mps), site, progress)
-    start = resumed or start
+    resumed = _resumed(last_fix.prior(speed_mps), matcher.site, progress)
+    flight: dict[str, Any] = {
+        "start": resumed or start, "resumed": resumed is not None, "site": matcher.site,
+        "origin": link.origin(matcher.site, resumed or start),
+        "gimbal_mount": matcher.camera.mount if files.gimbal else None,
+    }  # fmt: skip
+    with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
+        flight["live"], flight["watch"] = settings.live_options(MAX_DELAY_MS), _watch(last_fix, watcher)
+        return _fly(
+            partial(open_bridge, link, make_navigator, **flight), files, matcher.camera, settings, progress
+        )
 
+
+def _last_fix(files: BridgeFiles, link: MavlinkSettings) -> LastFix:
+    """With a camera the bridge may start in the air; a replayed flight begins at its start."""
+    if files.camera_source is None:
+        return LastFix()
+    return LastFix(last_fix_file(link.connect, link.system_id, Path(files.map.map).absolute()))
+
+
+def _watch(last_fix: LastFix, watcher: Callable[[Answer], None] | None) -> Callable[[Answer, bool], None]:
+    """Keep every fix that was sent, and show every answer."""
+
+    def watch(answer: Answer, sent: bool) -> None:
+        if sent and isinstance(answer.result, Fix):
+            last_fix.keep(answer.result)
+        if watcher is not None:
+            watcher(answer)
+
+    return watch
+
+
+def open_bridge(
+    link: MavlinkSettings, make_navigator: Callable[[Prior | None], Navigator], **flight: Any
+) -> MavlinkBridge:
+    """Open the link to the autopilot; ``flight`` are further arguments of the bridge.
+
+    Raises:
+        BackendError: it cannot be opened.
+    """
+    from scenematch.bridges.mavlink import MavlinkBridge
+    from scenematch.bridges.packets import read_key
+
+    key = None if link.key is None else read_key(Path(link.key))
+    try:
+        return MavlinkBridge(link.connection(), make_navigator, link, key=key, **flight)
+    except OSError as error:
+        raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
+
+
+def _fly(
+    opened: Callable[[], MavlinkBridge],
+    files: BridgeFiles,
+    camera: Camera,
+    settings: BridgeSettings,
+    progress: Progress,
+) -> MavlinkStatus:
+    """Open the bridge and pass the pictures to it until they end or the time is up."""
     # Before the link: a bench autopilot takes off as soon as the bridge listens.
     pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat), settings.scheduling())
-    with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
-        try:
-            bridge = MavlinkBridge(
-                connection, make_navigator, link, start, settings.live_options(MAX_DELAY_MS),
-                origin=link.origin(site, start), site=site, resumed=resumed is not None, key=key,
-                watch=watcher, on_sent=last_fix.keep, gimbal_mount=camera.mount if files.gimbal else None,
-            )  # fmt: skip
-        except OSError as error:
-            raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
-        with bridge:
-            settings.schedule_this_thread()
-            # Ctrl-C is the usual way to stop a camera's bridge and must keep the counts.
-            with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
-                _run(bridge, pictures, camera, settings.seconds, progress, beat)
-            return bridge.status
+    with opened() as bridge:
+        settings.schedule_this_thread()
+        # Ctrl-C is the usual way to stop a camera's bridge and must keep the counts.
+        with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
+            _run(bridge, pictures, camera, settings.seconds, progress, beat)
+        return bridge.status
 
 
 def _loaded(
