@@ -27,7 +27,8 @@ _NAMES = {
     "scenematch.runs.inputs": "FlightFiles",
     "scenematch.runs.live_viewing": "LiveViewTarget",
     "scenematch.runs.map_audit": "AuditFiles MapAudit audit_map",
-    "scenematch.runs.map_fetch": "FetchSettings fetch_map",
+    "scenematch.fetch.grid": "FetchSettings",
+    "scenematch.runs.map_fetch": "fetch_map",
     "scenematch.runs.map_input": "MapInput",
     "scenematch.runs.mavlink_bridge": "BridgeSettings MavlinkSettings run_mavlink_bridge",
     "scenematch.runs.mavlink_parameters": "write_parameter_file",
@@ -45,6 +46,7 @@ __all__ = sorted(" ".join(_NAMES.values()).split())
 
 if TYPE_CHECKING:  # the same names for type checkers, which reject others; `as` makes them public
     from scenematch.bridges.vehicle import RecentValues as RecentValues
+    from scenematch.fetch.grid import FetchSettings as FetchSettings
     from scenematch.files.corrections import Corrections as Corrections
     from scenematch.runs.bridge_files import BridgeFiles as BridgeFiles
     from scenematch.runs.cameras import CameraInput as CameraInput
@@ -61,7 +63,6 @@ if TYPE_CHECKING:  # the same names for type checkers, which reject others; `as`
     from scenematch.runs.map_audit import AuditFiles as AuditFiles
     from scenematch.runs.map_audit import MapAudit as MapAudit
     from scenematch.runs.map_audit import audit_map as audit_map
-    from scenematch.runs.map_fetch import FetchSettings as FetchSettings
     from scenematch.runs.map_fetch import fetch_map as fetch_map
     from scenematch.runs.map_input import MapInput as MapInput
     from scenematch.runs.mavlink_bridge import BridgeSettings as BridgeSettings

@@ -82,29 +82,67 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FetchSettings:
+    """What to fetch, and how; None for each not given.
+
+    Attributes:
+        around: "LAT,LON", the centre of the map, or a folder of photographs with positions.
+        radius_m: half the side of the square to cover at least; None covers what the photographs show, plus 50 m.
+        source: template of tiles with {z}, {x}, {y}, or the address of a WMS or WMTS.
+        gsd_m_per_px: as coarse as the map may be; of a WMS its pixels. None is 0.5, around photographs that were
+            taken from less than 150 m as much less.
+        layer: of a service that has several.
+        crs: of a service that offers several, EPSG:N.
+        image_format: of a service that offers several, such as image/jpeg.
+        tile_px: side of the tiles of a template.
+        map_sigma_m: georeferencing accuracy per axis, which the file states then.
+        attribution: whom to credit, which the file states then.
+        licence: what may be done with it, which the file states then.
+        surface: file or URL of heights, or a template with {lat} and {lon}.
+        surface_datum: vertical datum of its heights, EPSG:N.
+        surface_slope_sigma_deg: slope accuracy over one frame, which the file states then.
+        max_tiles: as many as may be asked for.
+        pause_ms: between requests.
+        timeout_s: without a byte.
+        dry_run: only plan.
+        force: whether the files may be there already.
+    """
+
+    around: str
+    source: str
+    radius_m: float | None = None
+    gsd_m_per_px: float | None = None
+    layer: str | None = None
+    crs: str | None = None
+    image_format: str | None = None
+    tile_px: int = 256
+    map_sigma_m: float | None = None
+    attribution: str | None = None
+    licence: str | None = None
+    surface: str | None = None
+    surface_datum: str | None = None
+    surface_slope_sigma_deg: float | None = None
+    max_tiles: int = 2000
+    pause_ms: float = 100.0
+    timeout_s: float = 30.0
+    dry_run: bool = False
+    force: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Wanted:
     """What the user requests from a server.
 
     Attributes:
         place: where.
         gsd_m_per_px: coarsest acceptable resolution; for a WMS the exact one.
-        max_tiles: largest number of requests.
-        layer: of a service; None is its only one.
-        crs: of a service; None is one that it offers, in metres if possible.
-        image_format: of a service; None is PNG if possible.
-        tile_px: side of the tiles of a template.
-        timeout_s: of a request.
+        settings: how.
         cache: folder of fetched data.
     """
 
     place: Place
     gsd_m_per_px: float
-    max_tiles: int
-    layer: str | None
-    crs: str | None
-    image_format: str | None
-    tile_px: int
-    timeout_s: float
+    settings: FetchSettings
     cache: Path
 
     def elements(self) -> dict[str, Any]:
@@ -113,7 +151,7 @@ class Wanted:
             "BandsCount": 4,
             "ZeroBlockHttpCodes": "204,404,410",
             "MaxConnections": 1,
-            "Timeout": math.ceil(self.timeout_s),
+            "Timeout": math.ceil(self.settings.timeout_s),
             "UserAgent": user_agent(),
             "Cache": {"Path": self.cache},
         }

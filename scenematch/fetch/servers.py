@@ -29,12 +29,13 @@ def plan(url: str, wanted: Wanted) -> Grid:
     if is_template(url):
         grid = plan_tiles(url, wanted)
     else:
-        root = capabilities(url, wanted.timeout_s)
+        root = capabilities(url, wanted.settings.timeout_s)
         service = root.tag.rpartition("}")[2]
         grid = (plan_wmts if service == "Capabilities" else plan_wms)(root, url, wanted)
-    if grid.tiles > wanted.max_tiles:
+    most = wanted.settings.max_tiles
+    if grid.tiles > most:
         raise OptionError(
-            f"max_tiles: expected at most {wanted.max_tiles} tiles, but the area has {grid.tiles}; choose a "
+            f"max_tiles: expected at most {most} tiles, but the area has {grid.tiles}; choose a "
             "smaller `radius_m` or a larger `gsd_m_per_px`, or allow them if the server's terms do"
         )
     return grid
@@ -54,7 +55,7 @@ def plan_tiles(template: str, wanted: Wanted) -> Grid:
     if sorted(PLACEHOLDER.findall(template)) not in (["q"], ["x", "y", "z"], ["-y", "x", "z"]):
         expected = "{z}, {x} and {y} (or {-y}), or {q}, in a template of tiles"
         raise OptionError(f"source: expected {expected}, got {shown(template)!r}")
-    crs, place, tile_px = crs_of("EPSG:3857"), wanted.place, wanted.tile_px
+    crs, place, tile_px = crs_of("EPSG:3857"), wanted.place, wanted.settings.tile_px
     half = math.pi * 6378137.0  # of the world's side in metres
     deepest = (_MAX_SIDE_PX // tile_px - 1).bit_length() - 1
     steps = [2.0 * half / (tile_px << zoom) for zoom in range(deepest + 1)]

@@ -18,16 +18,16 @@ _MAX_PX = 1024  # of a piece, if the server allows it
 
 def plan_wms(root: Xml.Element, url: str, wanted: Wanted) -> Grid:
     """A map that the server draws on a grid in pixels of the size asked for."""
-    layers = _asked_layers(root, wanted.layer or query_value(url, "layers"))
+    layers = _asked_layers(root, wanted.settings.layer or query_value(url, "layers"))
     place, first_layer = wanted.place, next(iter(layers.values()))
-    code = chosen_crs(wanted.crs, _offered_crs(root, first_layer), place)
+    code = chosen_crs(wanted.settings.crs, _offered_crs(root, first_layer), place)
     crs = crs_of(code)
     corner, step, size = _grid(place, crs, wanted.gsd_m_per_px)
     across, down = (
         _piece_px(side, root.findtext(f".//{{*}}Max{name}"))
         for side, name in zip(size, ("Width", "Height"), strict=True)
     )
-    asked_format = wanted.image_format or query_value(url, "format")
+    asked_format = wanted.settings.image_format or query_value(url, "format")
     window = {
         "UpperLeftX": corner[0], "UpperLeftY": corner[1], "LowerRightX": corner[0] + size[0] * step[0],
         "LowerRightY": corner[1] - size[1] * step[1], "SizeX": size[0], "SizeY": size[1],

@@ -21,16 +21,16 @@ def plan_wmts(root: Xml.Element, url: str, wanted: Wanted) -> Grid:
     from rasterio.errors import RasterioError
 
     layers = {text_of(layer, "Identifier"): layer for layer in root.iterfind("{*}Contents/{*}Layer")}
-    asked = wanted.layer or query_value(url, "layer")
+    asked = wanted.settings.layer or query_value(url, "layer")
     name = chosen_name("layer", asked, list(layers), "one that the server has")
     sets = _matrix_sets(root, layers[name])
-    code, place = chosen_crs(wanted.crs, list(sets), wanted.place), wanted.place
+    code, place = chosen_crs(wanted.settings.crs, list(sets), wanted.place), wanted.place
     is_document = url.partition("?")[0].lower().endswith(".xml")
     query = {"SERVICE": "WMTS", "REQUEST": "GetCapabilities"}
     elements: dict[str, Any] = {
         "GetCapabilitiesUrl": url if is_document else with_query(url, query),
         "ExtraQueryParameters": _extra_query(root, url), "Layer": name, "TileMatrixSet": sets[code],
-        "Format": chosen_format(wanted.image_format, layers[name].iterfind("{*}Format")),
+        "Format": chosen_format(wanted.settings.image_format, layers[name].iterfind("{*}Format")),
     }  # fmt: skip
     source, crs = gdal_xml("GDAL_WMTS", elements | wanted.elements()), crs_of(code)
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from engine.errors import OptionError
 from engine.geo import LocalFrame
 from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.values import MAX_SIGMA_M
-from scenematch.fetch.grid import FINE_ENOUGH, Bounds, Grid, Place, Wanted
+from scenematch.fetch.grid import FINE_ENOUGH, Bounds, FetchSettings, Grid, Place, Wanted
 from scenematch.fetch.heights import GLO30, GLO30_SLOPE_SIGMA_DEG, Heights, files_for, read_part, write_heights
 from scenematch.fetch.pictures import fetch_pictures, kept_pictures, remove_pictures
 from scenematch.fetch.servers import is_template, plan
@@ -23,61 +23,12 @@ from scenematch.files.photos import exif_telemetry
 from scenematch.runs.arguments import check_above, check_between, check_unused, parse_place
 from scenematch.runs.output import SILENT, Progress, StrPath, check_file
 
-MAX_TILES = 2000
 NOTE = "you named this server: its terms decide what may be fetched, kept and used, and whom to credit"
 _MAX_RADIUS_M = 100_000.0
 GSD_M_PER_PX = 0.5
 _USUAL_HEIGHT_M = 150.0  # of a camera that suits the ground sample distance
 _MARGIN_M = 50.0  # beyond what the photographs cover
 _MUCH_EMPTY = 0.5  # of a map: more is reported
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FetchSettings:
-    """What to fetch, and how; None for each not given.
-
-    Attributes:
-        around: "LAT,LON", the centre of the map, or a folder of photographs with positions.
-        radius_m: half the side of the square to cover at least; None covers what the photographs show, plus 50 m.
-        source: template of tiles with {z}, {x}, {y}, or the address of a WMS or WMTS.
-        gsd_m_per_px: as coarse as the map may be; of a WMS its pixels. None is 0.5, around photographs that were
-            taken from less than 150 m as much less.
-        layer: of a service that has several.
-        crs: of a service that offers several, EPSG:N.
-        image_format: of a service that offers several, such as image/jpeg.
-        tile_px: side of the tiles of a template.
-        map_sigma_m: georeferencing accuracy per axis, which the file states then.
-        attribution: whom to credit, which the file states then.
-        licence: what may be done with it, which the file states then.
-        surface: file or URL of heights, or a template with {lat} and {lon}.
-        surface_datum: vertical datum of its heights, EPSG:N.
-        surface_slope_sigma_deg: slope accuracy over one frame, which the file states then.
-        max_tiles: as many as may be asked for.
-        pause_ms: between requests.
-        timeout_s: without a byte.
-        dry_run: only plan.
-        force: whether the files may be there already.
-    """
-
-    around: str
-    source: str
-    radius_m: float | None = None
-    gsd_m_per_px: float | None = None
-    layer: str | None = None
-    crs: str | None = None
-    image_format: str | None = None
-    tile_px: int = 256
-    map_sigma_m: float | None = None
-    attribution: str | None = None
-    licence: str | None = None
-    surface: str | None = None
-    surface_datum: str | None = None
-    surface_slope_sigma_deg: float | None = None
-    max_tiles: int = MAX_TILES
-    pause_ms: float = 100.0
-    timeout_s: float = 30.0
-    dry_run: bool = False
-    force: bool = False
 
 
 def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT) -> dict[str, Any]:
@@ -202,9 +153,7 @@ def _wanted(settings: FetchSettings, folder: Path, progress: Progress) -> Wanted
     else:
         place = Place(*parse_place("around", settings.around), radius_m)
     gsd_m_per_px = GSD_M_PER_PX if gsd_m_per_px is None else gsd_m_per_px
-    names = ("max_tiles", "layer", "crs", "image_format", "tile_px", "timeout_s")
-    server = {name: getattr(settings, name) for name in names}
-    return Wanted(place=place, gsd_m_per_px=gsd_m_per_px, cache=folder, **server)
+    return Wanted(place, gsd_m_per_px, settings, folder)
 
 
 def _seen_by_photographs(folder: Path) -> tuple[Place, float]:

@@ -123,7 +123,7 @@ TABLES = {
     "parameters": ("scenematch.runs.mavlink_parameters", "ParameterSettings", ()),
     "ros": ("scenematch.runs.ros_bridge", "RosSettings", ("map", "camera", "version", "arguments")),
     "audit": ("scenematch.check.plan", "AuditOptions", ()),
-    "fetch": ("scenematch.runs.map_fetch", "FetchSettings", ("around", "source", "dry_run", "force")),
+    "fetch": ("scenematch.fetch.grid", "FetchSettings", ("around", "source", "dry_run", "force")),
 }  # fmt: skip
 """Tables of a settings file besides those of :class:`TrackSettings`: module, class, and fields that are not
 settings.
