@@ -162,15 +162,12 @@ def read_table(
         with path.open(encoding="utf-8-sig", newline="") as file:
             delimiter = _delimiter(file)
             reader = csv.reader(file, delimiter=delimiter)
-            header = _names(reader)
-            if not any(header):
-                expected = f"a header with {', '.join(required)}"
-                raise TelemetryError(f"{path}: expected {expected}, got an empty first line")
+            header = _names(path, reader, required)
             places = {column: _place(path, header, column, names) for column in (*required, *optional)}
-            for column in required:
-                if all(places[name] is None for name in (column, *instead.get(column, ()))):
-                    its = f"its columns are {quoted(','.join(header))}{hint}"
-                    raise TelemetryError(f"{path}: line 1: lacks the column {column}; {its}")
+            lacking = [c for c in required if all(places[name] is None for name in (c, *instead.get(c, ())))]
+            if lacking:
+                its = f"its columns are {quoted(','.join(header))}{hint}"
+                raise TelemetryError(f"{path}: line 1: lacks the column {lacking[0]}; {its}")
             marks: dict[str, str] = {}
             for row in reader:
                 if any(cell.strip() for cell in row):
@@ -198,10 +195,13 @@ def _delimiter(file: TextIO) -> str:
     return max((",", ";", "\t"), key=line.count)
 
 
-def _names(reader: Iterator[list[str]]) -> list[str]:
-    """The columns of the header, none for an empty file; some programs quote the header as one cell."""
+def _names(path: Path, reader: Iterator[list[str]], required: Sequence[str]) -> list[str]:
+    """The columns of the header; some programs quote it as one cell."""
     names = next(reader, [])
-    return [name.strip() for name in (names[0].split(",") if len(names) == 1 else names)]
+    names = [name.strip() for name in (names[0].split(",") if len(names) == 1 else names)]
+    if not any(names):
+        raise TelemetryError(f"{path}: expected a header with {', '.join(required)}, got an empty first line")
+    return names
 
 
 def _place(path: Path, header: Sequence[str], column: str, names: Mapping[str, str]) -> int | None:

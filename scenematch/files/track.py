@@ -160,6 +160,11 @@ def track_row(
     )
     if isinstance(result, NoFix):
         return replace(row, reason=result.reason.value, detail=result.detail or None)
+    return _with_fix(row, result)
+
+
+def _with_fix(row: TrackRow, result: Fix) -> TrackRow:
+    """The row with what only a fix has."""
     covariance, level_m = result.covariance_m2, result.protection_level_m()
     # If no height was measured, roll and pitch are the telemetry's or unknown.
     tilt = None if result.up_m is None else result.attitude

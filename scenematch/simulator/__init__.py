@@ -1,7 +1,7 @@
 """The software-in-the-loop flight: a simulated town, the camera over it, the vehicle and its sensors."""
 
 from scenematch.simulator.conditions import CONDITIONS, Condition
-from scenematch.simulator.flight import FlightPlan, TownOptions, picture_at, plan_flight
+from scenematch.simulator.flight import FlightPlan, picture_at, plan_flight
 from scenematch.simulator.light import LIGHTS, Light
 from scenematch.simulator.optics import ExposureMotion, Optics, take_picture
 from scenematch.simulator.raster_world import world_from_map
@@ -21,7 +21,6 @@ __all__ = [
     "Optics",
     "SensorNoise",
     "Town",
-    "TownOptions",
     "World",
     "build_town",
     "picture_at",

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TypedDict, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import Array, LocalFrame, wrap_difference_deg
 from engine.values import Attitude, Frame, Truth
-from scenematch.simulator.conditions import Condition
 from scenematch.simulator.light import Image
 from scenematch.simulator.optics import ExposureMotion, Optics, Sensor, take_picture
 from scenematch.simulator.render import transformer
@@ -243,24 +242,6 @@ def _sways(motion: Motion, time_s: Array) -> tuple[ExposureMotion, ...]:
     )
 
 
-class TownOptions(TypedDict, total=False):
-    """Keyword arguments of :func:`plan_flight` about the town to build, see :func:`build_town`.
-
-    Attributes:
-        condition: day of the frames: light, season and air.
-        map_condition: day of the map.
-        relief_m: height of the hills. The flight keeps its height above the ground at its start.
-        river: whether a river crosses the town.
-        changed: share of the houses, 0 to 1, that differ between the map and the flight.
-    """
-
-    condition: str | Condition
-    map_condition: str | Condition
-    relief_m: float
-    river: bool
-    changed: float
-
-
 def plan_flight(
     seed: int = 1,
     *,
@@ -271,7 +252,7 @@ def plan_flight(
     town: Town | None = None,
     camera: Camera | None = None,
     optics: Optics | None = None,
-    **town_options: Unpack[TownOptions],
+    **town_options: Any,
 ) -> FlightPlan:
     """Plan the paper's flight: 150 m up, 7 m/s, four legs round the map with a stop at every corner.
 
@@ -284,7 +265,8 @@ def plan_flight(
         town: to fly over; None builds the seed's by ``town_options``.
         camera: None uses the paper's, 300 x 300 px with 60 degrees.
         optics: exposure time and shutter of the camera; None is an ideal one.
-        **town_options: see :class:`TownOptions`; ignored if a town is given.
+        **town_options: of the town, see :func:`scenematch.simulator.build_town`; ignored if a town is given. Over
+            hills the flight keeps its height above the ground at its start.
 
     Raises:
         OptionError: an argument is out of range, or the map is too small for the height.

@@ -15,7 +15,7 @@ import numpy as np
 
 from engine.errors import OptionError
 from engine.geo import Array, wrap_difference_deg
-from engine.values import check_positive
+from engine.values import check, check_positive
 
 GRAVITY_MPS2 = 9.80665
 COURSE_STEP_S = 0.01
@@ -51,9 +51,7 @@ class SensorNoise:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value = getattr(self, item.name)
-            if not 0.0 <= value < math.inf:
-                raise OptionError(f"{item.name}: expected 0 or more, got {value}")
+            check(self, item.name, "0 or more", lambda value: 0.0 <= value < math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
