@@ -32,7 +32,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import shutil
 import subprocess
@@ -44,7 +43,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.pages.text import table
+from bench.accuracy.truth import pooled
+from bench.pages.text import percent, table_of
 
 RUNS, FLIGHTS, UNFINISHED = "runs", "flights", "unfinished"
 _LAYOUT = {
@@ -126,17 +126,21 @@ def do_all(jobs: Sequence[Job], unfinished: Path, workers: int) -> Iterator[tupl
 
 def page(runs: Sequence[Job], failures: Mapping[str, str]) -> str:
     """Markdown: every group's runs pooled, each fix counting alike, every run, and what failed."""
-    columns = ["flights", "frames", "fixed", "RMS m", "worst RMS m", "false", "off > 10 m"]
+    found = (("frames", "frames", "d"), ("fixed", "availability", percent), ("RMS m", "rms_m", ".2f"))
+    wrong = (("false", "false_fixes", "d"), ("off > 10 m", "wrong_over_10m", "d"))
+    columns = (*found, ("worst RMS m", "worst_rms_m", ".2f"), *wrong)
     figures = {job: _figures(job) for job in runs if job.name not in failures}
     lines = ["# Campaign", ""]
     for group in dict.fromkeys(job.group for job in runs):
         by_run: dict[str, list[dict[str, Any]]] = {}
-        for job, found in figures.items():
+        for job, one in figures.items():
             if job.group == group:
-                by_run.setdefault(job.name.partition("/")[2], []).append(found)
-        lines += [f"## {group}", "", *table(["run", *columns], [[n, *_pooled(f)] for n, f in by_run.items()])]
-    every = [[*job.name.split("/"), *_pooled([found])[1:]] for job, found in figures.items()]
-    lines += ["## Every run", "", *table(["flight", "run", *columns[1:]], every)]
+                by_run.setdefault(job.name.partition("/")[2], []).append(one)
+        rows = [{"run": name, **pooled(each)} for name, each in by_run.items()]
+        lines += [f"## {group}", "", *table_of(rows, ("run", "run", "s"), ("flights", "tracks", "d"), *columns)]
+    every = [dict(zip(("flight", "run"), job.name.split("/"), strict=True), **pooled([one]))
+             for job, one in figures.items()]  # fmt: skip
+    lines += ["## Every run", "", *table_of(every, ("flight", "flight", "s"), ("run", "run", "s"), *columns)]
     lines += ["## Failed", "", *(f"- {name}: {why}" for name, why in failures.items()), ""] if failures else []
     return "\n".join(lines)
 
@@ -144,19 +148,6 @@ def page(runs: Sequence[Job], failures: Mapping[str, str]) -> str:
 def _figures(job: Job) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((job.folder / "summary.json").read_text(encoding="utf-8"))
     return found
-
-
-def _pooled(figures: Sequence[Mapping[str, Any]]) -> list[str]:
-    frames, fixes = (sum(one[name] for one in figures) for name in ("frames", "fixes"))
-    scored = [one for one in figures if one.get("rms_m") is not None]
-    count = sum(one["scored_fixes"] for one in scored)
-    squares_m2 = sum(one["scored_fixes"] * one["rms_m"] ** 2 for one in scored)
-    wrong = [sum(one.get(name, 0) for one in scored) for name in ("false_fixes", "wrong_over_10m")]
-    metres = (
-        [f"{math.sqrt(squares_m2 / count):.2f}", f"{max(one['rms_m'] for one in scored):.2f}"] if count else None
-    )
-    cells = [*metres, *map(str, wrong)] if metres else ["-"] * 4
-    return [str(len(figures)), str(frames), f"{fixes / frames:.1%}" if frames else "-", *cells]
 
 
 def main() -> int:

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.accuracy.truth import true_start
 from bench.command import parser_on_one_thread
-from bench.faults import START_SIGMA_M
-from engine import Prior
 from scenematch.check import Diagnosis, diagnose
 from scenematch.simulator import CONDITIONS, FlightStyle, plan_flight
 
@@ -25,9 +24,7 @@ def checked(seed: int, condition: str) -> Diagnosis:
     rng = np.random.default_rng(seed)
     style = FlightStyle(height_agl_m=rng.uniform(*HEIGHTS_M), cruise_mps=rng.uniform(*SPEEDS_MPS))
     plan = plan_flight(seed, rate_hz=RATE_HZ, style=style, condition=condition)
-    first, frames = plan.truth_rows()[0], list(plan.iter_frames())
-    start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
-    site = plan.town.site()
+    frames, site, start = list(plan.iter_frames()), plan.town.site(), true_start(plan.truth_rows())
     return diagnose(frames, frames.__getitem__, site, plan.camera, start=start)
 
 

@@ -10,7 +10,6 @@ table of docs/results/wrong-inputs.md.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from bench import RESULTS
+from bench.accuracy.truth import START_SIGMA_M, off, true_places_m
 from bench.command import parser_on_one_thread
 from bench.inputs.faults import Fault, FlightInputs, faults, load
 from bench.pages.text import rewrite, shown, table
@@ -30,7 +30,6 @@ from scenematch.files.truth import interpolate_truth
 
 BEGIN, END = "<!-- written by bench.faults -->", "<!-- end of what bench.faults writes -->"
 FALSE_M, FALSE_SIGMAS = 5.0, 3.0
-START_SIGMA_M = 15.0
 
 
 @dataclass(frozen=True)
@@ -64,12 +63,12 @@ class Flown:
     """A flight by one method.
 
     Attributes:
-        error_m, chi_square: of each fix whose true place is known.
+        error_m, sigmas: of each fix whose true place is known.
         history: the calibration after each frame.
     """
 
     error_m: Array
-    chi_square: Array
+    sigmas: Array
     history: list[Calibration]
 
     @property
@@ -80,7 +79,7 @@ class Flown:
     @property
     def nees(self) -> float | None:
         """Per axis; None without a fix."""
-        return float(self.chi_square.mean() / 2) if len(self.error_m) else None
+        return float((self.sigmas**2).mean() / 2) if len(self.error_m) else None
 
 
 def start_of(inputs: FlightInputs, stamp_ns: int) -> Prior:
@@ -95,18 +94,15 @@ def fly(inputs: FlightInputs, stamps_ns: list[int], method: str) -> Flown:
     site = inputs.site()
     matcher = SceneMatcher(site, inputs.camera, method, "cpu")
     navigator = Navigator(matcher, start_of(inputs, stamps_ns[0]))
-    off_m, chi, history = [], [], []
+    errors, history = [], []
     for frame, stamp_ns in zip(inputs.frames, stamps_ns, strict=True):
         result = navigator.update(frame)
         history.append(navigator.calibration)
         there = interpolate_truth(inputs.truth, stamp_ns)
-        if not isinstance(result, Fix) or there is None:
-            continue
-        east, north = site.frame.enu_from_geodetic(there.lat_deg, there.lon_deg)[:2]
-        off = np.array([result.east_m - east, result.north_m - north])
-        off_m.append(math.hypot(*off))
-        chi.append(float(off @ np.linalg.solve(result.covariance_m2[:2, :2], off)))
-    return Flown(np.array(off_m), np.array(chi), history)
+        if isinstance(result, Fix) and there is not None:
+            errors.append(off(result, true_places_m(site, [there])[0]))
+    error_m, sigmas = np.reshape(errors, (-1, 2)).T
+    return Flown(error_m, sigmas, history)
 
 
 def stamps_of(inputs: FlightInputs) -> list[int]:
@@ -119,7 +115,7 @@ def cell(inputs: FlightInputs, fault: Fault, flight: str, method: str) -> Cell:
     spoiled = fault.spoil(inputs)
     stamps = stamps_of(inputs if len(inputs.frames) == len(spoiled.frames) else spoiled)
     flown = fly(spoiled, stamps, method)
-    false = int(((flown.error_m > FALSE_M) & (flown.chi_square > FALSE_SIGMAS**2)).sum())
+    false = int(((flown.error_m > FALSE_M) & (flown.sigmas > FALSE_SIGMAS)).sum())
     largest_m = float(flown.error_m.max()) if len(flown.error_m) else None
     counts = len(stamps), len(flown.error_m), false
     return Cell(flight, fault.name, method, *counts, flown.rms_m, flown.nees, largest_m)
@@ -175,13 +171,12 @@ def lines_of(cells: list[Cell]) -> list[str]:
         for name in dict.fromkeys(found.fault for found in of_flight):
             of_fault = {found.method: found for found in of_flight if found.fault == name}
             counts = [f"{of_fault[m].fixed}, {of_fault[m].false}" for m in methods]
-            nees = max((found.nees for found in of_fault.values() if found.nees is not None), default=None)
-            far = max(
-                (found.largest_m for found in of_fault.values() if found.largest_m is not None), default=None
-            )
-            rows.append(
-                [name, *counts, shown(far, ".1f"), shown(nees, ".1f"), next(iter(of_fault.values())).named]
-            )
+            largest = [
+                max((value for value in values if value is not None), default=None)
+                for values in zip(*((found.largest_m, found.nees) for found in of_fault.values()), strict=True)
+            ]
+            named = next(iter(of_fault.values())).named
+            rows.append([name, *counts, *(shown(value, ".1f") for value in largest), named])
         frames = max(found.frames for found in of_flight)
         columns = [f"`{flight}`, {frames} frames: fixed, false", *methods, "largest m", "NEES", "named"]
         lines += table(columns, rows)

@@ -8,7 +8,6 @@ are not reported on, prints its weights, and writes nothing.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -20,25 +19,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import RESULTS, SHARED
-from bench.accuracy.flights import STEPS, Recorded, recorded
+from bench.accuracy.flights import STEPS, recorded
+from bench.accuracy.trials import picture
+from bench.accuracy.truth import off, prior_about, true_start
 from bench.command import parser_on_one_thread
-from bench.inputs.farmland import farmland
-from bench.inputs.scenes import mosaic
+from bench.inputs.farmland import farmland, half_of
+from bench.inputs.scenes import mosaic, town_gray
 from bench.pages.integrity import auc
-from bench.pages.text import machine, paragraph, table
-from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
+from bench.pages.text import machine, paragraph, shown, table
+from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, SceneMatcher
 from engine.geo import Array
-from engine.matching.align import view_of
 from engine.values import Attitude, Window
-from scenematch.check.availability import Audit, audit_site, regressors
-from scenematch.simulator import build_town
+from scenematch.check.availability import audit_site, regressors
+from scenematch.report.metrics import WRONG_M
 
 Gray = NDArray[np.uint8]
 
 PAGE = RESULTS / "audit.md"
 MEASURED = "<!-- bench.accuracy.audit -->\n"
-WRONG_M = 10.0
-START_SIGMA_M = 15.0
 CAMERA = Camera.from_fov(300, 300, 60.0)
 HEIGHTS_M = (40.0, 60.0, 120.0)
 PRIOR_SIGMA_M = 10.0  # as AuditOptions
@@ -76,7 +74,7 @@ def arrays(gray: Gray, seen: Gray | None = None) -> Ground:
 
 
 def town(seed: int) -> Ground:
-    return arrays(np.asarray(cv2.cvtColor(build_town(seed).ortho, cv2.COLOR_RGB2GRAY), np.uint8))
+    return arrays(town_gray(seed))
 
 
 def patchwork(seed: int) -> Ground:
@@ -109,16 +107,10 @@ def whole(site: OrthoMap) -> Ground:
     return Ground(site, site.gray(Window(0, 0, columns, rows)))
 
 
-def half(gray: Gray, *, east: bool) -> Gray:
-    """One half of the farmland: one to fit on, one to report on."""
-    middle = gray.shape[1] // 2
-    return np.ascontiguousarray(gray[:, middle:] if east else gray[:, :middle])
-
-
 def fitted_on() -> Iterator[Ground]:
     yield from map(town, FIT_TOWNS)
     yield from map(patchwork, FIT_TOWNS)
-    yield from (arrays(half(farmland(year), east=False)) for year in FIT_YEARS)
+    yield from (arrays(half_of(farmland(year), east=False)) for year in FIT_YEARS)
 
 
 def reported_on() -> Iterator[tuple[str, Callable[[], list[Ground]]]]:
@@ -127,12 +119,17 @@ def reported_on() -> Iterator[tuple[str, Callable[[], list[Ground]]]]:
     yield "their patchwork with water, forest and repeated fields", lambda: list(map(patchwork, TOWNS))
     if not SHARED.is_dir():
         return
-    years = {year: half(farmland(year), east=True) for year in YEARS}
+    years = reported_years()
     yield "the other half of the farmland, four other years", lambda: [arrays(years[year]) for year in YEARS]
     pairs = list(pairwise(YEARS))
     yield "the same, each year's frames on the map before", lambda: [arrays(years[a], years[b]) for a, b in pairs]
     for name in ("gazebo-a1", "nust"):
         yield f"map of {name}", lambda name=name: [whole(OrthoMap.open(SHARED / name / "map.tif"))]  # type: ignore[misc]
+
+
+def reported_years() -> dict[str, Gray]:
+    """The other half of the farmland, by year."""
+    return {year: half_of(farmland(year), east=True) for year in YEARS}
 
 
 # ----------------------------------------------------------------------------------------------------- frames
@@ -163,21 +160,18 @@ def changed(gray: Gray, rng: np.random.Generator) -> Gray:
     return np.asarray(np.clip(out, 0, 255), np.uint8)
 
 
-def photograph(ground: Ground, nadir_px: Array, height_m: float, rng: np.random.Generator) -> Frame:
+def photograph(ground: Ground, place_m: Array, height_m: float, rng: np.random.Generator) -> Frame:
     """A changed frame over a place, with telemetry a little off."""
-    site, heading = ground.site, float(rng.uniform(0.0, 360.0))
+    heading = float(rng.uniform(0.0, 360.0))
     roll, pitch = rng.normal(0.0, 2.0, 2)
-    view = view_of(CAMERA, Attitude(roll, pitch, heading), height_m, site.enu_jacobian(nadir_px))
-    assert view is not None
-    moved = np.array([[1.0, 0.0, -nadir_px[0]], [0.0, 1.0, -nadir_px[1]], [0.0, 0.0, 1.0]])
-    size = (CAMERA.width_px, CAMERA.height_px)
-    picture = cv2.warpPerspective(ground.seen, view.image_from_map @ moved, size, borderMode=cv2.BORDER_REFLECT)
+    attitude = Attitude(float(roll), float(pitch), heading)
+    seen = picture(ground.seen, ground.site, CAMERA, place_m, height_m, attitude, cv2.BORDER_REFLECT)
     telemetry = (
         height_m * (1.0 + rng.normal(0.0, 0.01)),
         heading + rng.normal(0.0, 1.0),
         *(angle + rng.normal(0.0, 0.5) for angle in (roll, pitch)),
     )
-    return Frame(changed(np.asarray(picture, np.uint8), rng), None, *map(float, telemetry))
+    return Frame(changed(seen, rng), None, *map(float, telemetry))
 
 
 def trials(ground: Ground, height_m: float, count: int, rng: np.random.Generator) -> list[Trial]:
@@ -199,13 +193,11 @@ def trials(ground: Ground, height_m: float, count: int, rng: np.random.Generator
             count -= 1  # nodata is no question
             continue
         truth = site.enu_from_pixel(place)
-        east, north = truth + rng.normal(0.0, PRIOR_SIGMA_M, 2)
-        prior = Prior(east_m=float(east), north_m=float(north), sigma_m=PRIOR_SIGMA_M)
-        fix = matcher.locate(photograph(ground, place, height_m, rng), prior)
-        right = isinstance(fix, Fix) and np.hypot(fix.east_m - truth[0], fix.north_m - truth[1]) <= WRONG_M
-        out.append(
-            Trial(height_m, float(found.at(place)), at_places[j, i], right, isinstance(fix, Fix) and not right)
-        )
+        prior = prior_about(truth, PRIOR_SIGMA_M, rng)
+        fix = matcher.locate(photograph(ground, truth, height_m, rng), prior)
+        right = is_right(fix, truth)
+        wrong = isinstance(fix, Fix) and not right
+        out.append(Trial(height_m, float(found.at(place)), at_places[j, i], right, wrong))
     return out
 
 
@@ -258,10 +250,10 @@ def places_rows(count: int) -> list[list[str]]:
 
 def places_row(name: str, found: list[Trial]) -> list[str]:
     by_height = [auc_of([t for t in found if t.height_m == height]) for height in HEIGHTS_M]
-    shown = ", ".join("-" if np.isnan(value) else f"{value:.2f}" for value in by_height)
+    heights = ", ".join(map(shown, by_height))
     share, held = np.mean([t.right for t in found]), np.mean([t.predicted for t in found])
     wrong = str(sum(t.wrong for t in found))
-    row = [name, str(len(found)), f"{held:.0%}", f"{share:.0%}", wrong, f"{auc_of(found):.3f}", shown]
+    row = [name, str(len(found)), f"{held:.0%}", f"{share:.0%}", wrong, f"{auc_of(found):.3f}", heights]
     print(" | ".join(row), flush=True)
     return row
 
@@ -270,7 +262,7 @@ def other_rows(count: int) -> list[list[str]]:
     """Farmland four years on."""
     if not SHARED.is_dir():
         return []
-    years = {year: half(farmland(year), east=True) for year in YEARS}
+    years = reported_years()
     grounds = [arrays(years[first], years[last]) for first, last in zip(YEARS, YEARS[2:], strict=False)]
     return [places_row("one year alone", all_trials(grounds, count, 1))]
 
@@ -284,33 +276,23 @@ def flight_rows(quick: bool) -> list[list[str]]:
         flight = recorded(name, step * (10 if quick else 2))
         heights = [frame.height_agl_m for frame, _ in flight.frames if frame.height_agl_m is not None]
         found = audit_site(flight.site, flight.camera, float(np.median(heights)))
-        first = flight.truth[0]
-        start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
-        navigator = Navigator(SceneMatcher(flight.site, flight.camera, "ncc", "cpu"), start)
-        right = np.array([is_right(navigator.update(frame, prior), flight) for frame, prior in flight.frames])
-        predicted = np.array([held(found, flight, frame) for frame, _ in flight.frames])
+        navigator = Navigator(SceneMatcher(flight.site, flight.camera, "ncc", "cpu"), true_start(flight.truth))
+        results = [navigator.update(*each) for each in flight.frames]
+        places = [(result, flight.true_place_m(result.timestamp_ns)) for result in results]
+        placed = [(result, place) for result, place in places if place is not None]
+        predicted = np.array([found.at(flight.site.pixel_from_enu(place)) for _, place in placed])
+        right = np.array([is_right(*each) for each in placed])
         known = np.isfinite(predicted)
         inside = auc(predicted[known], right[known])
-        rows.append([
-            name, str(int(known.sum())), f"{predicted[known].mean():.1%}", f"{right[known].mean():.1%}",
-            "-" if np.isnan(inside) else f"{inside:.2f}",
-        ])  # fmt: skip
+        shares = [f"{values[known].mean():.1%}" for values in (predicted, right)]
+        rows.append([name, str(int(known.sum())), *shares, shown(inside)])
         print(" | ".join(rows[-1]), flush=True)
     return rows
 
 
-def is_right(result: Fix | NoFix, flight: Recorded) -> bool:
+def is_right(result: Fix | NoFix, place_m: Array) -> bool:
     """Whether there is a fix, and that near the truth."""
-    place_m = flight.true_place_m(result.timestamp_ns)
-    if not isinstance(result, Fix) or place_m is None:
-        return False
-    return math.hypot(result.east_m - place_m[0], result.north_m - place_m[1]) <= WRONG_M
-
-
-def held(found: Audit, flight: Recorded, frame: Frame) -> float:
-    """What the audit says of where a frame was taken; NaN where nobody knows where that was."""
-    place_m = flight.true_place_m(frame.timestamp_ns)
-    return float("nan") if place_m is None else float(found.at(flight.site.pixel_from_enu(place_m)))
+    return isinstance(result, Fix) and off(result, place_m)[0] <= WRONG_M
 
 
 def time_rows() -> list[list[str]]:

@@ -21,14 +21,15 @@ import numpy as np
 
 from bench import SHARED
 from bench.accuracy.classical import TOLERANCE_SHARE, ClassicalRecipe
-from bench.accuracy.flights import MIDDLE, moved_to_middle
+from bench.accuracy.flights import MIDDLE, where_truth_is
+from bench.accuracy.truth import START_SIGMA_M, answered, rows_of
 from bench.command import parser_on_one_thread
 from bench.pages import field
-from engine import Fix, Frame, Navigator, OrthoMap, Prior, SceneMatcher
+from engine import Frame, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.geo import Array
 from engine.options import ACCEPT_ALL, LearnedOptions
 from scenematch import FlightFiles, TrackSettings, track
-from scenematch.files.track import TrackRow, read_track, track_row
+from scenematch.files.track import TrackRow, read_track
 from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
 from scenematch.runs.arguments import parse_position
@@ -39,7 +40,6 @@ DRAWN = {"gazebo-a1": 8, "gazebo-a2": 8, "gazebo-a1-evening": 8}
 METHODS = ("ncc", "sift", "auto", "learned", "paper-ncc", "paper-sift", "classical")
 RECIPE_STEPS = {"nust": 4, "caliterra": 2, "gazebo-a1": 24, "gazebo-a2": 24, "gazebo-a1-evening": 24}
 VIDEO = "flight.mp4"
-START_SIGMA_M = 15.0
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def fly(name: str, method: str, step: int, weights: Sequence[Path]) -> Figures:
         profile=profile,
         learned=LearnedOptions(weights=tuple(map(str, weights)) if method == "learned" else ()),
     )
-    rows = _middles(inputs, settings) if name in MIDDLE else _tracked(files, inputs, settings)
+    rows = _middles(name, inputs, settings) if name in MIDDLE else _tracked(files, inputs, settings)
     errors = errors_en_m(rows, inputs.truth, inputs.site.frame)
     spent = [row.latency_ms for row in rows if row.latency_ms is not None]
     squared = None if paper else errors.normalised_squared_errors
@@ -108,7 +108,7 @@ def _tracked(files: FlightFiles, inputs: FlightInputs, settings: TrackSettings) 
         return read_track(Path(out) / "track.csv")
 
 
-def _middles(inputs: FlightInputs, settings: TrackSettings) -> list[TrackRow]:
+def _middles(name: str, inputs: FlightInputs, settings: TrackSettings) -> list[TrackRow]:
     """The rows of the same track with each fix moved to the ground in the middle of its frame, as the truth is.
 
     A fix with a pose is the vehicle's position, and the file of a track does not hold the pose's attitude.
@@ -117,15 +117,8 @@ def _middles(inputs: FlightInputs, settings: TrackSettings) -> list[TrackRow]:
     matcher.warmup()
     options = ACCEPT_ALL if settings.profile == "paper" else settings.navigator
     navigator = Navigator(matcher, parse_position("start", settings.start), None, options)
-    rows = []
-    for item in inputs.flight:
-        begin = time.perf_counter()
-        result = navigator.update(item.frame, item.prior)
-        spent_ms = (time.perf_counter() - begin) * 1e3
-        if isinstance(result, Fix):
-            result = moved_to_middle(result, inputs.site, inputs.camera)
-        rows.append(track_row(item.name, result, latency_ms=spent_ms, deadline_met=None))
-    return rows
+    results, spent_ms = answered(navigator.update, ((item.frame, item.prior) for item in inputs.flight))
+    return rows_of([where_truth_is(name, inputs.site, inputs.camera, result) for result in results], spent_ms)
 
 
 def _start(inputs: FlightInputs) -> str | None:

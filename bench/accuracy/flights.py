@@ -8,7 +8,6 @@ Writes docs/results/flights.md. Recorded flights that are missing are left out; 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,26 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import SHARED
+from bench.accuracy.truth import answered, rows_of, true_places_m, true_start
 from bench.command import parser_on_one_thread
 from bench.inputs.views import FRAMES
 from bench.pages import flights
 from bench.pages.flights import Run
 from bench.speed.peers import OpenCvFeatures
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
-from engine.geo import enu_from_body
+from engine.geo import Array, enu_from_body
 from engine.navigation.navigator import Matcher
 from engine.options import ACCEPT_ALL, SiftOptions
 from engine.values import Attitude, Truth
 from scenematch.files.flight import open_flight
 from scenematch.files.telemetry import ground_amsl_m
-from scenematch.files.track import TrackRow, track_row
 from scenematch.files.truth import interpolate_truth, read_truth
 from scenematch.report.metrics import Ground, errors_en_m, summarise
 from scenematch.simulator import plan_flight
 
 STEPS = {"gazebo-a1": 3, "gazebo-a2": 3, "gazebo-a1-evening": 3, "nust": 2, "caliterra": 1}
 MIDDLE = ("nust",)  # whose truth is the ground in the middle of each frame, not below the camera
-START_SIGMA_M = 15.0
 SIMULATED_SEED, SIMULATED_HZ = 1, 0.56
 OURS, NO_ATTITUDE = "scenematch SIFT", "scenematch SIFT, attitude not used"
 OPENCV, PAPER = "OpenCV features, scenematch pose", "paper's SIFT"
@@ -58,7 +56,12 @@ class Recorded:
     def true_place_m(self, stamp_ns: int | None) -> NDArray[np.float64] | None:
         """(2,) true east and north at a moment; None where they are not known."""
         true = None if stamp_ns is None else interpolate_truth(self.truth, stamp_ns)
-        return None if true is None else self.site.frame.enu_from_geodetic(true.lat_deg, true.lon_deg)[:2]
+        return None if true is None else true_places_m(self.site, [true])[0]
+
+    def placed(self) -> list[tuple[Frame, Array]]:
+        """Those frames whose true east and north (2,) are known."""
+        places = [(frame, self.true_place_m(frame.timestamp_ns)) for frame, _ in self.frames]
+        return [(frame, place) for frame, place in places if place is not None]
 
 
 def recorded(name: str, step: int, *, with_surface: bool = True, **accuracy: float | None) -> Recorded:
@@ -73,9 +76,9 @@ def recorded(name: str, step: int, *, with_surface: bool = True, **accuracy: flo
     return Recorded(name, step, site, camera, frames, read_truth(folder / "truth.csv"), ground)
 
 
-def simulated() -> Recorded:
-    """Every second frame of the built-in flight."""
-    plan = plan_flight(SIMULATED_SEED, rate_hz=SIMULATED_HZ)
+def simulated(rate_hz: float = SIMULATED_HZ) -> Recorded:
+    """The built-in flight, every second frame of it if nothing else is said."""
+    plan = plan_flight(SIMULATED_SEED, rate_hz=rate_hz)
     site = plan.town.site()
     frames: list[tuple[Frame, Prior | None]] = [(frame, None) for frame in plan.iter_frames()]
     return Recorded("built-in", 2, site, plan.camera, frames, plan.truth_rows(), Ground(site.ground_m))
@@ -83,22 +86,11 @@ def simulated() -> Recorded:
 
 def fly(flight: Recorded, who: str, matcher: Matcher) -> Run:
     """Follow the flight from its true start."""
-    first = flight.truth[0]
-    start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
-    navigator = Navigator(matcher, start, options=ACCEPT_ALL if who == PAPER else None)
-    results, rows = [], []
-    for index, (frame, prior) in enumerate(flight.frames):
-        begin = time.perf_counter()
-        result = navigator.update(frame, prior)
-        spent_ms = (time.perf_counter() - begin) * 1e3
-        results.append(result)
-        if flight.name in MIDDLE and isinstance(result, Fix):
-            result = moved_to_middle(result, flight.site, flight.camera)
-        rows.append(track_row(str(index), result, latency_ms=spent_ms, deadline_met=None))
-    return _judged(flight, who, results, rows)
-
-
-def _judged(flight: Recorded, who: str, results: list[Fix | NoFix], rows: list[TrackRow]) -> Run:
+    options = ACCEPT_ALL if who == PAPER else None
+    navigator = Navigator(matcher, true_start(flight.truth), options=options)
+    results, spent_ms = answered(navigator.update, flight.frames)
+    seen = [where_truth_is(flight.name, flight.site, flight.camera, result) for result in results]
+    rows = rows_of(seen, spent_ms)
     shares = [result.score for result in results if isinstance(result, Fix)]
     return Run(
         flight.name,
@@ -109,6 +101,11 @@ def _judged(flight: Recorded, who: str, results: list[Fix | NoFix], rows: list[T
         float(np.mean(shares)) if shares else None,
         attitude_rms_deg(results, flight.truth),
     )
+
+
+def where_truth_is(name: str, site: OrthoMap, camera: Camera, result: Fix | NoFix) -> Fix | NoFix:
+    """An answer on a flight, its fix at the place that the flight's truth is of."""
+    return moved_to_middle(result, site, camera) if name in MIDDLE and isinstance(result, Fix) else result
 
 
 def moved_to_middle(fix: Fix, site: OrthoMap, camera: Camera) -> Fix:

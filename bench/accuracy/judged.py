@@ -10,7 +10,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from bench.accuracy.trials import Ground, Trial, prior_about, trial
+from bench.accuracy.trials import Ground, Trial, drawn_prior, trial
+from bench.accuracy.truth import off
 from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.budget import Budget, Deadline
 from engine.matching.candidates import PeakCandidate
@@ -86,7 +87,7 @@ class Bench:
             made = trial(self.here, number, rng)
             if made.on == "other":
                 place = self.other.places_m[rng.integers(len(self.other.places_m))]
-                made = replace(made, prior=prior_about(place, rng))
+                made = replace(made, prior=drawn_prior(place, rng))
             yield made
 
     def judged(self, made: Trial, method: str) -> Row:
@@ -160,11 +161,9 @@ class Bench:
         levels_m = [fix.protection_level_m(risk) for risk in RISKS]
         if made.truth_m is None:
             return Row(name, kind, method, fixed, False, scores, values, np.inf, fix.sigma_m, np.nan, levels_m)
-        error = self.here.seen_m(fix) - made.truth_m
-        error_m = float(np.hypot(*error))
-        squared = float(error @ np.linalg.solve(fix.covariance_m2[:2, :2], error))
+        error_m, sigmas = off(self.here.seen(fix), made.truth_m)
         right = error_m <= WRONG_M or error_m <= FALSE_SIGMAS * fix.sigma_m
-        return Row(name, kind, method, fixed, right, scores, values, error_m, fix.sigma_m, squared, levels_m)
+        return Row(name, kind, method, fixed, right, scores, values, error_m, fix.sigma_m, sigmas**2, levels_m)
 
 
 def _query(matcher: SceneMatcher, frame: Frame, prior: Prior | None) -> Query:

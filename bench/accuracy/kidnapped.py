@@ -11,7 +11,6 @@ object a row.
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
@@ -21,10 +20,10 @@ import numpy as np
 
 from bench import SHARED
 from bench.accuracy.flights import recorded
+from bench.accuracy.truth import answered, is_false
 from bench.command import parser_on_one_thread
 from engine import Camera, Fix, Frame, Navigator, OrthoMap, SceneMatcher
 from engine.geo import Array
-from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import Motion, SensorNoise, build_town, plan_flight
 from scenematch.simulator.vehicle import simulate_telemetry
 
@@ -92,8 +91,7 @@ def wander(site: OrthoMap, starts: int, rng: np.random.Generator) -> Motion:
 def shared(name: str, starts: int) -> Flight:
     """Runs from evenly spaced starts of a shared flight."""
     flown = recorded(name, 1)
-    places = [(blind(frame), flown.true_place_m(frame.timestamp_ns)) for frame, _ in flown.frames]
-    frames = [(frame, place) for frame, place in places if place is not None]
+    frames = [(blind(frame), place) for frame, place in flown.placed()]
     first = np.linspace(0, len(frames) - FRAMES, starts).astype(int)
     return Flight(name, flown.site, flown.camera, [frames[k : k + FRAMES] for k in first])
 
@@ -119,20 +117,17 @@ def fly(flight: Flight, matcher: SceneMatcher) -> dict[str, Any]:
     any_heading = (
         {"heading_deg": 0.0, "heading_sigma_deg": 180.0} if matcher.method == "ncc" else {}
     )  # it needs one
-    for blinded in flight.runs:
-        run = [(replace(frame, **any_heading), place) for frame, place in blinded]
-        navigator, seen, last = Navigator(matcher), False, None
-        for number, (frame, place) in enumerate(run):
-            begin = time.perf_counter()
-            last = navigator.update(frame)
-            times.append((time.perf_counter() - begin) * 1e3)
-            if isinstance(last, Fix):
-                fixes, wrong, seen = fixes + 1, wrong + is_wrong(last, place), True
-            within += number == 2 and seen
-        refused += not seen
-        single = matcher.locate(run[0][0])
+    for run in flight.runs:
+        frames = [(replace(frame, **any_heading),) for frame, _ in run]
+        results, spent_ms = answered(Navigator(matcher).update, frames)
+        times += spent_ms
+        fixed = [(fix, place) for fix, (_, place) in zip(results, run, strict=True) if isinstance(fix, Fix)]
+        fixes, wrong = fixes + len(fixed), wrong + sum(is_false(*each) for each in fixed)
+        within += any(isinstance(result, Fix) for result in results[:3])
+        refused += not fixed
+        single = matcher.locate(*frames[0])
         if isinstance(single, Fix):
-            alone, alone_wrong = alone + 1, alone_wrong + is_wrong(single, run[0][1])
+            alone, alone_wrong = alone + 1, alone_wrong + is_false(single, run[0][1])
     return {
         "flight": flight.name,
         "method": matcher.method,
@@ -146,13 +141,6 @@ def fly(flight: Flight, matcher: SceneMatcher) -> dict[str, Any]:
         "median_ms": round(float(np.median(times)), 1),
         "max_ms": round(float(np.max(times)), 1),
     }
-
-
-def is_wrong(fix: Fix, place: Array) -> bool:
-    """Off by more than 10 m and three sigmas."""
-    off = np.array([fix.east_m, fix.north_m]) - place
-    sigmas = float(np.sqrt(off @ np.linalg.solve(fix.covariance_m2[:2, :2], off)))
-    return bool(np.hypot(*off) > WRONG_M and sigmas > FALSE_SIGMAS)
 
 
 def rows(seeds: list[int], starts: int, names: tuple[str, ...]) -> Iterator[dict[str, Any]]:

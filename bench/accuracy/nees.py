@@ -15,7 +15,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bench import SHARED
-from bench.accuracy.flights import MIDDLE, Recorded, moved_to_middle, recorded
+from bench.accuracy.flights import MIDDLE, Recorded, recorded, where_truth_is
+from bench.accuracy.truth import prior_about, true_places_m
 from bench.command import parser_on_one_thread
 from bench.pages.text import paragraph, rewrite, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
@@ -110,9 +111,9 @@ def town(seed: int, light: str = "noon") -> Flight:
     plan = plan_flight(seed, rate_hz=0.45, condition=light)
     site = plan.town.site()
     frames, truth = list(plan.iter_frames()), plan.truth_rows()
-    places = [site.frame.enu_from_geodetic(t.lat_deg, t.lon_deg) for t in truth]
     ups = [np.nan if t.height_agl_m is None else t.height_agl_m + site.ground_m for t in truth]
-    return Flight(f"town {seed}, {light}", site, plan.camera, frames, np.column_stack([places, ups]), Known(EXACT))
+    places_m = np.column_stack([true_places_m(site, truth), ups])
+    return Flight(f"town {seed}, {light}", site, plan.camera, frames, places_m, Known(EXACT))
 
 
 def shared(name: str, *, with_surface: bool = True) -> Flight:
@@ -146,8 +147,7 @@ def samples(flight: Flight, method: str) -> list[Sample | None]:
     matcher.warmup()
     frames, priors = [], []
     for frame, true in zip(flight.frames, flight.truth_m, strict=True):
-        east, north = true[:2] + rng.normal(0.0, OFF_M, 2)
-        prior = Prior(east_m=float(east), north_m=float(north), sigma_m=SIGMA_M)
+        prior = prior_about(true[:2], SIGMA_M, rng, OFF_M)
         if method == "NCC, no attitude":
             frame = replace(frame, roll_deg=None, pitch_deg=None)
         elif flight.name in MIDDLE and method == "SIFT":
@@ -155,11 +155,11 @@ def samples(flight: Flight, method: str) -> list[Sample | None]:
         frames.append(frame)
         priors.append(prior)
     out: list[Sample | None] = []
-    for fix, true in zip(matcher.locate_many(frames, priors), flight.truth_m, strict=True):
+    for found, true in zip(matcher.locate_many(frames, priors), flight.truth_m, strict=True):
+        fix = where_truth_is(flight.name, flight.site, flight.camera, found)
         if not isinstance(fix, Fix):
             out.append(None)
             continue
-        fix = moved_to_middle(fix, flight.site, flight.camera) if flight.name in MIDDLE else fix
         up = np.nan if fix.up_m is None else fix.up_m
         covariance = fix.covariance_m2 + flight.known.truth_m**2 * np.diag([1.0, 1.0, 0.0])
         error_m = np.array([fix.east_m, fix.north_m, up]) - true

@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from bench import SHARED
-from bench.accuracy.flights import MIDDLE, START_SIGMA_M, Recorded, moved_to_middle, recorded
+from bench.accuracy.flights import Recorded, recorded, simulated, where_truth_is
+from bench.accuracy.truth import true_start
 from bench.command import parser_on_one_thread
 from engine import (
     Budget,
@@ -36,8 +37,6 @@ from engine.geo import Array
 from engine.matching.align import to_gray
 from engine.navigation.motion import GroundMotion
 from engine.navigation.odometry import NoMotion, VisualOdometry
-from scenematch.report.metrics import Ground
-from scenematch.simulator import plan_flight
 
 REPORTED, BUILT_IN = ("gazebo-a1", "nust"), "built-in"
 PERIOD_S = 5.0  # with matching, then without
@@ -48,12 +47,7 @@ NO_VELOCITY, PICTURES, TELEMETRY = "none", "odometry", "telemetry's velocity"
 
 def flight_of(name: str) -> Recorded:
     """A shared flight as recorded, or the built-in one at 3 Hz."""
-    if name != BUILT_IN:
-        return recorded(name, 1)
-    plan = plan_flight(1, rate_hz=3.0)
-    site = plan.town.site()
-    frames: list[tuple[Frame, Prior | None]] = [(frame, None) for frame in plan.iter_frames()]
-    return Recorded(name, 1, site, plan.camera, frames, plan.truth_rows(), Ground(site.ground_m))
+    return simulated(rate_hz=3.0) if name == BUILT_IN else recorded(name, 1)
 
 
 def without_velocity(frame: Frame) -> Frame:
@@ -112,16 +106,14 @@ def fly(flight: Recorded, velocity: str) -> Gaps:
     matcher.warmup()
     frames = [frame if velocity == TELEMETRY else without_velocity(frame) for frame, _ in flight.frames]
     gappy = EverySecondPeriod(matcher, frames[0].timestamp_ns or 0)
-    first = flight.truth[0]
-    start = Prior(lat_deg=first.lat_deg, lon_deg=first.lon_deg, sigma_m=START_SIGMA_M)
-    navigator = Navigator(gappy, start, options=NavigatorOptions(odometry=velocity == PICTURES))
+    navigator = Navigator(gappy, true_start(flight.truth), options=NavigatorOptions(odometry=velocity == PICTURES))
     gaps, way_m, before, ended_ns, middle_m = Gaps(), 0.0, None, None, np.zeros(2)
     for index, frame in enumerate(frames):
         result, stamp_ns = navigator.update(frame), frame.timestamp_ns or 0
         place = flight.true_place_m(stamp_ns)
         withheld = gappy.withholds(frame)
-        if isinstance(result, Fix) and flight.name in MIDDLE:
-            seen = moved_to_middle(result, flight.site, flight.camera)
+        if isinstance(result, Fix):
+            seen = where_truth_is(flight.name, flight.site, flight.camera, result)
             middle_m = np.array([seen.east_m - result.east_m, seen.north_m - result.north_m])
         known = _known(navigator, result, middle_m)
         _count(gaps, result, known, place, withheld=withheld)

@@ -10,7 +10,6 @@ start. Writes docs/results/field-simulated.md.
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 
@@ -18,12 +17,12 @@ import cv2
 import numpy as np
 
 from bench.accuracy.field import figures
+from bench.accuracy.truth import START_SIGMA_M, answered, prior_about, prior_at, rows_of, true_places_m
 from bench.command import parser_on_one_thread
 from bench.pages import scenes as page
-from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
+from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, SceneMatcher
 from engine.geo import Array, enu_from_body
 from engine.values import Attitude, Truth
-from scenematch.files.track import TrackRow, track_row
 from scenematch.report.metrics import errors_en_m
 from scenematch.simulator import FlightStyle, Town, build_town, plan_flight, render_frame
 from scenematch.simulator.flight import paper_camera
@@ -32,7 +31,6 @@ from scenematch.simulator.town import MAP_SENSOR
 
 FIRST_SEED = 9100
 """No constant of the engine was fitted on towns from here on."""
-SIGMA_M = 15.0
 RATE_HZ = 0.28
 CITY_SHIFT_M, CITY_TILT_DEG, CITY_HEIGHT_M = 5.0, 9.0, 120.0
 CITY_CHANGED, LEAN_DEG, LEAN_FROM_M = 0.2, 12.0, 6000.0
@@ -168,35 +166,16 @@ def match(scene: Scene, method: str, seed: int) -> Iterator[Result]:
     """Every frame by itself, then the whole flight."""
     matcher = SceneMatcher(scene.site, scene.camera, method, "cpu", MatcherOptions())
     matcher.warmup()
-    rng, truth_en = np.random.default_rng([seed, 7]), _truth_en(scene)
-
-    def alone(frame: Frame, index: int) -> Fix | NoFix:
-        east, north = truth_en[index] + rng.normal(0.0, SIGMA_M, 2)
-        return matcher.locate(frame, Prior(east_m=float(east), north_m=float(north), sigma_m=SIGMA_M))
-
-    yield _judged(scene, method, "each frame", *_run(scene, alone))
-    start = Prior(east_m=float(truth_en[0, 0]), north_m=float(truth_en[0, 1]), sigma_m=SIGMA_M)
-    navigator = Navigator(matcher, start)
-    yield _judged(scene, method, "track", *_run(scene, lambda frame, _: navigator.update(frame)))
+    rng, places_m = np.random.default_rng([seed, 7]), true_places_m(scene.site, scene.truth)
+    priors = [prior_about(place, START_SIGMA_M, rng) for place in places_m]
+    alone = answered(matcher.locate, zip(scene.frames, priors, strict=True))
+    yield _judged(scene, method, "each frame", *alone)
+    navigator = Navigator(matcher, prior_at(places_m[0], START_SIGMA_M))
+    yield _judged(scene, method, "track", *answered(navigator.update, ((frame,) for frame in scene.frames)))
 
 
-def _truth_en(scene: Scene) -> Array:
-    rows = [(row.lat_deg, row.lon_deg) for row in scene.truth]
-    return np.asarray(scene.site.frame.enu_from_geodetic(*np.array(rows).T))
-
-
-def _run(scene: Scene, locate: Callable[[Frame, int], Fix | NoFix]) -> tuple[list[TrackRow], list[float]]:
-    rows, spent = [], []
-    for index, frame in enumerate(scene.frames):
-        begin = time.perf_counter()
-        result = locate(frame, index)
-        spent.append((time.perf_counter() - begin) * 1e3)
-        rows.append(track_row(str(index), result, latency_ms=spent[-1], deadline_met=None))
-    return rows, spent
-
-
-def _judged(scene: Scene, method: str, how: str, rows: list[TrackRow], spent: list[float]) -> Result:
-    errors = errors_en_m(rows, scene.truth, scene.site.frame)
+def _judged(scene: Scene, method: str, how: str, results: list[Fix | NoFix], spent: list[float]) -> Result:
+    errors = errors_en_m(rows_of(results, spent), scene.truth, scene.site.frame)
     on_map = np.hypot(*(errors.error_en_m - scene.map_shift_m).T)
     return Result(scene.name, method, how, errors.distance_m, on_map, errors.normalised_squared_errors, spent)
 

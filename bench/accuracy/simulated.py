@@ -1,17 +1,16 @@
 """Flights over simulated towns in one light and season, on the map of another; and a sheet of what they look like.
 
-    python -m bench.accuracy.simulated [--quick] [--sheet] [--docs DIR]
+    python -m bench.accuracy.simulated [--hills] [--quick] [--sheet] [--docs DIR]
 
-Writes the tables of docs/results/simulator.md; --sheet draws docs/img/sim-conditions.png instead.
+Writes the tables of docs/results/simulator.md: of the conditions, or with ``--hills`` that of flat towns and hilly
+ones. ``--sheet`` draws docs/img/sim-conditions.png instead.
 """
 
 from __future__ import annotations
 
 import json
-import math
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import DOCS
+from bench.accuracy.truth import answered, pooled, rows_of, true_start
 from bench.command import parser_on_one_thread
-from bench.pages.text import machine, paragraph, rewrite, table
-from engine import Camera, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
+from bench.pages.text import machine, paragraph, percent, rewrite, table_of
+from engine import Camera, MatcherOptions, Navigator, SceneMatcher
 from engine.geo import LocalFrame
 from engine.options import ACCEPT_ALL
 from engine.values import Attitude
-from scenematch.files.track import track_row
 from scenematch.report.metrics import Ground, summarise
 from scenematch.simulator import CONDITIONS, FlightPlan, Optics, build_town, picture_at, plan_flight
 from scenematch.simulator.render import transformer
@@ -44,10 +43,15 @@ HARDER: dict[str, dict[str, Any]] = {
 }
 RATE_HZ = 0.28
 """Every fourth frame of the paper's flight."""
-START_SIGMA_M = 15.0
 WAYS = (("ncc", "engine"), ("sift", "engine"), ("ncc", "paper"), ("sift", "paper"))
-PAGE = "simulator.md"
-BEGIN, END = "<!-- bench.accuracy.simulated -->", "<!-- end of bench.accuracy.simulated -->"
+PAPER = "paper's recipe"
+HILLY_SEEDS, HILLY_DAYS = (1, 2, 31, 32, 71), ("noon", "evening")
+"""The ground below was worked out on the towns 21 to 26."""
+HILLS_M = (0.0, 15.0, 30.0, 60.0)
+MARKS = "<!-- bench.accuracy.simulated -->", "<!-- end of bench.accuracy.simulated -->"
+HILLS_MARKS = "<!-- bench.accuracy.simulated --hills -->", "<!-- end of bench.accuracy.simulated --hills -->"
+DAY, WHO, RMS = ("frames' day", "day", "s"), ("by", "who", "s"), ("RMS m", "rms_m", ".2f")
+FIXED, FALSE = ("availability", "availability", percent), ("false", "false_fixes", "d")
 SHEET_SEED, CELL_PX = 41, 170
 PLACES = ((0.0, 0.0, 20.0), (95.0, -110.0, 100.0), (-80.0, 120.0, 250.0))  # east, north and heading of its rows
 
@@ -61,48 +65,42 @@ class Run:
     method: str
     profile: str
     summary: dict[str, Any]
-    with_attitude: bool = True
+    hills_m: float
+    with_attitude: bool
 
 
-def matchers(site: OrthoMap, camera: Camera, ways: tuple[tuple[str, str], ...]) -> Iterator[tuple[str, str, Any]]:
-    """Each way to match over a map, warmed up."""
-    for method, profile in ways:
-        matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions(profile=profile))
+def matchers(plan: FlightPlan, ways: tuple[tuple[str, str], ...]) -> list[SceneMatcher]:
+    """Each way to match over the map of a town, warmed up."""
+    site = plan.town.site()
+    made = [SceneMatcher(site, plan.camera, method, "cpu", MatcherOptions(profile=p)) for method, p in ways]
+    for matcher in made:
         matcher.warmup()
-        yield method, profile, matcher
+    return made
 
 
 def fly(
-    plan: FlightPlan, day: str, ready: list[tuple[str, str, Any]], site: OrthoMap, *, with_attitude: bool = True
+    plan: FlightPlan, ready: list[SceneMatcher], day: str, hills_m: float = 0.0, *, with_attitude: bool = True
 ) -> Iterator[Run]:
     """The same frames by every matcher, each from the true start."""
     truth, frames = plan.truth_rows(), list(plan.iter_frames())
     if not with_attitude:
         frames = [replace(frame, roll_deg=None, pitch_deg=None) for frame in frames]
-    start = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=START_SIGMA_M)
-    for method, profile, matcher in ready:
-        navigator = Navigator(matcher, start, options=ACCEPT_ALL if profile == "paper" else None)
-        rows = []
-        for index, frame in enumerate(frames):
-            begin = time.perf_counter()
-            result = navigator.update(frame)
-            spent_ms = (time.perf_counter() - begin) * 1e3
-            rows.append(track_row(str(index), result, latency_ms=spent_ms, deadline_met=None))
-        ground = Ground(site.ground_m, plan.town.datum_amsl_m)
-        summary = summarise(rows, truth, frame=site.frame, ground=ground)
-        yield Run(day, plan.seed, method, profile, summary, with_attitude)
+    for matcher in ready:
+        profile = matcher.options.profile
+        navigator = Navigator(matcher, true_start(truth), options=ACCEPT_ALL if profile == "paper" else None)
+        rows = rows_of(*answered(navigator.update, ((frame,) for frame in frames)))
+        ground = Ground(matcher.site.ground_m, plan.town.datum_amsl_m)
+        summary = summarise(rows, truth, frame=matcher.site.frame, ground=ground)
+        yield Run(day, plan.seed, matcher.method, profile, summary, hills_m, with_attitude)
 
 
 def flights(seeds: tuple[int, ...], frames: int | None) -> Iterator[Run]:
     """All days over all towns; the map of a town, which is of noon in all of them, is prepared once."""
     for seed in seeds:
-        ready: list[tuple[str, str, Any]] = []
-        for day in DAYS:
-            plan = plan_flight(seed, frames=frames, rate_hz=RATE_HZ, condition=day)
-            if not ready:
-                site = plan.town.site()
-                ready = list(matchers(site, plan.camera, WAYS))
-            yield from fly(plan, day, ready, site)
+        plans = [plan_flight(seed, frames=frames, rate_hz=RATE_HZ, condition=day) for day in DAYS]
+        ready = matchers(plans[0], WAYS)
+        for day, plan in zip(DAYS, plans, strict=True):
+            yield from fly(plan, ready, day)
 
 
 def harder(seeds: tuple[int, ...], frames: int | None) -> Iterator[Run]:
@@ -110,18 +108,19 @@ def harder(seeds: tuple[int, ...], frames: int | None) -> Iterator[Run]:
     for name, options in HARDER.items():
         for seed in seeds:
             plan = plan_flight(seed, frames=frames, rate_hz=RATE_HZ, **options)
-            site = plan.town.site()
-            yield from fly(plan, name, list(matchers(site, plan.camera, WAYS[:2])), site)
+            yield from fly(plan, matchers(plan, WAYS[:2]), name)
 
 
-def pooled(runs: list[Run]) -> list[str]:
-    """Cells of all runs together: frames, RMS, availability, false fixes, wrong ones."""
-    each = [run.summary for run in runs]
-    frames, fixes = (sum(s[key] for s in each) for key in ("frames", "fixes"))
-    squares = sum(s["fixes"] * s["rms_m"] ** 2 for s in each if s["fixes"])
-    rms = f"{math.sqrt(squares / fixes):.2f}" if fixes else "-"
-    counts = [str(sum(s[key] for s in each)) for key in ("false_fixes", "wrong_over_10m")]
-    return [str(frames), rms, f"{100.0 * fixes / frames:.1f} %", *counts]
+def hills(seeds: tuple[int, ...], hills_m: tuple[float, ...], frames: int | None) -> Iterator[Run]:
+    """Flat towns and hilly ones, with attitude and with it withheld; every hilly town has its river."""
+    for seed in seeds:
+        for height_m in hills_m:
+            world = {"relief_m": height_m, "river": height_m > 0.0}
+            plans = [plan_flight(seed, frames=frames, rate_hz=RATE_HZ, condition=d, **world) for d in HILLY_DAYS]
+            ready = matchers(plans[0], WAYS[:2])
+            for day, plan in zip(HILLY_DAYS, plans, strict=True):
+                for known in (True, False):
+                    yield from fly(plan, ready, day, height_m, with_attitude=known)
 
 
 def lines(runs: list[Run], ways: tuple[tuple[str, str], ...]) -> list[str]:
@@ -129,18 +128,26 @@ def lines(runs: list[Run], ways: tuple[tuple[str, str], ...]) -> list[str]:
     rows = []
     for day in dict.fromkeys(run.day for run in runs):
         for method, profile in ways:
-            who = f"{method.upper()}, {'scenematch' if profile == 'engine' else 'paper' + chr(39) + 's recipe'}"
-            same = [run for run in runs if (run.day, run.method, run.profile) == (day, method, profile)]
-            rows.append([day, who, *pooled(same)])
-    return table(["frames' day", "by", "frames", "RMS m", "availability", "false", "off > 10 m"], rows)
+            who = f"{method.upper()}, {'scenematch' if profile == 'engine' else PAPER}"
+            same = [run.summary for run in runs if (run.day, run.method, run.profile) == (day, method, profile)]
+            rows.append({"day": day, "who": who, **pooled(same)})
+    counts, wrong = ("frames", "frames", "d"), ("off > 10 m", "wrong_over_10m", "d")
+    return table_of(rows, DAY, WHO, counts, RMS, FIXED, FALSE, wrong)
 
 
-def write(docs: Path, runs: list[Run], more: list[Run]) -> None:
-    """Put the tables between the page's markers."""
-    body = lines(runs, WAYS)
-    if more:
-        body += ["The engine on what is harder, two towns each:", "", *lines(more, WAYS[:2])]
-    rewrite(docs / PAGE, BEGIN, END, [*body, *paragraph(f"Measured with {machine()}.")])
+def hilly_lines(runs: list[Run]) -> list[str]:
+    """The table of the hills, a row for each of their heights, day, method and with or without attitude."""
+    same: dict[tuple[float, int, str, bool], list[dict[str, Any]]] = {}
+    for run in runs:
+        key = (run.hills_m, HILLY_DAYS.index(run.day), run.method, not run.with_attitude)
+        same.setdefault(key, []).append(run.summary)
+    rows = []
+    for hills_m, day, method, withheld in sorted(same):
+        who = method.upper() + (", attitude withheld" if withheld else "")
+        figures = pooled(same[hills_m, day, method, withheld])
+        rows.append({"hills": f"{hills_m:g} m", "day": HILLY_DAYS[day], "who": who, **figures})
+    worst, nees = ("worst m", "max_m", ".1f"), ("NEES", "nees", ".2f")
+    return table_of(rows, ("hills", "hills", "s"), DAY, WHO, RMS, worst, FIXED, FALSE, nees)
 
 
 def draw_sheet(path: Path) -> None:
@@ -170,22 +177,36 @@ def _column(name: str, camera: Camera) -> NDArray[np.uint8]:
     return np.vstack(cells)
 
 
+def flown(runs: Iterator[Run]) -> list[Run]:
+    """All of them, each printed when it is there."""
+    out = []
+    for run in runs:
+        out.append(run)
+        print(json.dumps(asdict(run)), flush=True)
+    return out
+
+
 def main() -> None:
     """Fly, and write the tables; or draw the sheet."""
     parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("--quick", action="store_true", help="a few frames over one town")
-    parser.add_argument("--sheet", action="store_true", help="draw the frames of every condition, fly nothing")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--hills", action="store_true", help="fly over hills, and write their table")
+    what.add_argument("--sheet", action="store_true", help="draw the frames of every condition, fly nothing")
     options = parser.parse_args()
     if options.sheet:
         draw_sheet(DOCS / "img" / "sim-conditions.png")
         return
-    seeds, frames = (SEEDS[:1], 5) if options.quick else (SEEDS, None)
-    runs: list[Run] = []
-    for run in flights(seeds, frames):
-        runs.append(run)
-        short = {key: run.summary[key] for key in ("frames", "fixes", "rms_m", "false_fixes")}
-        print(json.dumps([run.day, run.seed, run.method, run.profile, short]), flush=True)
-    write(options.docs, runs, list(harder(seeds[:2], frames)))
+    page, measured = options.docs / "simulator.md", paragraph(f"Measured with {machine()}.")
+    frames = 5 if options.quick else None
+    if options.hills:
+        seeds, hills_m = (HILLY_SEEDS[:1], HILLS_M[-1:]) if options.quick else (HILLY_SEEDS, HILLS_M)
+        rewrite(page, *HILLS_MARKS, [*hilly_lines(flown(hills(seeds, hills_m, frames))), *measured])
+        return
+    seeds = SEEDS[:1] if options.quick else SEEDS
+    body = lines(flown(flights(seeds, frames)), WAYS)
+    more = lines(flown(harder(seeds[:2], frames)), WAYS[:2])
+    rewrite(page, *MARKS, [*body, "The engine on what is harder, two towns each:", "", *more, *measured])
 
 
 if __name__ == "__main__":

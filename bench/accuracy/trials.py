@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.accuracy.flights import MIDDLE, moved_to_middle, recorded
-from bench.inputs.farmland import farmland
+from bench.accuracy.flights import recorded, where_truth_is
+from bench.accuracy.truth import prior_about, true_places_m
+from bench.inputs.farmland import farmland, laid_out
 from engine import Camera, Fix, Frame, OrthoMap, Prior
-from engine.geo import Array, enu_from_body
-from engine.values import Window
+from engine.geo import Array
+from engine.values import Attitude, Window
 from scenematch.simulator import plan_flight
 
 Image = NDArray[np.uint8]
@@ -26,7 +27,6 @@ Rng = np.random.Generator
 FRAMES = 80  # of each town, in each light
 STEPS = {"gazebo-a1": 6, "gazebo-a2": 6, "gazebo-a1-evening": 6, "nust": 1, "caliterra": 1}
 YEARS = {"farmland 2012 on 2016": ("2012", "2016"), "farmland 2018 on 2020": ("2018", "2020")}
-NAIP_GSD_M = 0.5  # its pixels of 5 m are laid out as if they were this
 PRIOR_SIGMAS_M = (4.0, 8.0, 16.0, 24.0)
 TILE_M, BLOCK_M, REBUILT = 30.0, 12.0, 0.35
 
@@ -51,11 +51,9 @@ class Ground:
     places_m: Array
     evening: list[Frame] = field(default_factory=list)
 
-    def seen_m(self, fix: Fix) -> Array:
-        """(2,) what a fix says of the place that the truth is of."""
-        if self.name in MIDDLE:
-            fix = moved_to_middle(fix, self.site, self.camera)
-        return np.array([fix.east_m, fix.north_m])
+    def seen(self, fix: Fix) -> Fix:
+        """A fix at the place that the truth is of."""
+        return where_truth_is(self.name, self.site, self.camera, fix)
 
     @cached_property
     def gray(self) -> Image:
@@ -142,50 +140,39 @@ def _town(seed: int, map_only: bool) -> Ground:
         [frame for _, frame in zip(range(0 if map_only else FRAMES), one.iter_frames(), strict=False)]
         for one in lights.values()
     )
-    places = [site.frame.enu_from_geodetic(t.lat_deg, t.lon_deg)[:2] for t in plan.truth_rows()[:FRAMES]]
-    return Ground(f"town {seed}", site, plan.camera, noon, np.array(places), evening)
+    places_m = true_places_m(site, plan.truth_rows()[:FRAMES])
+    return Ground(f"town {seed}", site, plan.camera, noon, places_m, evening)
 
 
 def flown(name: str, step: int) -> Ground:
     """Every ``step``-th frame of a shared flight whose place, height and heading are known."""
     flight = recorded(name, step)
-    frames, places = [], []
-    for frame, _ in flight.frames:
-        place = flight.true_place_m(frame.timestamp_ns)
-        if place is not None and frame.height_agl_m is not None and frame.heading_deg is not None:
-            frames.append(frame)
-            places.append(place)
-    return Ground(name, flight.site, flight.camera, frames, np.array(places))
+    known = [
+        (f, place) for f, place in flight.placed() if f.height_agl_m is not None and f.heading_deg is not None
+    ]
+    frames, places = zip(*known, strict=True)
+    return Ground(name, flight.site, flight.camera, list(frames), np.array(places))
 
 
 def _farmland(name: str) -> Ground:
     """A level camera's pictures of one year over the map of another; telemetry errs as a flight's does."""
-    seen, mapped = (farmland(year)[:723, :934] for year in YEARS[name])
-    layout = np.array([[NAIP_GSD_M, 0.0, 5e5], [0.0, -NAIP_GSD_M, 5.2e6]])
-    site, taken = (OrthoMap.from_arrays(gray, layout, "EPSG:32614") for gray in (mapped, seen))
+    seen, mapped = (farmland(year) for year in YEARS[name])
+    site, taken = laid_out(mapped), laid_out(seen)
     camera, rng = plan_flight(1, frames=1).camera, np.random.default_rng(0)
     low, high = site.enu_from_pixel(np.array([[210.0, seen.shape[0] - 210.0], [seen.shape[1] - 210.0, 210.0]]))
     frames, places = [], rng.uniform(low, high, (FRAMES, 2))
     for place in places:
         height_m, heading_deg = rng.uniform(110.0, 160.0), rng.uniform(0.0, 360.0)
-        image = picture(seen, taken, camera, place, height_m, heading_deg)
+        image = picture(seen, taken, camera, place, height_m, Attitude(0.0, 0.0, heading_deg))
         roll, pitch, turn = rng.normal(0.0, [0.3, 0.3, 0.5])
         frames.append(Frame(image, None, height_m * rng.normal(1.0, 0.007), heading_deg + turn, roll, pitch))
     return Ground(name, site, camera, frames, places)
 
 
-def ground_quad_px(
-    site: OrthoMap,
-    camera: Camera,
-    place_m: Array,
-    height_m: float,
-    heading_deg: float,
-    roll_deg: float = 0.0,
-    pitch_deg: float = 0.0,
-) -> Array:
+def ground_quad_px(site: OrthoMap, camera: Camera, place_m: Array, height_m: float, attitude: Attitude) -> Array:
     """(4, 2) map pixels of flat ground that the frame's corners see, clockwise from its top left."""
     rays = np.c_[_corners_px(camera), np.ones(4)] @ np.linalg.inv(camera.matrix).T
-    rays = rays @ (enu_from_body(roll_deg, pitch_deg, heading_deg) @ camera.mount).T
+    rays = rays @ camera.enu_from_camera(attitude).T
     return site.pixel_from_enu(place_m + rays[:, :2] * (height_m / -rays[:, 2:]))
 
 
@@ -200,15 +187,14 @@ def picture(
     camera: Camera,
     place_m: Array,
     height_m: float,
-    heading_deg: float,
-    roll_deg: float = 0.0,
-    pitch_deg: float = 0.0,
+    attitude: Attitude,
+    border: int = cv2.BORDER_CONSTANT,
 ) -> Image:
     """What a camera without distortion sees of a flat map."""
-    quad_px = ground_quad_px(site, camera, place_m, height_m, heading_deg, roll_deg, pitch_deg)
+    quad_px = ground_quad_px(site, camera, place_m, height_m, attitude)
     seen = cv2.getPerspectiveTransform(quad_px.astype(np.float32), _corners_px(camera).astype(np.float32))
     size = (camera.width_px, camera.height_px)
-    return np.asarray(cv2.warpPerspective(gray, seen, size, flags=cv2.INTER_LINEAR), np.uint8)
+    return np.asarray(cv2.warpPerspective(gray, seen, size, flags=cv2.INTER_LINEAR, borderMode=border), np.uint8)
 
 
 # ------------------------------------------------------------------------------------------- changes of a frame
@@ -295,35 +281,44 @@ def trial(here: Ground, number: int, rng: Rng) -> Trial:
     frame, place = here.frames[index], here.places_m[index]
     kinds = UNANSWERABLE if number % 2 else ANSWERABLE
     kind = kinds[number // 2 % len(kinds)]
+    on, said, truth = "own", place, place
     if kind in CHANGES:
-        return Trial(kind, "own", CHANGES[kind](frame, rng), prior_about(place, rng), place)
-    if kind == "evening light":
-        frame = here.evening[index] if here.evening else frame
-        return Trial(kind if here.evening else "as it is", "own", frame, prior_about(place, rng), place)
-    if kind == "old map":
-        return Trial(kind, "old", frame, prior_about(place, rng), place)
-    if kind == "repeated tiles":
-        return _tiled(here, frame, place, rng)
-    if kind == "prior elsewhere":
-        return Trial(kind, "own", frame, prior_about(_elsewhere(here, frame, place, rng), rng), place)
-    if kind == "another map":
-        return Trial(kind, "other", frame, prior_about(np.zeros(2), rng), None)  # the caller knows where it lies
-    if kind == "mirrored":
-        image = np.ascontiguousarray(np.asarray(frame.image)[:, ::-1])
-        return Trial(kind, "own", replace(frame, image=image), prior_about(place, rng), None)
-    turned = replace(frame, heading_deg=(frame.heading_deg or 0.0) + 180.0)  # features may still find the place
-    return Trial(kind, "own", turned, prior_about(place, rng), place)
+        frame = CHANGES[kind](frame, rng)
+    elif kind == "evening light":
+        kind, frame = (kind, here.evening[index]) if here.evening else ("as it is", frame)
+    elif kind == "old map":
+        on = "old"
+    elif kind == "repeated tiles":
+        on, frame = "tiled", _of_tiles(here, frame, place, rng)
+    elif kind == "prior elsewhere":
+        said = _elsewhere(here, frame, place, rng)
+    elif kind == "another map":
+        on, said, truth = "other", np.zeros(2), None  # the caller knows where it lies
+    elif kind == "mirrored":
+        frame, truth = mirrored(frame), None
+    else:
+        frame = turned_round(frame)  # features may still find the place
+    return Trial(kind, on, frame, drawn_prior(said, rng), truth)
 
 
-def _tiled(here: Ground, frame: Frame, place: Array, rng: Rng) -> Trial:
+def mirrored(frame: Frame) -> Frame:
+    """What no place looks like."""
+    return replace(frame, image=np.ascontiguousarray(np.asarray(frame.image)[:, ::-1]))
+
+
+def turned_round(frame: Frame) -> Frame:
+    """The frame with a heading that is off by 180 degrees."""
+    return replace(frame, heading_deg=(frame.heading_deg or 0.0) + 180.0)
+
+
+def _of_tiles(here: Ground, frame: Frame, place: Array, rng: Rng) -> Frame:
     """A frame drawn from the repeated map itself, so that every copy of the place is as good as the true one."""
     assert frame.height_agl_m is not None
     assert frame.heading_deg is not None
-    site = here.tiled
+    site, level = here.tiled, Attitude(0.0, 0.0, frame.heading_deg)
     gray = site.gray(Window(0, 0, site.width_px, site.height_px))
-    image = picture(gray, site, here.camera, place, frame.height_agl_m, frame.heading_deg)
-    frame = replace(frame, image=_noisy(image, rng, 4.0), roll_deg=0.0, pitch_deg=0.0)
-    return Trial("repeated tiles", "tiled", frame, prior_about(place, rng), place)
+    image = picture(gray, site, here.camera, place, frame.height_agl_m, level)
+    return replace(frame, image=_noisy(image, rng, 4.0), roll_deg=0.0, pitch_deg=0.0)
 
 
 def _elsewhere(here: Ground, frame: Frame, place: Array, rng: Rng) -> Array:
@@ -338,8 +333,6 @@ def _elsewhere(here: Ground, frame: Frame, place: Array, rng: Rng) -> Array:
     return place + np.array([4.0 * far_m, 0.0])
 
 
-def prior_about(place_m: Array, rng: Rng) -> Prior:
+def drawn_prior(place_m: Array, rng: Rng) -> Prior:
     """As far off as it says."""
-    sigma_m = float(rng.choice(PRIOR_SIGMAS_M))
-    east, north = place_m + rng.normal(0.0, sigma_m, 2)
-    return Prior(east_m=float(east), north_m=float(north), sigma_m=sigma_m)
+    return prior_about(place_m, float(rng.choice(PRIOR_SIGMAS_M)), rng)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import permutations
 
@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import SHARED
-from bench.accuracy.trials import NAIP_GSD_M, Ground, Trial, ground_quad_px, picture
-from bench.inputs.farmland import farmland, vintages
+from bench.accuracy.trials import Ground, Trial, ground_quad_px, mirrored, picture, turned_round
+from bench.accuracy.truth import prior_about
+from bench.inputs.farmland import farmland, half_of, laid_out, vintages
 from engine import Camera, Frame, OrthoMap, Prior
 from engine.geo import Array
-from engine.values import Window
+from engine.values import Attitude, Window
 
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
@@ -102,7 +103,7 @@ def _drawn(taken: OrthoMap, camera: Camera, sides_m: tuple[float, float], rng: R
     for _ in range(_TRIES):
         height_m = rng.uniform(*sides_m) * camera.focal_px / camera.width_px
         heading_deg, (roll_deg, pitch_deg) = rng.uniform(0.0, 360.0), rng.normal(0.0, TILT_SD_DEG, 2)
-        pose = (height_m, heading_deg, float(roll_deg), float(pitch_deg))
+        pose = height_m, Attitude(float(roll_deg), float(pitch_deg), heading_deg)
         reach_px = ground_quad_px(taken, camera, middle_m, *pose) - size_px / 2.0
         low, high = 1.0 - reach_px.min(axis=0), size_px - 2.0 - reach_px.max(axis=0)
         if (low > high).any():
@@ -126,11 +127,7 @@ def opened(source: str, half: str, place: str, year: str) -> OrthoMap:
     """The map of a place in a year; of farmland, which is at 5 m, as if it were at 0.5 m, its half."""
     if source == "naip-cities":
         return OrthoMap.open(CITIES / place / f"{year}.tif")
-    gray = farmland(year)[:723, :934]
-    middle = gray.shape[1] // 2
-    columns = np.s_[:middle] if half == "fit" else np.s_[middle:]
-    layout = np.array([[NAIP_GSD_M, 0.0, 5e5], [0.0, -NAIP_GSD_M, 5.2e6]])
-    return OrthoMap.from_arrays(np.ascontiguousarray(gray[:, columns]), layout, "EPSG:32614")
+    return laid_out(half_of(farmland(year), east=half == "report"))
 
 
 @cache
@@ -159,22 +156,19 @@ def trial(pair: YearPair, other: YearPair, number: int, rng: Rng) -> Trial:
     index = int(rng.integers(len(here.frames)))
     frame, place = here.frames[index], here.places_m[index]
     kind = "another year" if number % 2 == 0 else UNANSWERABLE[number // 2 % len(UNANSWERABLE)]
-    if kind == "another year":
-        return Trial(kind, "own", frame, _prior(place, rng), place)
-    if kind == "mirrored":
-        image = np.ascontiguousarray(np.asarray(frame.image)[:, ::-1])
-        return Trial(kind, "own", replace(frame, image=image), _prior(place, rng), None)
-    if kind == "turned by 180 degrees":
-        turned = replace(frame, heading_deg=(frame.heading_deg or 0.0) + 180.0)
-        return Trial(kind, "own", turned, _prior(place, rng), place)
     far = [p for p in here.places_m if np.hypot(*(p - place)) > 4.0 * PRIOR_SIGMA_M]
-    if kind == "prior elsewhere" and far:
-        return Trial(kind, "own", frame, _prior(far[int(rng.integers(len(far)))], rng), place)
-    there = other.ground
-    there_m = there.places_m[int(rng.integers(len(there.places_m)))]
-    return Trial("another place", "other", frame, _prior(there_m, rng), None)
+    if kind == "another place" or (kind == "prior elsewhere" and not far):
+        there_m = other.ground.places_m
+        return Trial("another place", "other", frame, _prior(there_m[int(rng.integers(len(there_m)))], rng), None)
+    said, truth = place, place
+    if kind == "mirrored":
+        frame, truth = mirrored(frame), None
+    elif kind == "turned by 180 degrees":
+        frame = turned_round(frame)
+    elif kind == "prior elsewhere":
+        said = far[int(rng.integers(len(far)))]
+    return Trial(kind, "own", frame, _prior(said, rng), truth)
 
 
 def _prior(place_m: Array, rng: Rng) -> Prior:
-    east, north = place_m + rng.normal(0.0, PRIOR_SIGMA_M, 2)
-    return Prior(east_m=float(east), north_m=float(north), sigma_m=PRIOR_SIGMA_M)
+    return prior_about(place_m, PRIOR_SIGMA_M, rng)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.accuracy.truth import off, prior_at, true_places_m
 from engine import Budget, Camera, Fix, Frame, MatcherOptions, Navigator, OrthoMap, Prior, SceneMatcher
 from engine.geo import Array
 from engine.options import ACCEPT_ALL
@@ -52,8 +53,7 @@ class Course:
     @property
     def start(self) -> Prior:
         """Where the flight begins."""
-        east, north = (float(v) for v in self.places_m[0])
-        return Prior(east_m=east, north_m=north, sigma_m=START_SIGMA_M)
+        return prior_at(self.places_m[0], START_SIGMA_M)
 
     def frame(self, number: int) -> Frame:
         """The frame with this number, stamped by it; on the way back the drone flies backwards."""
@@ -69,8 +69,7 @@ class Course:
 
     def error(self, number: int, fix: Fix) -> tuple[float, float]:
         """Horizontal distance of a fix from the truth, in metres and in sigmas of its own covariance."""
-        off = np.array([fix.east_m, fix.north_m]) - self.places_m[there_and_back(number, len(self.frames))[0]]
-        return float(np.hypot(*off)), math.sqrt(off @ np.linalg.solve(fix.covariance_m2[:2, :2], off))
+        return off(fix, self.places_m[there_and_back(number, len(self.frames))[0]])
 
 
 def there_and_back(number: int, count: int) -> tuple[int, bool]:
@@ -88,10 +87,9 @@ def draw(count: int | None = None, dive_m: float = DIVE_M, rate_hz: float = RATE
     dive[:, 2] = 0.5 * dive_m * (np.cos(2.0 * np.pi * plan.truth.time_s / DIVE_S) - 1.0)
     truth, told = (replace(m, position_m=m.position_m + dive) for m in (plan.truth, plan.telemetry))
     plan = replace(plan, truth=truth, telemetry=told)
-    town = plan.town
-    site = town.site()
-    places = [site.frame.enu_from_geodetic(row.lat_deg, row.lon_deg)[:2] for row in plan.truth_rows()]
-    return Course(site, plan.camera, list(plan.iter_frames()), np.array(places), round(1e9 / rate_hz))
+    site = plan.town.site()
+    places_m = true_places_m(site, plan.truth_rows())
+    return Course(site, plan.camera, list(plan.iter_frames()), places_m, round(1e9 / rate_hz))
 
 
 def warm(course: Course, method: str, options: MatcherOptions | None = None) -> SceneMatcher:

@@ -28,6 +28,11 @@ def shown(value: Any, form: str = ".2f") -> str:
     return "-" if value is None or value != value else format(value, form)
 
 
+def percent(value: float | None) -> str:
+    """A share in per cent."""
+    return "-" if value is None else f"{100.0 * value:.1f} %"
+
+
 def table_of(rows: list[dict[str, Any]], *columns: tuple[str, str, str | Callable[[Any], str]]) -> list[str]:
     """Lines of a table of rows; a column is its title, its key in a row, and its format or what writes it."""
     cells = [

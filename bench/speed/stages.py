@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 
 from bench import SHARED
+from bench.accuracy.truth import off, prior_at, true_places_m
 from bench.inputs.faults import load
 from bench.live.endless import draw
 from bench.speed.peers import OpenCvStep
-from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
+from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, SceneMatcher
 from engine.geo import Array
 from engine.runtime.threads import set_threads
 from scenematch.files.truth import interpolate_truth
@@ -70,8 +71,8 @@ def run() -> list[dict[str, Any]]:
     if (SHARED / "gazebo-a1").is_dir():
         told = load(SHARED / "gazebo-a1", "map_ortho.tif", 2, FRAMES)
         site, rows = told.site(), [interpolate_truth(told.truth, frame.timestamp_ns or 0) for frame in told.frames]
-        places = [site.frame.enu_from_geodetic(row.lat_deg, row.lon_deg)[:2] for row in rows if row is not None]
-        flights["gazebo-a1"] = (site, told.camera, told.frames, np.array(places))
+        places_m = true_places_m(site, [row for row in rows if row is not None])
+        flights["gazebo-a1"] = (site, told.camera, told.frames, places_m)
     return [
         {"flight": name, "method": method, **_flown(*flight, method)}
         for name, flight in flights.items()
@@ -83,30 +84,28 @@ def _flown(site: OrthoMap, camera: Camera, frames: list[Frame], places_m: Array,
     matcher = SceneMatcher(site, camera, method, "cpu")
     matcher.warmup()
     timed, peer, peer_ms = Timed(matcher), OpenCvStep(site, camera, prepared=False), []
-    east, north = (float(v) for v in places_m[0])
-    navigator = Navigator(timed, Prior(east_m=east, north_m=north, sigma_m=START_SIGMA_M))  # type: ignore[arg-type]
-    off, squared, kept = [], [], []
+    navigator = Navigator(timed, prior_at(places_m[0], START_SIGMA_M))  # type: ignore[arg-type]
+    errors, kept = [], []
     for begin in range(0, len(frames), BLOCK):
         block = slice(begin, begin + BLOCK)
         for place, frame in zip(places_m[block], frames[block], strict=True):
             result = navigator.update(frame)
             if isinstance(result, Fix):
-                off_m = np.array([result.east_m, result.north_m]) - place
-                off.append(float(np.hypot(*off_m)))
-                squared.append(float(off_m @ np.linalg.solve(result.covariance_m2[:2, :2], off_m)))
+                errors.append(off(result, place))
         kept += timed.ms[-BLOCK + SKIPPED :]
         for number, (place, frame) in enumerate(zip(places_m[block], frames[block], strict=True)):
-            prior = Prior(east_m=float(place[0]) + 2.0, north_m=float(place[1]) - 2.0, sigma_m=5.0)
+            prior = prior_at(np.add(place, (2.0, -2.0)), 5.0)
             start = time.perf_counter()
             peer(frame, prior)
             peer_ms += [(time.perf_counter() - start) * 1e3] * (number >= SKIPPED)
     stages = {name: float(np.median(ms)) for name, ms in timed.stages.items() if len(ms) > len(frames) / 2}
     p50_ms = float(np.median(kept))
+    rms_m, rms_sigmas = np.sqrt(np.mean(np.square(errors), axis=0)).tolist()
     return {
         "frames": len(frames),
-        "fixed": len(off),
-        "rms_m": float(np.sqrt(np.mean(np.square(off)))),
-        "nees": float(np.mean(squared) / 2.0),
+        "fixed": len(errors),
+        "rms_m": rms_m,
+        "nees": rms_sigmas**2 / 2.0,
         "p50_ms": p50_ms,
         "p99_ms": float(np.percentile(kept, 99)),
         "opencv_p50_ms": float(np.median(peer_ms)),

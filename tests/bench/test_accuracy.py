@@ -19,6 +19,7 @@ from engine.values import Attitude, Truth
 from tests.support.fixes import a_fix
 
 CAMERA = Camera.from_fov(300, 300, 60.0)
+NORTH = Attitude(0.0, 0.0, 0.0)  # level
 SIZE = 200
 TURN = np.array([[0.0, -1.0, SIZE - 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a quarter: (x, y) to (last - y, x)
 
@@ -202,9 +203,9 @@ def test_a_shift_back_is_the_shift_forth_turned_round():
 
 def test_a_level_frame_that_looks_north_shows_the_map_under_its_place(ground):
     place_m = ground.site.enu_from_pixel(np.array([310.0, 305.0]))
-    quad_px = ground_quad_px(ground.site, CAMERA, place_m, 100.0, 0.0)
+    quad_px = ground_quad_px(ground.site, CAMERA, place_m, 100.0, NORTH)
     np.testing.assert_allclose(quad_px.mean(axis=0), [310.0, 305.0], atol=1e-3)
-    image = picture(ground.gray, ground.site, CAMERA, place_m, 100.0, 0.0)
+    image = picture(ground.gray, ground.site, CAMERA, place_m, 100.0, NORTH)
     scale = (quad_px[1, 0] - quad_px[0, 0]) / (CAMERA.width_px - 1)
     x, y = np.round(quad_px[0] + 150 * scale).astype(int)
     near = ground.gray[y - 1 : y + 2, x - 1 : x + 2]
