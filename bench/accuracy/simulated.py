@@ -1,9 +1,9 @@
-"""Flights over simulated towns in one light and season, on the map of another; and a sheet of what they look like.
+"""Flights over simulated towns in one light and season, on the map of another.
 
-    python -m bench.accuracy.simulated [--hills] [--quick] [--sheet] [--docs DIR]
+    python -m bench.accuracy.simulated [--hills] [--quick] [--docs DIR]
 
 Writes the tables of docs/results/simulator.md: of the conditions, or with ``--hills`` that of flat towns and hilly
-ones. ``--sheet`` draws docs/img/sim-conditions.png instead.
+ones.
 """
 
 from __future__ import annotations
@@ -11,24 +11,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
-from bench import DOCS
 from bench.accuracy.truth import answered, pooled, rows_of, true_start
 from bench.command import parser_on_one_thread
 from bench.pages.text import machine, paragraph, percent, rewrite, table_of
-from engine import Camera, MatcherOptions, Navigator, SceneMatcher
-from engine.geo import LocalFrame
+from engine import MatcherOptions, Navigator, SceneMatcher
 from engine.options import ACCEPT_ALL
-from engine.values import Attitude
 from scenematch.report.metrics import Ground, summarise
-from scenematch.simulator import CONDITIONS, FlightPlan, Optics, build_town, picture_at, plan_flight
-from scenematch.simulator.render import transformer
+from scenematch.simulator import FlightPlan, Optics, plan_flight
 
 SEEDS = (71, 72, 73, 74, 75)
 """No threshold was fitted on these towns."""
@@ -52,8 +43,6 @@ MARKS = "<!-- bench.accuracy.simulated -->", "<!-- end of bench.accuracy.simulat
 HILLS_MARKS = "<!-- bench.accuracy.simulated --hills -->", "<!-- end of bench.accuracy.simulated --hills -->"
 DAY, WHO, RMS = ("frames' day", "day", "s"), ("by", "who", "s"), ("RMS m", "rms_m", ".2f")
 FIXED, FALSE = ("availability", "availability", percent), ("false", "false_fixes", "d")
-SHEET_SEED, CELL_PX = 41, 170
-PLACES = ((0.0, 0.0, 20.0), (95.0, -110.0, 100.0), (-80.0, 120.0, 250.0))  # east, north and heading of its rows
 
 
 @dataclass(frozen=True)
@@ -150,33 +139,6 @@ def hilly_lines(runs: list[Run]) -> list[str]:
     return table_of(rows, ("hills", "hills", "s"), DAY, WHO, RMS, worst, FIXED, FALSE, nees)
 
 
-def draw_sheet(path: Path) -> None:
-    """Frames of one town, a column for every condition and a row for every place."""
-    from PIL import Image
-
-    camera = Camera.from_fov(2 * CELL_PX, 2 * CELL_PX, 60.0)
-    columns = [_column(name, camera) for name in CONDITIONS]
-    sheet = Image.fromarray(np.hstack(columns)).quantize(256, dither=Image.Dither.FLOYDSTEINBERG)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    sheet.save(path, optimize=True)
-
-
-def _column(name: str, camera: Camera) -> NDArray[np.uint8]:
-    town = build_town(SHEET_SEED, condition=name, relief_m=25.0, river=True)
-    middle = town.pixel_to_crs @ ((town.ortho.shape[1] - 1) / 2, (town.ortho.shape[0] - 1) / 2, 1.0)
-    lon, lat = transformer(town.crs_epsg).transform(*middle, direction="INVERSE")
-    cells = [np.full((22, CELL_PX, 3), 255, np.uint8)]
-    cv2.putText(cells[0], name, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
-    for east, north, heading in PLACES:
-        attitude, rng = Attitude(2.0, -3.0, heading), np.random.default_rng(1)
-        seen = picture_at(town, camera, LocalFrame(lat, lon), np.array([east, north, 165.0]), attitude, rng)
-        small = cv2.resize(seen, (CELL_PX, CELL_PX), interpolation=cv2.INTER_AREA)
-        cells.append(
-            np.asarray(cv2.copyMakeBorder(small[2:, 2:], 2, 0, 2, 0, cv2.BORDER_CONSTANT, value=(255,) * 3))
-        )
-    return np.vstack(cells)
-
-
 def flown(runs: Iterator[Run]) -> list[Run]:
     """All of them, each printed when it is there."""
     out = []
@@ -187,16 +149,11 @@ def flown(runs: Iterator[Run]) -> list[Run]:
 
 
 def main() -> None:
-    """Fly, and write the tables; or draw the sheet."""
+    """Fly, and write the tables."""
     parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("--quick", action="store_true", help="a few frames over one town")
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument("--hills", action="store_true", help="fly over hills, and write their table")
-    what.add_argument("--sheet", action="store_true", help="draw the frames of every condition, fly nothing")
+    parser.add_argument("--hills", action="store_true", help="fly over hills, and write their table")
     options = parser.parse_args()
-    if options.sheet:
-        draw_sheet(DOCS / "img" / "sim-conditions.png")
-        return
     page, measured = options.docs / "simulator.md", paragraph(f"Measured with {machine()}.")
     frames = 5 if options.quick else None
     if options.hills:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import gc
 import math
-import os
 import socket
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bench.live.soak import rss_mb
+from bench.live.growth import Growth
 from bench.live.standin import MS, Standin, State
 
 RATE_NS = 200 * MS
 """Between two frames: 5 Hz."""
-SAMPLE = 10_000
-"""Messages between two looks at the memory."""
 
 
 def free_port() -> int:
@@ -27,28 +23,16 @@ def free_port() -> int:
         return int(found.getsockname()[1])
 
 
-@dataclass
-class Growth:
-    """Memory, files and threads of the process, looked at every so many messages."""
-
-    seen: list[tuple[int, float, int, int]] = field(default_factory=list)
-
-    def look(self, messages: int) -> None:
-        """Look, after a collection."""
-        gc.collect()
-        files, threads = (len(os.listdir(f"/proc/self/{kind}")) for kind in ("fd", "task"))
-        self.seen.append((messages, rss_mb() * 1e6 / 1024, files, threads))
-
-    def rows(self) -> list[list[str]]:
-        """After the first tenth, in which tables and caches fill."""
-        settled = np.array(self.seen[len(self.seen) // 10 :], float)
-        slope = np.polyfit(settled[:, 0] / SAMPLE, settled[:, 1], 1)[0] if len(settled) > 2 else math.nan
-        first, last = settled[0], settled[-1]
-        return [
-            ["memory (RSS), after a tenth, and at the end", f"{first[1] / 1024:.1f}, {last[1] / 1024:.1f} MiB"],
-            ["its slope, KiB per 10,000 messages", f"{slope:+.2f}"],
-            ["open files, threads: least to most", f"{_span(settled[:, 2])}, {_span(settled[:, 3])}"],
-        ]
+def growth_rows(growth: Growth) -> list[list[str]]:
+    """After the first tenth, in which tables and caches fill."""
+    settled = growth.seen[len(growth.seen) // 10 :]
+    (first, last), (files, threads) = settled[[0, -1], 1] / 1.048576, settled[:, 2:].T
+    slope_kib = growth.slope_mb() * growth.every * 1e6 / 1024
+    return [
+        ["memory (RSS), after a tenth, and at the end", f"{first:.1f}, {last:.1f} MiB"],
+        [f"its slope, KiB per {growth.every:,} messages", f"{slope_kib:+.2f}"],
+        ["open files, threads: least to most", f"{_span(files)}, {_span(threads)}"],
+    ]
 
 
 def _span(values: np.ndarray) -> str:

@@ -15,7 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from bench import RESULTS
 from bench.command import parser_on_one_thread
-from bench.live.bridge_counts import RATE_NS, SAMPLE, Growth, Received, free_port, place_off_m
+from bench.live.bridge_counts import RATE_NS, Received, free_port, growth_rows, place_off_m
+from bench.live.growth import Growth
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
 from bench.pages.text import paragraph, rewrite, table
 from engine.geo import LocalFrame
@@ -40,6 +41,7 @@ HOUR = (
 PLACE = LocalFrame(33.64, 72.99)
 CAMERA_MS = (45.0, 95.0)  # from exposure to the answer: the scripted matcher takes no time of its own
 IMAGE = np.zeros((8, 8, 3), np.uint8)
+SAMPLE = 10_000  # messages between two looks at the memory
 
 
 # -------------------------------------------------------------------------------------- the hour at speed
@@ -125,7 +127,7 @@ def hour(minutes: float, flood_pieces: int = 20_000) -> dict[str, Any]:
     """So many minutes of traffic on a clock that waits for the bridge; what came of them."""
     script = Script(round(minutes * 60))
     clock = VirtualClock(7_000 * S)
-    agenda, growth, dice = Agenda(clock), Growth(), random.Random(2)
+    agenda, growth, dice = Agenda(clock), Growth(SAMPLE), random.Random(2)
     received = Received.room(clock() + 137_000, script.seconds * 5)
     Scripted.heading_off_deg = Scripted.height_off_m = 0.0
     door = Door(Connection("udpin", "127.0.0.1", port := free_port()))
@@ -162,8 +164,7 @@ def hour(minutes: float, flood_pieces: int = 20_000) -> dict[str, Any]:
 
         def settle(sent: int) -> None:
             door.settle(sent)
-            if pilot.messages // SAMPLE >= len(growth.seen):
-                growth.look(pilot.messages)
+            growth.look(pilot.messages)
 
         pilot = Standin(agenda, port, circling, PLACE, on_fix, settle, delay_ms=(4.0, 25.0))
         agenda.at(received.captured_ns(0), expose)
@@ -206,7 +207,7 @@ def hour(minutes: float, flood_pieces: int = 20_000) -> dict[str, Any]:
         "dropped": status.dropped,
         "withheld": status.withheld,
         "refused": status.refused,
-        "growth": growth.rows() if len(growth.seen) > 2 else [],
+        "growth": growth_rows(growth) if len(growth.seen) > 2 else [],
     }
 
 

@@ -23,7 +23,7 @@ from bench.command import parser_on_one_thread
 from bench.live.burden import PERIOD_S, hogs, throttle
 from bench.live.embedded import embedded
 from bench.live.endless import Course, draw, fly, summary, warm
-from bench.live.soak import Growth, queue, soak
+from bench.live.soak import Soaked, queue, soak
 from bench.live.startup import entries, startup
 from bench.live.tradeoff import tradeoff
 from bench.pages import latency
@@ -39,7 +39,7 @@ Row = dict[str, Any]
 def budgets(course: Course, auto_frames: int = 10_000, other_frames: int = 300) -> dict[str, Any]:
     """The endless flight at every budget, alone on the machine; and what grew over the frames of auto."""
     matcher = warm(course, "auto")
-    growth = Growth(matcher, auto_frames * len(BUDGETS_MS))
+    growth = Soaked(matcher, auto_frames * len(BUDGETS_MS))
     rows = [
         summary(fly(course, matcher, auto_frames, budget_ms, growth.sample), "auto") for budget_ms in BUDGETS_MS
     ]

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bench.live.endless import START_NS, Course, fly, summary, warm
+from bench.live.endless import PERCENTILES, START_NS, Course, fly, summary, warm
+from bench.live.growth import Growth, resident_mb
 from engine import Fix, Frame, Navigator, SceneMatcher
 from engine.navigation.live import Answer, Live, LiveOptions
 
@@ -19,12 +18,6 @@ FACTORS = (2, 5, 10)
 DEADLINE_MS = 40.0
 SAMPLE_EVERY = 50
 SOAK_BUDGET_MS = 40.0
-
-
-def rss_mb() -> float:
-    """Resident memory of this process."""
-    with open("/proc/self/statm", encoding="ascii") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 # ---------------------------------------------------------------------------------------------------- queue
@@ -38,7 +31,7 @@ def queue(course: Course, seconds: float = 3.0) -> list[Row]:
     for factor in FACTORS:
         frames = _faster(course, factor, round(seconds * 1e3 * factor / frame_ms))
         answers: list[Answer] = []
-        before_mb = rss_mb()
+        before_mb = resident_mb()
         options = LiveOptions(deadline_ms=DEADLINE_MS)
         with Live(lambda start: Navigator(matcher, start), answers.append, course.start, options) as live:
             spent_s = _feed(live, frames, frame_ms / factor * 1e-3)
@@ -57,12 +50,9 @@ def queue(course: Course, seconds: float = 3.0) -> list[Row]:
                 "workers_replaced": counts.workers_replaced,
                 "fixes": sum(isinstance(answer.result, Fix) for answer in answers),
                 "stale": sum(answer.result.timestamp_ns != answer.frame.timestamp_ns for answer in answers),
-                **{
-                    name: float(np.percentile(ages, level))
-                    for name, level in (("p50", 50), ("p99", 99), ("max", 100))
-                },
+                **{name: float(np.percentile(ages, level)) for name, level in PERCENTILES.items()},
                 "rss_before_mb": before_mb,
-                "rss_after_mb": rss_mb(),
+                "rss_after_mb": resident_mb(),
             }
         )
     return rows
@@ -88,32 +78,28 @@ def _feed(live: Live, frames: list[Frame], interval_s: float) -> float:
 # ----------------------------------------------------------------------------------------------------- soak
 
 
-class Growth:
-    """What may not grow in flight, sampled every so many frames: memory, open files, threads, caches."""
+class Soaked:
+    """What may not grow in flight: the process, and the caches of a matcher, which are warm before it."""
 
     def __init__(self, matcher: SceneMatcher, frames: int) -> None:
-        self._matcher = matcher
-        self._work = matcher.cache_counters
-        self._samples = np.full((-(-frames // SAMPLE_EVERY), 3), np.nan)
-        self._frames = 0
+        self._matcher, self._work = matcher, matcher.cache_counters
+        self._growth, self._frames = Growth(SAMPLE_EVERY, -(-frames // SAMPLE_EVERY)), 0
 
-    def sample(self, _: int) -> None:
+    def sample(self, *_: object) -> None:
         """Take note of one frame more."""
-        if self._frames % SAMPLE_EVERY == 0:
-            open_files, threads = (len(os.listdir(f"/proc/self/{kind}")) for kind in ("fd", "task"))
-            self._samples[self._frames // SAMPLE_EVERY] = rss_mb(), open_files, threads
+        self._growth.look(self._frames)
         self._frames += 1
 
     def row(self) -> Row:
         """What grew, from the first sample to the last."""
-        work, samples = self._matcher.cache_counters, self._samples
+        work, seen = self._matcher.cache_counters, self._growth.seen
         return {
             "frames": self._frames,
-            "rss_mb": samples[:, 0].tolist(),
+            "rss_mb": seen[:, 1].tolist(),
             "rss_every": SAMPLE_EVERY,
-            "rss_slope_mb": slope(samples[:, 0], SAMPLE_EVERY) * 1e4,
-            "open_files": samples[[0, -1], 1].tolist(),
-            "threads": samples[[0, -1], 2].tolist(),
+            "rss_slope_mb": self._growth.slope_mb() * 1e4,
+            "open_files": seen[[0, -1], 2].tolist(),
+            "threads": seen[[0, -1], 3].tolist(),
             "cache_growth": {name: count - self._work.get(name, 0) for name, count in work.items()},
         }
 
@@ -123,14 +109,8 @@ def soak(course: Course, frames: int = 4_000) -> list[Row]:
     rows = []
     for method in ("ncc", "sift"):
         matcher = warm(course, method)
-        growth = Growth(matcher, frames)
+        growth = Soaked(matcher, frames)
         rows.append(
             {**summary(fly(course, matcher, frames, SOAK_BUDGET_MS, growth.sample), method), **growth.row()}
         )
     return rows
-
-
-def slope(values: NDArray[np.float64], every: int) -> float:
-    """Growth a frame by least squares, after the first tenth, of a value sampled every so many frames."""
-    kept = values[len(values) // 10 :]
-    return float(np.polyfit(np.arange(len(kept)) * every, kept, 1)[0]) if len(kept) > 1 else 0.0

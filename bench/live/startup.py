@@ -105,16 +105,6 @@ def _row(root: Path, method: str, kept: str, maps: Path, compiled: Path, rounds:
     }
 
 
-def peak_mb() -> float:
-    """The most memory that this process had resident so far, in megabytes (Linux).
-
-    Not by ``getrusage``: what a program says of itself there begins with the peak of the process that started it.
-    """
-    status = Path("/proc/self/status").read_text(encoding="ascii")
-    line = next(line for line in status.splitlines() if line.startswith("VmHWM"))
-    return int(line.split()[1]) * 1.024e-3
-
-
 def measured() -> Row:
     """This process, part by part."""
     marks = [float(sys.argv[3]), time.time()]
@@ -135,12 +125,14 @@ def measured() -> Row:
     result = matcher.locate(first.frame, first.prior)
     marks.append(time.time())
     spent = [end - begin for begin, end in itertools.pairwise(marks)]
+    from bench.live.growth import resident_mb
+
     used = os.times()
     return {
         **dict(zip(PARTS, spent, strict=True)),
         "fixed": isinstance(result, Fix),
         "core_s": used.user + used.system,  # which other work on the machine hardly changes
-        "resident_mb": peak_mb(),
+        "resident_mb": resident_mb(field="VmHWM"),
     }
 
 

@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from bench.live.soak import rss_mb
-from bench.live.startup import peak_mb
+from bench.live.growth import resident_mb
 from engine.runtime.threads import set_threads
 
 
@@ -39,8 +38,8 @@ def peak_memory_mb(call: Callable[[], Any]) -> float | None:
     """By how much one call raises the process's resident memory at its highest; None where Linux does not tell."""
     try:
         Path("/proc/self/clear_refs").write_text("5")  # forget the highest so far
-        before = rss_mb()
+        before = resident_mb()
         call()
-        return peak_mb() - before
+        return resident_mb(field="VmHWM") - before
     except OSError:
         return None

@@ -10,6 +10,7 @@ the table of docs/results/large-maps.md. Takes some fifteen minutes; `--folder` 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
 import json
 import subprocess
@@ -24,6 +25,7 @@ import numpy as np
 
 from bench import RESULTS
 from bench.inputs.scenes import mosaic
+from bench.live.growth import resident_mb
 from bench.pages.text import machine, paragraph, rewrite, table_of
 
 BEGIN, END = "<!-- bench.speed.large_map -->", "<!-- end of bench.speed.large_map -->"
@@ -156,7 +158,8 @@ def watch(name: str, site: Path, surface: Path, flight: Path, method: str) -> Ru
             rows = _rows(out / "track.csv")
             if rows and start_s is None:
                 start_s = time.perf_counter() - begin
-            seen.append((rows, _rss_mb(process.pid)))
+            with contextlib.suppress(OSError, IndexError):  # it has just ended
+                seen.append((rows, resident_mb(process.pid)))
             time.sleep(_POLL_S)
         if process.returncode or start_s is None:
             raise RuntimeError(f"{' '.join(command)}: {process.communicate()[1]}")
@@ -174,15 +177,6 @@ def watch(name: str, site: Path, surface: Path, flight: Path, method: str) -> Ru
 def _rows(path: Path) -> int:
     """Frames that are in track.csv."""
     return max(0, path.read_bytes().count(b"\n") - 1) if path.exists() else 0
-
-
-def _rss_mb(pid: int) -> float:
-    """Resident memory of a process, 0 where it has just ended."""
-    try:
-        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
-        return float(status.split("VmRSS:")[1].split()[0]) / 1e3
-    except (OSError, IndexError):
-        return 0.0
 
 
 # --------------------------------------------------------------------------------------------------- the page

@@ -9,7 +9,7 @@ import pytest
 from bench.live import endless
 from bench.live.burden import hogs
 from bench.live.endless import GRACE_MS, Flown, Taken, cause, draw, stage_at, summary, there_and_back
-from bench.live.soak import slope
+from bench.live.growth import slope
 from bench.pages.latency import share
 from scenematch.simulator import plan_flight
 from tests.support.towns import drawn_town
@@ -79,8 +79,8 @@ def test_a_flight_without_a_fix_has_no_error():
 
 def test_the_slope_leaves_out_the_first_tenth():
     values = np.concatenate([np.full(10, 500.0), 3.0 * np.arange(90)])
-    assert slope(values, every=50) == pytest.approx(3.0 / 50)
-    assert slope(np.ones(1), every=50) == 0.0
+    assert slope(50.0 * np.arange(100), values) == pytest.approx(3.0 / 50)
+    assert slope(np.zeros(1), np.ones(1)) == 0.0
 
 
 def test_a_share_is_full_only_where_nothing_is_missing():

@@ -14,7 +14,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from pymavlink import mavutil
 
 from bench.live.bridge_counts import free_port
-from bench.live.flights.faults import Fault
-from bench.live.flights.fly import FAR_M, FLIGHT_S, RATE_HZ, Bridge
+from bench.live.flights.faults import Fault, events
+from bench.live.flights.fly import FAR_M, FLIGHT_S, RATE_HZ, Bridge, change, conditions
 from bench.live.flights.recorded import recorded
 from bench.live.flights.sitl import RATES_HZ, Motion, Pilot, take_off
 from engine.geo import LocalFrame
@@ -48,23 +48,13 @@ Track = NDArray[np.float64]
 """(N, 3) seconds since the simulator's start, metres east and north."""
 
 
-class SitlBridge(Bridge):
+def sitl_bridge(
+    folder: Path, port: int, method: str, message: str, *, realtime: bool, firmware: str = "ardupilot"
+) -> Bridge:
     """The bridge with the camera over the town."""
-
-    def __init__(
-        self, folder: Path, port: int, method: str, message: str, *, realtime: bool, firmware: str = "ardupilot"
-    ) -> None:
-        self._firmware = firmware
-        self._settings = [f"input.exposure_to_grab_ms={DELAY_MS}", *["bridge.realtime=true"] * realtime]
-        self._pipe, self.fault_file = folder / "camera", folder / "fault"
-        super().__init__(folder, port, method, message)
-
-    def start(self) -> None:
-        """Start it in its own process group."""
-        self._command[self._command.index("--camera-source") + 1] = f"exec:cat {self._pipe}"
-        while self._settings:
-            self._command += ["--settings", self._settings.pop(), "--firmware", self._firmware]
-        super().start()
+    settings = [f"input.exposure_to_grab_ms={DELAY_MS}", *["bridge.realtime=true"] * realtime]
+    more = [word for setting in settings for word in ("--settings", setting)] + ["--firmware", firmware]
+    return Bridge(folder, port, method, message, f"exec:cat {folder / 'camera'}", more)
 
 
 class LoggedPilot(Pilot):
@@ -119,9 +109,7 @@ def launch(world: contextlib.ExitStack, command: Sequence[object], **how: Any) -
     world.callback(process.kill)
 
 
-def fly(
-    pilot: LoggedPilot, motion: Motion, duration_s: float, bridge: SitlBridge, faults: tuple[Fault, ...]
-) -> float:
+def fly(pilot: LoggedPilot, motion: Motion, duration_s: float, bridge: Bridge, faults: tuple[Fault, ...]) -> float:
     """Fly the course over and over; enter GUIDED again where a failsafe took over.
 
     Returns:
@@ -135,31 +123,35 @@ def fly(
     pilot.command(*_SOURCE_SET_2)
     pilot.listen(10.0)
     pilot.link.param_set_send(*_GNSS_OFF)
-    pilot.part, begin, asked = "course", time.monotonic(), 0.0
+    pilot.part, asked_s = "course", 0.0
     begin_s = pilot.times_s[-1][1]
-    due = sorted([(f.begin_s, False, f) for f in faults] + [(f.end_s, True, f) for f in faults if f.seconds],
-                 key=lambda event: event[0])  # fmt: skip
+
+    def steer(gone_s: float) -> None:
+        nonlocal asked_s
+        if pilot.mode != "GUIDED" and gone_s - asked_s > 1.0:
+            asked_s = gone_s
+            pilot.link.set_mode("GUIDED")
+        pilot.go_to(motion(gone_s % FLIGHT_S))
+        pilot.listen(0.1)
+
+    endure(pilot, bridge, faults, duration_s, steer)
+    return begin_s
+
+
+def endure(
+    pilot: Pilot, bridge: Bridge, faults: Sequence[Fault], duration_s: float, steer: Callable[[float], None]
+) -> list[tuple[Fault, float]]:
+    """Steer for so long, by the seconds that are gone, with faults; when each ended on this machine's clock."""
+    due, begin, ended = events(faults), time.monotonic(), []
     while (gone_s := time.monotonic() - begin) < duration_s:
         while due and due[0][0] <= gone_s:
             _, is_over, fault = due.pop(0)
             pilot.say(f"{fault.name} {'over' if is_over else 'begins'}")
-            change(bridge, fault, is_over=is_over)
-        if pilot.mode != "GUIDED" and time.monotonic() - asked > 1.0:
-            asked = time.monotonic()
-            pilot.link.set_mode("GUIDED")
-        pilot.go_to(motion(gone_s % FLIGHT_S))
-        pilot.listen(0.1)
-    return begin_s
-
-
-def change(bridge: SitlBridge, fault: Fault, *, is_over: bool) -> None:
-    """Begin or end a fault."""
-    if fault.kind == "bridge killed":
-        bridge.start() if is_over else bridge.kill()
-    elif fault.kind == "worker killed":
-        bridge.kill_worker()
-    else:
-        bridge.fault_file.write_text("" if is_over else fault.kind, encoding="ascii")
+            change(fault, bridge, is_over=is_over)
+            if is_over:
+                ended.append((fault, time.monotonic()))
+        steer(gone_s)
+    return ended
 
 
 def read_log(log: Path, pilot: LoggedPilot) -> tuple[Track, Track, Track]:
@@ -240,12 +232,6 @@ def planned(arguments: argparse.Namespace) -> tuple[Path, tuple[Fault, ...], flo
     return folder, faults, faults[-1].end_s + _AFTER_S if faults else arguments.seconds
 
 
-def conditions(before: float) -> str:
-    """Today, and the machine's load before the flight and now."""
-    load = f"load {before:.1f} before, {os.getloadavg()[0]:.1f} after, {os.cpu_count()} cores"
-    return f"{time.strftime('%Y-%m-%d')}, {load}"
-
-
 def main() -> None:
     """Fly, and print the tables."""
     parser = parser_of(__doc__)
@@ -259,7 +245,7 @@ def main() -> None:
         simulator(arguments.sitl.absolute(), folder, place, port, arguments.message, arguments.wind_mps) as logs,
         contextlib.ExitStack() as stack,
     ):
-        bridge = SitlBridge(folder, port, arguments.method, arguments.message, realtime=arguments.realtime)
+        bridge = sitl_bridge(folder, port, arguments.method, arguments.message, realtime=arguments.realtime)
         stack.callback(bridge.kill)
         link = mavutil.mavlink_connection("udpin:127.0.0.1:14552", source_system=255)
         link.wait_heartbeat()

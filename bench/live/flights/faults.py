@@ -1,8 +1,10 @@
-"""The faults of a flight, and their times."""
+"""The faults of a flight, their times, and the file that tells a camera of one."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,14 +20,21 @@ class Fault:
         """When the fault is over, as far as an outside process can end it."""
         return self.begin_s + self.seconds
 
-    def reigns(self, time_s: float) -> bool:
-        """Whether it is active then."""
-        return self.begin_s <= time_s < self.end_s
-
     @property
     def name(self) -> str:
         """For a table."""
         return f"{self.kind} {self.seconds:g} s" if self.seconds else self.kind
+
+
+def reigning(fault_file: Path) -> str:
+    """The fault that a camera has now, or nothing."""
+    return fault_file.read_text(encoding="ascii") if fault_file.exists() else ""
+
+
+def events(faults: Sequence[Fault]) -> list[tuple[float, bool, Fault]]:
+    """Beginnings and ends in their order: when, whether it is an end, and of what."""
+    both = [(fault.begin_s, False, fault) for fault in faults] + [(fault.end_s, True, fault) for fault in faults]
+    return sorted(both, key=lambda event: event[0])
 
 
 FAULTS = (

@@ -21,6 +21,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from bench.live.bridge_counts import free_port
-from bench.live.flights.faults import FAULTS, FLIGHT_S, Fault
+from bench.live.flights.faults import FAULTS, FLIGHT_S, Fault, events
 from bench.live.flights.recorded import captured_s, off_m, recorded
 from bench.live.flights.sitl import fly_sitl
 from bench.live.standin import MS, Agenda, RealClock, S, Standin, State
@@ -46,19 +47,37 @@ Fixes = list[tuple[float, float, float]]
 
 
 class Bridge:
-    """The bridge's process, its worker and its camera, killed and started together."""
+    """The bridge's process, its worker and its camera, killed and started together.
 
-    def __init__(self, folder: Path, port: int, method: str, message: str) -> None:
+    Args:
+        folder: of the flight.
+        port: to listen on.
+        method, message: of the fixes.
+        camera: the source of its pictures; if empty, those of the flight.
+        more: further options of the bridge.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        port: int,
+        method: str,
+        message: str,
+        camera: str | None = None,
+        more: Sequence[str] = (),
+    ) -> None:
         start = recorded(folder)[1]
-        self._begin = folder / "begin"
-        self._begin.unlink(missing_ok=True)
-        camera = f"exec:{sys.executable} -m bench.live.flights.camera {folder / 'frames'} {self._begin} {RATE_HZ}"
+        self._begin, self.fault_file = folder / "begin", folder / "fault"
+        for old in (self._begin, self.fault_file):
+            old.unlink(missing_ok=True)
+        own = f"{folder / 'frames'} {self._begin} {self.fault_file} {RATE_HZ}"
+        camera = camera or f"exec:{sys.executable} -m bench.live.flights.camera {own}"
         self._command = [
             sys.executable, "-m", "scenematch", "bridge", "mavlink", "--supervise", "--method", method,
             "--connect", f"udpin:127.0.0.1:{port}", "--map", str(folder / "map.tif"),
             "--surface", str(folder / "dsm.tif"), "--camera", str(folder / "camera.yaml"),
             "--camera-source", camera, "--start", f"{start.lat_deg},{start.lon_deg},15",
-            "--settings", f"mavlink.message={message}",
+            "--settings", f"mavlink.message={message}", *more,
         ]  # fmt: skip
         # An installation brings its bytecode along.
         self._environment = {name: v for name, v in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
@@ -136,9 +155,9 @@ def fly(
     agenda = Agenda(clock)
     pilot = Standin(agenda, port, now, place, on_fix, firmware=FIRMWARES[firmware])
     agenda.every(2 * MS, pilot.poll, clock())
-    for fault in faults:
+    for begin_s, is_over, fault in events(faults):
         assert bridge is not None
-        plan(agenda, begin_ns, fault, bridge, pilot)
+        agenda.at(begin_ns + round(begin_s * S), partial(change, fault, bridge, pilot, is_over=is_over))
     agenda.run(begin_ns + round((duration_s + _LAST_ANSWER_S) * S))
     pilot.close()
     return fixes
@@ -153,18 +172,22 @@ def fly_with_faults(folder: Path, method: str, message: str) -> Fixes:
         bridge.kill()
 
 
-def plan(agenda: Agenda, begin_ns: int, fault: Fault, bridge: Bridge, pilot: Standin) -> None:
-    """Start a fault; the camera handles its own."""
-    begin, end = (begin_ns + round(time_s * S) for time_s in (fault.begin_s, fault.end_s))
+def change(fault: Fault, bridge: Bridge, pilot: Standin | None = None, *, is_over: bool) -> None:
+    """Begin or end a fault; what passes at once has no end."""
+    if is_over and not fault.seconds:
+        return
     if fault.kind == "bridge killed":
-        agenda.at(begin, bridge.kill)
-        agenda.at(end, bridge.start)
+        bridge.start() if is_over else bridge.kill()
     elif fault.kind == "worker killed":
-        agenda.at(begin, bridge.kill_worker)
-    elif fault.kind == "autopilot silent":
-        agenda.at(begin, lambda: pilot.fall_silent(fault.seconds))
-    elif fault.kind == "autopilot restarted":
-        agenda.at(begin, pilot.restart)
+        bridge.kill_worker()
+    elif fault.kind.startswith("autopilot"):
+        assert pilot is not None
+        if fault.kind == "autopilot restarted":
+            pilot.restart()
+        elif not is_over:
+            pilot.fall_silent(fault.seconds)
+    else:
+        bridge.fault_file.write_text("" if is_over else fault.kind, encoding="ascii")
 
 
 def report(fixes: Fixes, begun: str, faults: Sequence[Fault] = ()) -> str:
@@ -196,6 +219,12 @@ def longest_silence_s(arrived_s: NDArray[np.float64], begin_s: float, end_s: flo
     return float(np.diff([begin_s, *within, end_s]).max())
 
 
+def conditions(before: float) -> str:
+    """Today, and the machine's load before the flight and now."""
+    load = f"load {before:.1f} before, {os.getloadavg()[0]:.1f} after, {os.cpu_count()} cores"
+    return f"{time.strftime('%Y-%m-%d')}, {load}"
+
+
 def main() -> None:
     """Fly, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -223,9 +252,8 @@ def main() -> None:
             fixes, faults = fly_with_faults(flight, arguments.method, arguments.message), FAULTS
     except EngineError as error:
         parser.error(str(error))
-    load = f"load {before:.1f} before, {os.getloadavg()[0]:.1f} after, {os.cpu_count()} cores"
     what = [arguments.method, arguments.message] if faults else [flight.name, arguments.firmware]
-    print(report(fixes, ", ".join([*what, time.strftime("%Y-%m-%d"), load]), faults))
+    print(report(fixes, ", ".join([*what, conditions(before)]), faults))
 
 
 if __name__ == "__main__":

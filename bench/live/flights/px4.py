@@ -19,18 +19,9 @@ from typing import Any
 import numpy as np
 from pymavlink import mavutil
 
-from bench.live.flights.arducopter import (
-    DELAY_MS,
-    SitlBridge,
-    change,
-    conditions,
-    launch,
-    off_m,
-    parser_of,
-    planned,
-)
+from bench.live.flights.arducopter import DELAY_MS, endure, launch, off_m, parser_of, planned, sitl_bridge
 from bench.live.flights.faults import Fault
-from bench.live.flights.fly import FLIGHT_S
+from bench.live.flights.fly import FLIGHT_S, Bridge, conditions
 from bench.live.flights.recorded import recorded
 from bench.live.flights.sitl import Motion, Pilot
 from engine.geo import LocalFrame
@@ -101,7 +92,7 @@ def follow(pilot: Px4Pilot, motion: Motion, begin_s: float, asked_s: float) -> f
 
 
 def fly(
-    pilot: Px4Pilot, motion: Motion, duration_s: float, bridge: SitlBridge, faults: tuple[Fault, ...]
+    pilot: Px4Pilot, motion: Motion, duration_s: float, bridge: Bridge, faults: tuple[Fault, ...]
 ) -> tuple[float, list[tuple[Fault, float]]]:
     """Climb by the receiver, switch it off, and fly the course over and over.
 
@@ -117,21 +108,14 @@ def fly(
         if not pilot.armed and pilot.mode == "OFFBOARD":
             pilot.command(mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
     pilot.link.mav.param_set_send(1, 1, b"EKF2_GPS_CTRL", 0.0, _INT32)
-    pilot.part, begin, ended = "course", time.monotonic(), []
+    pilot.part, begin = "course", time.monotonic()
     begin_s = pilot.tracks["EKF"][-1][0]
-    due = sorted(
-        [(f.begin_s, False, f) for f in faults] + [(f.end_s, True, f) for f in faults], key=lambda event: event[0]
-    )
-    while (gone_s := time.monotonic() - begin) < duration_s:
-        while due and due[0][0] <= gone_s:
-            _, is_over, fault = due.pop(0)
-            pilot.say(f"{fault.name} {'over' if is_over else 'begins'}")
-            if fault.seconds or not is_over:
-                change(bridge, fault, is_over=is_over)
-            if is_over:
-                ended.append((fault, time.monotonic()))
+
+    def steer(_: float) -> None:
+        nonlocal asked_s
         asked_s = follow(pilot, motion, begin, asked_s)
-    return begin_s, ended
+
+    return begin_s, endure(pilot, bridge, faults, duration_s, steer)
 
 
 def report(pilot: Px4Pilot, begin_s: float, ended: list[tuple[Fault, float]]) -> str:
@@ -157,7 +141,7 @@ def main() -> None:
         simulator(arguments.build.absolute(), folder, place, arguments.wind_mps),
         contextlib.ExitStack() as stack,
     ):
-        bridge = SitlBridge(folder, 14540, arguments.method, "odometry", realtime=True, firmware="px4")
+        bridge = sitl_bridge(folder, 14540, arguments.method, "odometry", realtime=True, firmware="px4")
         stack.callback(bridge.kill)
         link = mavutil.mavlink_connection("udpin:127.0.0.1:14550", source_system=255)
         link.wait_heartbeat()

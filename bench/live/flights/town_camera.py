@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink import mavutil
 
+from bench.live.flights.faults import reigning
 from bench.live.flights.recorded import recorded
 from bench.live.flights.video_camera import film
 from bench.live.standin import State
@@ -39,7 +40,7 @@ class TownView:
 
     def picture(self, vehicle: State) -> NDArray[np.uint8]:
         """(H, W, 3) BGR; among the roofs only noise."""
-        fault = self._fault_file.read_text(encoding="ascii") if self._fault_file.exists() else ""
+        fault = reigning(self._fault_file)
         if fault == "camera covered":
             return np.zeros_like(self._last)
         if fault == "picture frozen":
