@@ -21,14 +21,13 @@ from bench import RESULTS
 from bench.accuracy.truth import START_SIGMA_M, off, true_places_m
 from bench.command import parser_on_one_thread
 from bench.inputs.faults import Fault, FlightInputs, faults, load
-from bench.pages.text import rewrite, shown, table
+from bench.pages.text import fill, shown, table
 from engine import Fix, Navigator, Prior, SceneMatcher
 from engine.geo import Array
 from engine.navigation.telemetry_errors import Calibration
 from scenematch.check import diagnose
 from scenematch.files.truth import interpolate_truth
 
-BEGIN, END = "<!-- written by bench.faults -->", "<!-- end of what bench.faults writes -->"
 FALSE_M, FALSE_SIGMAS = 5.0, 3.0
 
 
@@ -204,7 +203,7 @@ def main() -> None:
             print(_row(found), flush=True)
     print(f"{len(cells)} cells in {time.monotonic() - begin:.0f} s")
     if wanted.docs is not None:
-        rewrite(wanted.docs / "wrong-inputs.md", BEGIN, END, lines_of(cells))
+        fill(wanted.docs / "wrong-inputs.md", {"faults": lines_of(cells)})
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Audits against matches: how well the raster tells where a changed frame is matched, and whole flights.
 
-    python -m bench.accuracy.audit [--quick] [--fit] [--page FILE]
+    python -m bench.accuracy.audit [--quick] [--fit] [--docs DIR]
 
-Rewrites docs/results/audit.md below its marker. ``--fit`` fits the rule on grounds of its own, which
+Fills in docs/results/audit.md. ``--fit`` fits the rule on grounds of its own, which
 are not reported on, prints its weights, and writes nothing.
 """
 
@@ -12,13 +12,12 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import RESULTS, SHARED
+from bench import SHARED
 from bench.accuracy.flights import STEPS, recorded
 from bench.accuracy.trials import picture
 from bench.accuracy.truth import off, prior_about, true_start
@@ -26,7 +25,7 @@ from bench.command import parser_on_one_thread
 from bench.inputs.farmland import farmland, half_of
 from bench.inputs.scenes import mosaic, town_gray
 from bench.pages.integrity import auc
-from bench.pages.text import machine, paragraph, shown, table
+from bench.pages.text import fill, measured, shown, table
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, SceneMatcher
 from engine.geo import Array
 from engine.values import Attitude, Window
@@ -35,8 +34,6 @@ from scenematch.report.metrics import WRONG_M
 
 Gray = NDArray[np.uint8]
 
-PAGE = RESULTS / "audit.md"
-MEASURED = "<!-- bench.accuracy.audit -->\n"
 CAMERA = Camera.from_fov(300, 300, 60.0)
 HEIGHTS_M = (40.0, 60.0, 120.0)
 PRIOR_SIGMA_M = 10.0  # as AuditOptions
@@ -308,43 +305,11 @@ def time_rows() -> list[list[str]]:
     return rows
 
 
-def section(
-    places: list[list[str]], others: list[list[str]], flights: list[list[str]], times: list[list[str]]
-) -> list[str]:
-    """What follows the heading."""
-    lines = ["", *paragraph(f"By `python -m bench.accuracy.audit`. One thread, {machine()}.")]
-    heights = ", ".join(f"{height:g}" for height in HEIGHTS_M)
-    lines += paragraph(
-        "**Places.** Frames of 300 x 300 px and 60 degrees are drawn from the map at random places and headings, "
-        f"from {heights} m, and changed: shadows, things that moved, exposure, haze, blur, noise, telemetry a "
-        f"little off. NCC matches each with a prior off by {PRIOR_SIGMA_M:g} m (one sigma). A place is right if "
-        f"there is a fix within {WRONG_M:g} m. AUC: how often a right place was rated higher than a wrong "
-        "one. The rule was fitted on other towns and patchworks by the same generator, and on the other half of "
-        "the farmland in other years."
-    )
-    columns = ["ground", "frames", "predicted", "measured", "wrong fixes", "AUC", "AUC by height"]
-    lines += table(columns, places)
-    lines += paragraph(
-        "**Another date.** The farmland again, its frames from years after the map's: almost nothing matches, and "
-        "an audit of one year predicts far too much. With so few right ones the AUC is not significant."
-    )
-    lines += table(columns, others)
-    lines += paragraph(
-        "**Flights.** The mean of the prediction at the true places, the share of frames that the navigator fixed "
-        f"by NCC within {WRONG_M:g} m, and the AUC within the flight where some were not. Nothing was fitted to "
-        "these flights."
-    )
-    lines += table(["flight", "frames", "predicted", "measured", "AUC"], flights)
-    lines += paragraph("**Time**, from 150 m at 0.5 m a pixel.")
-    return [*lines, *table(["map", "places", "time"], times)]
-
-
 def main() -> None:
-    """Measure, and write the section of the page; or fit."""
-    parser = parser_on_one_thread(__doc__)
+    """Measure, and fill in the page; or fit."""
+    parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("--quick", action="store_true", help="few frames")
     parser.add_argument("--fit", action="store_true", help="fit the rule and print its weights")
-    parser.add_argument("--page", type=Path, default=PAGE, help="what to rewrite")
     options = parser.parse_args()
     count = 15 if options.quick else 60
     if options.fit:
@@ -353,9 +318,14 @@ def main() -> None:
             "WEIGHTS =", np.round(fit(found), 2).tolist(), "of", len(found), "frames; AUC", round(auc_of(found), 3)
         )
         return
-    head = options.page.read_text(encoding="utf-8").split(MEASURED)[0]
-    lines = section(places_rows(count), other_rows(count), flight_rows(options.quick), time_rows())
-    options.page.write_text(head + MEASURED + "\n".join(lines).rstrip() + "\n", encoding="utf-8")
+    columns = ["ground", "frames", "predicted", "measured", "wrong fixes", "AUC", "AUC by height"]
+    sections = {
+        "places": table(columns, places_rows(count)),
+        "another date": table(columns, other_rows(count)),
+        "flights": table(["flight", "frames", "predicted", "measured", "AUC"], flight_rows(options.quick)),
+        "time": table(["map", "places", "time"], time_rows()),
+    }
+    fill(options.docs / "audit.md", measured() | sections)
 
 
 if __name__ == "__main__":

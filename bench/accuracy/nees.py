@@ -18,7 +18,7 @@ from bench import SHARED
 from bench.accuracy.flights import MIDDLE, Recorded, recorded, where_truth_is
 from bench.accuracy.truth import prior_about, true_places_m
 from bench.command import parser_on_one_thread
-from bench.pages.text import paragraph, rewrite, table
+from bench.pages.text import fill, paragraph, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
 from engine.assumed_errors import AssumedErrors
 from engine.geo import Array
@@ -39,7 +39,6 @@ CHI_SQUARE_95 = 5.991  # two degrees of freedom
 STRETCHES = 8  # whose means tell how well the mean of all is known
 STUDENT_95 = 2.365  # of seven degrees of freedom
 SIGMA_M, OFF_M = 8.0, 4.0
-BEGIN, END = "<!-- written by bench.accuracy.nees -->", "<!-- end of what bench.accuracy.nees writes -->"
 METHODS = ("NCC, peak", "NCC, refined", "SIFT", "auto", "NCC, no attitude")
 
 
@@ -285,7 +284,7 @@ def main() -> None:
     rows = measure(names, with_surface=not options.map_alone)
     if options.flights is not None or options.map_alone:
         return
-    rewrite(options.docs / "integrity.md", BEGIN, END, section(rows))
+    fill(options.docs / "integrity.md", {"consistency": section(rows)})
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import Any
 
 from bench.accuracy.truth import answered, pooled, rows_of, true_start
 from bench.command import parser_on_one_thread
-from bench.pages.text import machine, paragraph, percent, rewrite, table_of
+from bench.pages.text import fill, machine, paragraph, percent, table_of
 from engine import MatcherOptions, Navigator, SceneMatcher
 from engine.options import ACCEPT_ALL
 from scenematch.report.metrics import Ground, summarise
@@ -39,8 +39,6 @@ PAPER = "paper's recipe"
 HILLY_SEEDS, HILLY_DAYS = (1, 2, 31, 32, 71), ("noon", "evening")
 """The ground below was worked out on the towns 21 to 26."""
 HILLS_M = (0.0, 15.0, 30.0, 60.0)
-MARKS = "<!-- bench.accuracy.simulated -->", "<!-- end of bench.accuracy.simulated -->"
-HILLS_MARKS = "<!-- bench.accuracy.simulated --hills -->", "<!-- end of bench.accuracy.simulated --hills -->"
 DAY, WHO, RMS = ("frames' day", "day", "s"), ("by", "who", "s"), ("RMS m", "rms_m", ".2f")
 FIXED, FALSE = ("availability", "availability", percent), ("false", "false_fixes", "d")
 
@@ -158,12 +156,12 @@ def main() -> None:
     frames = 5 if options.quick else None
     if options.hills:
         seeds, hills_m = (HILLY_SEEDS[:1], HILLS_M[-1:]) if options.quick else (HILLY_SEEDS, HILLS_M)
-        rewrite(page, *HILLS_MARKS, [*hilly_lines(flown(hills(seeds, hills_m, frames))), *measured])
+        fill(page, {"hills": [*hilly_lines(flown(hills(seeds, hills_m, frames))), *measured]})
         return
     seeds = SEEDS[:1] if options.quick else SEEDS
     body = lines(flown(flights(seeds, frames)), WAYS)
     more = lines(flown(harder(seeds[:2], frames)), WAYS[:2])
-    rewrite(page, *MARKS, [*body, "The engine on what is harder, two towns each:", "", *more, *measured])
+    fill(page, {"conditions": [*body, "The engine on what is harder, two towns each:", "", *more, *measured]})
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from bench.command import parser_on_one_thread
 from bench.live.bridge_counts import RATE_NS, Received, free_port, growth_rows, place_off_m
 from bench.live.growth import Growth
 from bench.live.standin import MS, Agenda, Door, S, Standin, State, VirtualClock, circling
-from bench.pages.text import paragraph, rewrite, table
+from bench.pages.text import fill, table
 from engine.geo import LocalFrame
 from engine.options import NavigatorOptions
 from engine.values import Fix, Frame, NoFix, Reason, Timings, Window
@@ -29,15 +29,6 @@ from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
 PAGE = RESULTS / "mavlink.md"
-BEGIN, END = "<!-- written by bench.live.bridge_hour -->", "<!-- end of what bench.live.bridge_hour writes -->"
-HOUR = (
-    "`python -m bench.live.bridge_hour` flies the bridge beside a stand-in autopilot (pymavlink, UDP on loopback, "
-    "a link that takes 4 to 25 ms). The hour is on a virtual clock that waits for the bridge, and its matcher "
-    "is a script that knows the truth and takes no time; link, threads, decoder, telemetry, gates and "
-    "messages are the real ones. The script restarts the vehicle with its clock at zero and without "
-    "an origin, silences it twice and moves it once to another port; it floods the port, crashes a navigator, "
-    "covers the camera, makes fixes too uncertain, and refuses every 50th frame."
-)
 PLACE = LocalFrame(33.64, 72.99)
 CAMERA_MS = (45.0, 95.0)  # from exposure to the answer: the scripted matcher takes no time of its own
 IMAGE = np.zeros((8, 8, 3), np.uint8)
@@ -277,7 +268,7 @@ def main() -> None:
     lines = table(["the hour, scripted matcher, 5 Hz", ""], hour_rows(flown))
     print("\n".join(lines), {k: flown[k] for k in ("withheld", "refused", "dropped")})
     if told.write:
-        rewrite(PAGE, BEGIN, END, [*paragraph(HOUR), *lines])
+        fill(PAGE, {"hour": lines})
 
 
 if __name__ == "__main__":

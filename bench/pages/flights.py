@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bench.pages.text import machine, paragraph, table_of
+from bench.pages.text import fill, measured, table_of
 
 TITLES = {
     "gazebo-a1": "town A1, drawn by Gazebo",
@@ -22,28 +22,6 @@ TITLES = {
 }
 COLOURS = ("#d55e00", "#e69f00", "#0072b2", "#999999")
 WITHIN_M = (0.1, 30.0)
-INTRO = (
-    "Made by `make bench-flights` on {machine}, one thread. Each flight is followed from its "
-    "true start (sigma 15 m) by the navigator, with the recorded telemetry; only every n-th frame is flown."
-)
-METHODS = (
-    "`scenematch SIFT` uses the telemetry's heading, roll and pitch in its pose, where present; the second row "
-    "does not. `OpenCV features, scenematch pose` takes keypoints, descriptors and the brute-force "
-    "matcher of OpenCV in the windows of equations 4 and 5, and the same PnP; both describe the map once. "
-    "`paper's SIFT` is the paper's recipe taken literally; it refuses almost nothing."
-)
-FIGURES = (
-    "RMS and median are over all fixes, wrong ones too; **wrong** are those more than 10 m off, **false** those "
-    "of them that are also more than 3 of their own sigmas off. Agreeing is the mean share of matches that the "
-    "pose explains. The campus has a truth good to about a metre, and it is the ground in the middle of each "
-    "frame, made without a tilt: fixes there are moved to where their own axis meets the ground before they are "
-    "scored."
-)
-VARIANTS = (
-    "The built-in flight once more, by `scenematch SIFT`, with telemetry that is incomplete or wrong. The "
-    "attitude's error is the angle of the whole rotation. A frame without height takes that of the last fix; "
-    "without one, the whole map is searched."
-)
 
 
 @dataclass(frozen=True)
@@ -69,24 +47,16 @@ class Run:
 
 
 def write(docs: Path, runs: list[Run], variants: list[Run]) -> None:
-    """Write the page and its picture below ``docs``."""
-    (docs / "img").mkdir(parents=True, exist_ok=True)
-    _chart(runs).savefig(docs / "img" / "sift-flights.png", dpi=130, facecolor="white")
-    lines = ["# Flights by SIFT", "", *paragraph(INTRO.format(machine=machine()))]
-    lines += [*paragraph(METHODS), *paragraph(FIGURES)]
-    lines += ["![share of frames placed within a distance](img/sift-flights.png)", ""]
+    """Fill in the page below ``docs``, and draw its picture."""
+    lines = []
     for flight in dict.fromkeys(run.flight for run in runs):
         own = [run for run in runs if run.flight == flight]
         every = f"every {own[0].step}. frame" if own[0].step > 1 else "every frame"
         lines += [f"## {TITLES.get(flight, flight)} ({own[0].summary['frames']} frames, {every})", ""]
         lines += _table(own, "who")
-    lines += [
-        "## Built-in flight, telemetry incomplete or wrong",
-        "",
-        *paragraph(VARIANTS),
-        *_table(variants, "telemetry"),
-    ]
-    (docs / "flights.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+    fill(docs / "flights.md", measured() | {"flights": lines, "telemetry": _table(variants, "telemetry")})
+    (docs / "img").mkdir(exist_ok=True)
+    _chart(runs).savefig(docs / "img" / "sift-flights.png", dpi=130, facecolor="white")
 
 
 def _table(runs: list[Run], first: str) -> list[str]:

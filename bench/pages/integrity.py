@@ -11,13 +11,11 @@ from scipy.stats import binomtest
 
 from bench.accuracy.judged import METHODS, RISKS, SCORES, Row
 from bench.accuracy.trials import ANSWERABLE, SUITABLE, UNANSWERABLE, UNSUITABLE
-from bench.pages.text import paragraph, rewrite, table
+from bench.pages.text import fill, paragraph, percent, table
 from engine.geo import Array
-from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 
 Mask = NDArray[np.bool_]
 
-BEGIN, END = "<!-- bench.accuracy.integrity begins -->", "<!-- bench.accuracy.integrity ends -->"
 TPR, COVERAGE = 0.95, 0.75
 THRESHOLDS = (0.93, 0.95, 0.97, 0.98, 0.99, 0.995)
 IN_95 = 5.991  # chi-square of two degrees of freedom that holds 95 %
@@ -25,56 +23,31 @@ BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0])
 
 
 def write(rows: list[Row], docs: Path) -> None:
-    """The section between the markers, and its pictures."""
-    lines = section(rows)
-    rewrite(docs / "integrity.md", BEGIN, END, lines)
+    """Fill in the sections of the page, and draw its pictures."""
+    found = sections(rows)
+    fill(docs / "integrity.md", found)
     risk_chart(rows, docs / "img" / "integrity-risk.png")
     reliability_chart(rows, docs / "img" / "integrity-reliability.png")
-    print("\n".join(lines))
+    print("\n".join(line for lines in found.values() for line in lines))
 
 
-def section(rows: list[Row]) -> list[str]:
-    """Markdown."""
-    wrong = sum(_is_wrong(row) for row in rows)
+def sections(rows: list[Row]) -> dict[str, list[str]]:
+    """Lines by the names of their sections."""
     grounds = list(dict.fromkeys(row.ground for row in rows))
-    lines = paragraph(
-        f"{len(rows):,} matches over {', '.join(grounds)}; half of them have an answer; no constant was fitted "
-        f"on these grounds. **{wrong} wrong fixes**: more than {WRONG_M:g} m and {FALSE_SIGMAS:g} sigmas off; on "
-        "another map and of a mirrored frame every fix is wrong. Availability is the share of the answerable "
-        "matches that got a right fix; heading or height off by five times their assumed error is no suitable "
-        "match and listed apart, but its wrong fixes count. NEES (2 is consistent, less is cautious) and the "
-        "share inside the 95 % ellipse are of the suitable fixes that are right."
-    )
-    lines += table(["method", "matches", "availability", "wrong", "NEES", "in 95 %", "ECE"], _by_method(rows))
-    lines += paragraph(
-        "What other thresholds of the stated probability would have accepted of these fixes; each cell: "
-        "availability, wrong fixes. SIFT's own threshold stays. Refusals are not matched again: where `auto` "
-        "would have lost NCC's fix it is counted as lost, though SIFT might have had one."
-    )
-    lines += table(["`confidence` of at least", *METHODS, "all wrong"], _by_threshold(rows))
-    lines += paragraph(
-        "Errors beyond `Fix.protection_level_m(risk)`, of the suitable fixes: how many of those with a finite "
-        "level, the 95 % interval of their share, and the median level. It is infinite if a wrong place alone is "
-        "more probable than the risk."
-    )
-    lines += table(["method", "fixes", *(f"risk {risk:g}" for risk in RISKS)], _by_risk(rows))
-    lines += paragraph("By kind; each cell: matches, share that got a fix, wrong fixes.")
-    lines += table(["kind", *METHODS], _crossed(rows, (*ANSWERABLE, *UNANSWERABLE), lambda row: row.kind, _fixes))
-    lines += paragraph("By ground; each cell: availability, wrong fixes of all matches, NEES, inside the ellipse.")
-    lines += table(["ground", *METHODS], _crossed(rows, grounds, lambda row: row.ground, _by_ground_cell))
-    lines += paragraph(
-        "One score alone compared with the probability. Where a peak was tested against its null-hypothesis "
-        "template, that rival is in the second peak too. FPR: the share of wrong positions accepted where the "
-        f"threshold keeps {100 * TPR:g} % of the right ones. The last column: wrong ones accepted in 100,000 "
-        f"matches where {100 * COVERAGE:g} % of the suitable ones are accepted."
-    )
-    lines += table(
-        ["method", "score", "right, wrong found", "FPR at 95 % TPR", "AUC", "wrong in 100,000 at 75 %"],
-        _by_score(rows),
-    )
-    lines += ["![Risk against coverage](img/integrity-risk.png)", ""]
-    lines += ["![Stated against true probability](img/integrity-reliability.png)", ""]
-    return lines
+    said = f"{len(rows):,} matches over {', '.join(grounds)}: **{sum(map(_is_wrong, rows))} wrong fixes**."
+    kinds = _crossed(rows, (*ANSWERABLE, *UNANSWERABLE), lambda row: row.kind, _fixes)
+    by_ground = _crossed(rows, grounds, lambda row: row.ground, _by_ground_cell)
+    scores = ["method", "score", "right, wrong found", "FPR at 95 % TPR", "AUC", "wrong in 100,000 at 75 %"]
+    columns = ["method", "matches", "availability", "wrong", "NEES", "in 95 %", "ECE"]
+    return {
+        "matches": paragraph(said),
+        "methods": table(columns, _by_method(rows)),
+        "thresholds": table(["`confidence` of at least", *METHODS, "all wrong"], _by_threshold(rows)),
+        "risks": table(["method", "fixes", *(f"risk {risk:g}" for risk in RISKS)], _by_risk(rows)),
+        "kinds": table(["kind", *METHODS], kinds),
+        "grounds": table(["ground", *METHODS], by_ground),
+        "scores": table(scores, _by_score(rows)),
+    }
 
 
 def _is_wrong(row: Row) -> bool:
@@ -93,7 +66,7 @@ def _by_method(rows: list[Row]) -> list[list[str]]:
         stated = np.array([row.scores[0] for row in of if row.scores])
         right = np.array([row.right for row in of if row.scores])
         error = f"{calibration_error(stated, right):.4f}" if len(right) else "-"
-        cells = [f"{len(of):,}", _share(_available(suitable)), str(sum(map(_is_wrong, of)))]
+        cells = [f"{len(of):,}", percent(_available(suitable)), str(sum(map(_is_wrong, of)))]
         out.append([method, *cells, *_consistency(suitable), error])
     return out
 
@@ -108,7 +81,7 @@ def _by_threshold(rows: list[Row]) -> list[list[str]]:
             suitable = sum(row.kind in SUITABLE for row in _of(rows, method))
             right = sum(row.right and row.kind in SUITABLE for row in _of(kept, method))
             wrong = sum(map(_is_wrong, _of(kept, method)))
-            cells.append(f"{_share(right / max(1, suitable))}, {wrong}")
+            cells.append(f"{percent(right / max(1, suitable))}, {wrong}")
         out.append([f"{threshold:g}", *cells, str(sum(map(_is_wrong, kept)))])
     return out
 
@@ -146,14 +119,14 @@ def _fixes(of: list[Row]) -> str:
     if not of:
         return "-"
     fixed = sum(row.fixed for row in of)
-    return f"{len(of):,}, {_share(fixed / len(of))}, {sum(map(_is_wrong, of))}"
+    return f"{len(of):,}, {percent(fixed / len(of))}, {sum(map(_is_wrong, of))}"
 
 
 def _by_ground_cell(of: list[Row]) -> str:
     suitable = [row for row in of if row.kind in SUITABLE]
     if not suitable:
         return "-"
-    return f"{_share(_available(suitable))}, {sum(map(_is_wrong, of))}, {', '.join(_consistency(suitable))}"
+    return f"{percent(_available(suitable))}, {sum(map(_is_wrong, of))}, {', '.join(_consistency(suitable))}"
 
 
 def _available(of: list[Row]) -> float:
@@ -164,11 +137,7 @@ def _consistency(suitable: list[Row]) -> list[str]:
     squared = np.array([row.squared for row in suitable if row.fixed and row.right])
     if not len(squared):
         return ["-", "-"]
-    return [f"{squared.mean():.2f}", _share(float((squared <= IN_95).mean()))]
-
-
-def _share(value: float) -> str:
-    return f"{100 * value:.1f} %"
+    return [f"{squared.mean():.2f}", percent(float((squared <= IN_95).mean()))]
 
 
 def _by_score(rows: list[Row]) -> list[list[str]]:
@@ -187,7 +156,7 @@ def _by_score(rows: list[Row]) -> list[list[str]]:
             order = np.argsort(-score, kind="stable")
             enough = np.searchsorted(np.cumsum((right & answered)[order]), COVERAGE * suitable)
             per = f"{1e5 * float((~right[order][:enough]).sum()) / of:.0f}" if enough < len(order) else "never"
-            rates = [_share(false_positives(score, right)), f"{auc(score, right):.4f}"]
+            rates = [percent(false_positives(score, right)), f"{auc(score, right):.4f}"]
             out.append([method, name, counts, *(rates if (~right).any() else ["-", "-"]), per])
     return out
 

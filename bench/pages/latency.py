@@ -9,72 +9,32 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bench.live.embedded import PRIOR_SIGMA_M
 from bench.live.endless import GRACE_MS
 from bench.live.startup import PARTS
-from bench.pages.text import machine, paragraph, table_of
+from bench.pages.text import fill, measured, table_of
 
 Row = dict[str, Any]
 COLOURS = {"ncc": "#0072b2", "sift": "#d55e00", "auto": "#009e73"}
-INTRO = (
-    "Made by `make bench-latency`, one run of it, on {machine}; one thread where nothing else is said. The "
-    "built-in flight is drawn once and flown forth and back with rising stamps, between 110 and 150 m high, so "
-    "that thousands of frames meet hundreds of sizes of the window. A time is that of one `Navigator.update`, "
-    "from call to answer."
-)
-BUDGETS = (
-    f"**On time** is the share of frames answered, by a fix or a refusal, within the budget and {GRACE_MS:g} ms."
-    " A miss is attributed to the cause without which the frame would have been on time: *preempted* and *held or "
-    "waiting*, the thread was off its core for that long (with and without a preemption counted by the kernel); "
-    "*garbage collector*; else the *stage* that ran when the budget ended. **Fixed** is the share with a fix, "
-    "**false** are fixes more than 10 m and 3 of their own sigmas off, **stale** those that carry another "
-    "frame's stamp. Stages are those that the fixes came from."
-)
-HOGS = "Beside processes that burn a core each."
-EMBEDDED = (
-    "`SceneMatcher` embedded as in the README, on a recorded flight of Gazebo flown over and over, beside a busy "
-    "process on each core. Priors are the truth and noise of {sigma:g} m; a quarter of a frame's time is a pause; "
-    "*realtime* calls `engine.set_realtime()` after the warm-up. **On time**: within the budget and {grace:g} ms."
-)
-SLOW = (
-    "The process is warmed up at full speed and then stopped and continued by signals, 50 times a second: it "
-    "becomes four and ten times slower in flight, and the costs that it learned are wrong. Nothing answers while "
-    "it is stopped, which no scheduling can avoid; **but for a stop** allows for one stop, and **on core** counts "
-    "the thread's own time against the budget. *Share got* is the measured share of a core."
-)
-QUEUE = (
-    "`Live`, auto, deadline {deadline:g} ms, fed at so many times the rate that it takes ({frame:.1f} ms a "
-    "frame). **Age** is from capture to output, of every answer; the newest frame wins, and the others are "
-    "dropped. Allowed is the deadline and one frame."
-)
-SOAK = (
-    "`ncc` and `sift` with a budget of 40 ms; `auto` is all of its frames above, its times those at 121 ms. "
-    "Growth of the resident memory is the slope of a line through all samples after the first tenth; open files"
-    " and threads are those at the first and at the last frame. Cache growth is what is planned, compiled or "
-    "prepared for the first time: after the warm-up there should be none. Memory grows in steps where "
-    "a budget does: more steps become affordable, and take their memory once."
-)
-CURVE = "Every budget flies the same frames. What RMS leaves out, refused frames, is in the middle picture."
-TABLE_ONE = (
-    "The demo's flight, level at 150 m, without a budget. The paper's times are from a laptop of its own; its "
-    "recipe by OpenCV was measured here. Jitter is p99 less p50. At either end the flight turns back within one "
-    "frame, 7 m against all inertia: the 21 frames after it are refused."
-)
-STARTUP = (
-    "From the start of the process to the first fix, each start in a process of its own. *All kept* is every "
-    "start after the first on a machine: compiled code and the map's features lie in caches."
-)
-ENTRIES = (
-    "Help, completion and `import engine` alone load neither torch nor any other large package; cameras, frames "
-    "and maps need NumPy. Each is a process of its own, the median of five; *on a core* leaves out what it waited "
-    "for, and memory is the most that was resident."
-)
 
 
 def write(docs: Path, results: dict[str, Any]) -> None:
-    """Write the page and its pictures below ``docs``."""
-    (docs / "img").mkdir(parents=True, exist_ok=True)
+    """Fill in the page below ``docs``, and draw its pictures."""
     soaked = [*results["soak"], results["budgets"]["growth"]]
+    sections = {
+        "budgets": _latency_table(results["budgets"]["rows"]),
+        "hogs": _latency_table(results["hogs"]),
+        "slow": _slow_table(results["slow"]),
+        "queue": _queue_table(results["queue"]),
+        "soak": _soak_table(soaked),
+        "curve": _curve_table(results["tradeoff"]["curve"]),
+        "table one": _table_one(results["tradeoff"]["table"]),
+        "startup": _startup_table(results["startup"]),
+        "entries": _entries_table(results["entries"]),
+    }
+    if results["embedded"]:  # else its flight was not there
+        sections["embedded"] = _embedded_table(results["embedded"])
+    fill(docs / "latency.md", measured() | sections)
+    (docs / "img").mkdir(exist_ok=True)
     pictures = {
         "budgets": _load_chart(results),
         "soak": _soak_chart(soaked),
@@ -82,28 +42,6 @@ def write(docs: Path, results: dict[str, Any]) -> None:
     }
     for name, figure in pictures.items():
         figure.savefig(docs / "img" / f"latency-{name}.png", dpi=130, facecolor="white")
-    lines = ["# Latency, measured", "", *paragraph(INTRO.format(machine=machine()))]
-    lines += [
-        "## On time, alone on the machine",
-        "",
-        *paragraph(BUDGETS),
-        *_latency_table(results["budgets"]["rows"]),
-    ]
-    lines += ["![latency against budget, by load](img/latency-budgets.png)", ""]
-    lines += [f"A frame is on time below the top of its bar, {GRACE_MS:g} ms above its budget.", ""]
-    lines += ["## On time, beside busy processes", "", *paragraph(HOGS), *_latency_table(results["hogs"])]
-    lines += _embedded(results.get("embedded", []))
-    lines += ["## On time, on a share of a core", "", *paragraph(SLOW), *_slow_table(results["slow"])]
-    lines += ["## More frames than time", "", *_queue(results["queue"])]
-    lines += ["## A long flight", "", *paragraph(SOAK), *_soak_table(soaked)]
-    lines += ["![growth of the resident memory](img/latency-soak.png)", ""]
-    lines += ["## What a budget buys", "", *paragraph(CURVE)]
-    lines += ["![accuracy, availability and latency against budget](img/latency-tradeoff.png)", ""]
-    lines += [*_curve_table(results["tradeoff"]["curve"]), "## Table I with its tails", "", *paragraph(TABLE_ONE)]
-    lines += [*_table_one(results["tradeoff"]["table"]), "## From start to first fix", ""]
-    lines += _startup(results["startup"])
-    lines += ["## Before the first fix is asked for", "", *_entries(results["entries"])]
-    (docs / "latency.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
 
 # ----------------------------------------------------------------------------------------------------- tables
@@ -133,12 +71,9 @@ def _latency_table(rows: list[Row]) -> list[str]:
     return table_of(rows, *which, *_TIMES, _FIXED, _RMS, _FALSE, _STALE, _STAGES)
 
 
-def _embedded(rows: list[Row]) -> list[str]:
-    if not rows:  # the flight was not there
-        return []
+def _embedded_table(rows: list[Row]) -> list[str]:
     which = (("who", "who", "s"), _BUDGET, _FRAMES, _ON_TIME, ("within the budget", "within_budget", share))
-    columns = (*which, *_TIMES, _FIXED, _RMS, ("> 10 m off", "wrong", "d"), _STAGES)
-    return [*paragraph(EMBEDDED.format(sigma=PRIOR_SIGMA_M, grace=GRACE_MS)), *table_of(rows, *columns)]
+    return table_of(rows, *which, *_TIMES, _FIXED, _RMS, ("> 10 m off", "wrong", "d"), _STAGES)
 
 
 def _slow_table(rows: list[Row]) -> list[str]:
@@ -147,14 +82,13 @@ def _slow_table(rows: list[Row]) -> list[str]:
     return table_of(rows, *which, *kept, *_TIMES, _FIXED, _RMS, _FALSE, _STALE)
 
 
-def _queue(rows: list[Row]) -> list[str]:
+def _queue_table(rows: list[Row]) -> list[str]:
     counts = ((name, name, ",") for name in ("submitted", "answered", "dropped", "late", "fixes"))
     ages = (("age p50 ms", "p50", ".1f"), ("p99", "p99", ".1f"), ("max", "max", ".1f"))
     memory = (("RSS MB before", "rss_before_mb", ".0f"), ("after", "rss_after_mb", ".0f"))
     allowed = [{"allowed_ms": row["deadline_ms"] + row["frame_ms"], **row} for row in rows]
     columns = (("fed", "factor", "{} x".format), ("fed Hz", "fed_hz", ".0f"), *counts, *ages)
-    text = QUEUE.format(deadline=rows[0]["deadline_ms"], frame=rows[0]["frame_ms"])
-    return [*paragraph(text), *table_of(allowed, *columns, ("allowed ms", "allowed_ms", ".1f"), _STALE, *memory)]
+    return table_of(allowed, *columns, ("allowed ms", "allowed_ms", ".1f"), _STALE, *memory)
 
 
 def _from_to(counts: list[float]) -> str:
@@ -182,18 +116,18 @@ def _table_one(rows: list[Row]) -> list[str]:
     return table_of(spread, *which, *times, ("jitter", "jitter", ".1f"), _FIXED)
 
 
-def _startup(rows: list[Row]) -> list[str]:
+def _startup_table(rows: list[Row]) -> list[str]:
     told = [{**row["parts_s"], **row, "most": max(PARTS, key=row["parts_s"].__getitem__)} for row in rows]
     parts = ((f"{part} s", part, ".2f") for part in PARTS)
     total = (("total s", "total_s", ".2f"), ("most of it", "most", "s"), ("memory MB", "resident_mb", ".0f"))
     fixed = ("fix", "fixed", lambda is_fixed: "yes" if is_fixed else "no")
     columns = (("method", "method", "s"), ("caches", "kept", "s"), *parts, *total, fixed)
-    return [*paragraph(STARTUP), *table_of(told, *columns)]
+    return table_of(told, *columns)
 
 
-def _entries(rows: list[Row]) -> list[str]:
+def _entries_table(rows: list[Row]) -> list[str]:
     spent = (("seconds", "seconds", ".2f"), ("on a core s", "core_s", ".2f"), ("memory MB", "resident_mb", ".0f"))
-    return [*paragraph(ENTRIES), *table_of(rows, ("what", "what", "`{}`".format), *spent)]
+    return table_of(rows, ("what", "what", "`{}`".format), *spent)
 
 
 # ---------------------------------------------------------------------------------------------------- pictures

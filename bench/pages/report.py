@@ -16,14 +16,10 @@ from matplotlib.figure import Figure
 
 from bench.command import parser_on_one_thread
 from bench.pages import sift
-from bench.pages.text import machine, paragraph, table_of
+from bench.pages.text import fill, measured, table_of
 from bench.speed import stages
 
 BASELINE = {"peak": "OpenCV", "step": "OpenCV", "hypotheses": "OpenCV loop"}
-INTRO = (
-    "Made by `make bench` on {machine}. A time is the median of the calls; a ratio above 1 means faster than the "
-    "peer. In all sections but the first, NCC is its peak alone, without the dense refinement."
-)
 
 
 def main() -> None:
@@ -38,13 +34,12 @@ def main() -> None:
     charts = sift.charts(rows)
     if flown:
         charts["frame-stages.png"] = _stages_chart(flown)
-    (options.docs / "img").mkdir(parents=True, exist_ok=True)
+    sections = {"peak": _peak_table(rows), "step": _step_table(rows), "hypotheses": _hypotheses_table(rows)}
+    stages_table = {"stages": _stages_table(flown)} if flown else {}
+    fill(options.docs / "benchmarks.md", measured() | stages_table | sections | sift.sections(rows))
+    (options.docs / "img").mkdir(exist_ok=True)
     for name, figure in charts.items():
         figure.savefig(options.docs / "img" / name, dpi=130, facecolor="white")
-    page = ["# Benchmarks", "", *paragraph(INTRO.format(machine=machine()))]
-    page += _stages_section(flown) + _peak_section(rows) + _step_section(rows)
-    page += _hypotheses_section(rows) + sift.sections(rows)
-    (options.docs / "benchmarks.md").write_text("\n".join(page).rstrip() + "\n", encoding="utf-8")
 
 
 def _row(entry: dict[str, Any]) -> dict[str, Any]:
@@ -63,10 +58,8 @@ def _of_task(rows: list[dict[str, Any]], task: str) -> list[dict[str, Any]]:
     return [{**row, "ratio": base_ms[row["group"]] / row["median_ms"]} for row in own]
 
 
-def _stages_section(flown: list[dict[str, Any]]) -> list[str]:
+def _stages_table(flown: list[dict[str, Any]]) -> list[str]:
     """A tracked flight by the engine, in turns with OpenCV's step."""
-    if not flown:
-        return []
     rows = [
         {
             **row,
@@ -82,20 +75,7 @@ def _stages_section(flown: list[dict[str, Any]]) -> list[str]:
         ("OpenCV's step ms", "opencv_p50_ms", ".2f"),
     )
     found = (("fixed", "fixes", "s"), ("RMS m", "rms_m", ".3f"), ("NEES", "nees", ".2f"))
-    text = (
-        "`SceneMatcher.locate` of a tracked flight, one thread: a refined and verified pose with its covariance. "
-        "OpenCV's step (grey, enhance, warp, match; no check and no refinement, 1.1 to 1.3 m off) has the same "
-        "frames in turns of twenty. NEES is per axis: 1 where errors match the covariance, less where it is "
-        "cautious."
-    )
-    return [
-        "## A frame of a tracked flight",
-        "",
-        *paragraph(text),
-        "![stages of a frame](img/frame-stages.png)",
-        "",
-        *table_of(rows, ("flight, method", "who", "s"), *times, ("ratio to it", "ratio", ".2f"), *found),
-    ]
+    return table_of(rows, ("flight, method", "who", "s"), *times, ("ratio to it", "ratio", ".2f"), *found)
 
 
 def _stages_chart(flown: list[dict[str, Any]]) -> Figure:
@@ -120,43 +100,22 @@ _WHO, _MEMORY = (("who", "peer", "s"), ("threads", "threads", "d")), ("peak MB",
 _TIMES = (("median ms", "median_ms", ".2f"), ("p95 ms", "p95_ms", ".2f"), ("ratio to OpenCV", "ratio", ".2f"))
 
 
-def _peak_section(rows: list[dict[str, Any]]) -> list[str]:
+def _peak_table(rows: list[dict[str, Any]]) -> list[str]:
+    """Window and template in, peak out."""
     peaks = [{**row, "size": f"{row['template_px']} in {row['window_px']}"} for row in _of_task(rows, "peak")]
     found = (("score error", "error", ".0e"), _MEMORY)
-    return [
-        "## Window and template in, peak out",
-        "",
-        "The paper's case is 327 in 425; the engine's own patch of the same frame is 228 in 425. `map prepared`",
-        "is what a flight runs: coarse to fine on a map whose sums and half-resolution levels exist. `exhaustive`",
-        "scores every place at full resolution; `ncc()` prepares nothing and returns the whole surface. On the",
-        "smallest windows the fixed cost of a call exceeds OpenCV's whole work.",
-        "",
-        *table_of(peaks, ("size, float32", "size", "s"), *_WHO[::-1], *_TIMES, *found),
-    ]
+    return table_of(peaks, ("size, float32", "size", "s"), *_WHO[::-1], *_TIMES, *found)
 
 
-def _step_section(rows: list[dict[str, Any]]) -> list[str]:
-    return [
-        "## The whole step: a 300 x 300 colour frame in, position out",
-        "",
-        "Grey, enhanced, rectified, matched in the adaptive window, sub-pixel, as coordinates; the engine also",
-        "judges the peak and states a covariance. `OpenCV` enhances the window in every frame; with `map",
-        "prepared` it keeps the enhanced map.",
-        "",
-        *table_of(_of_task(rows, "step"), *_WHO, *_TIMES, ("RMS m", "rms_m", ".2f")),
-    ]
+def _step_table(rows: list[dict[str, Any]]) -> list[str]:
+    """A 300 x 300 colour frame in, position out."""
+    return table_of(_of_task(rows, "step"), *_WHO, *_TIMES, ("RMS m", "rms_m", ".2f"))
 
 
-def _hypotheses_section(rows: list[dict[str, Any]]) -> list[str]:
+def _hypotheses_table(rows: list[dict[str, Any]]) -> list[str]:
+    """Heading unknown, height within 10 %, the whole map of the paper."""
     figures = (("median ms", "median_ms", ".0f"), ("ratio", "ratio", ".1f"), ("error m", "error_m", ".1f"))
-    return [
-        "## Heading unknown, height within 10 %, the whole map of the paper",
-        "",
-        "OpenCV loops over 36 headings x 5 scales and names the best of them. The engine also refines heading and",
-        "height below the step.",
-        "",
-        *table_of(_of_task(rows, "hypotheses"), *_WHO, *figures, _MEMORY),
-    ]
+    return table_of(_of_task(rows, "hypotheses"), *_WHO, *figures, _MEMORY)
 
 
 if __name__ == "__main__":

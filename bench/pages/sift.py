@@ -6,44 +6,12 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.pages.text import bullets, paragraph, shown, table, table_of
+from bench.pages.text import shown, table, table_of
 
 Row = dict[str, Any]
 
 BASELINE = "OpenCV SIFT"
 PAPER_NCC, PAPER_SIFT = "paper's NCC", "paper's SIFT"
-TIMES = (
-    "Milliseconds a picture, grey uint8 in, whatever the library returns out: one picture at a time, and {batch} "
-    "at a time (one call of `sift`; for the others a loop, with two threads one picture on each, which COLMAP "
-    "does not let run side by side). `ratio` is OpenCV SIFT's time over this one's, one picture, one thread."
-)
-PAIRS = (
-    "Quality is the mean over pairs, left of the slash drone pictures warped by known homographies (any turn, "
-    "0.7 to 1.4 times the scale, tilt, gamma, exposure, blur, noise), right of it frames against the piece of "
-    "map that they show, by true poses and surface models:"
-)
-FIGURES = (
-    "**repeat**: keypoints in the common ground that the other picture has too, within 1.5 px and 1.5 times the "
-    "scale. Chance gives up to 9 % at 150 x 150, 2 % at 300 x 300, and less above.",
-    "**score**: correct matches over keypoints in the common ground, of the picture with fewer.",
-    "**right**: share of the mutual matches with ratio below 0.8 that lie within 3 px of the truth; **matches**: "
-    "how many those are; **error**: their median distance from it.",
-)
-CONDITIONS = (
-    "All have the same pictures, at most 300 keypoints (OpenCV and COLMAP count each orientation as one), and "
-    "their own defaults otherwise. With contrast 0.02 OpenCV keeps weak keypoints, as `scenematch` does. Its "
-    "positions have a bias of 0.25 px, which a turn turns into an error. COLMAP keeps its coarsest keypoints, "
-    "OpenCV and `scenematch` those of highest contrast. `upright` gets the rotation between the pictures, as from "
-    "a heading. Ground that roofs hide from a frame counts as common."
-)
-STEP = (
-    "The paper's case on the built-in flight: half scale, the window of equations 4 and 5, a prior a few metres "
-    "off. Rows that begin with `paper's` are its recipe taken literally with OpenCV (features of frame and "
-    "window in every frame, brute force, `solvePnPRansac` on flat ground); it refuses nothing. `scenematch` "
-    "finds the map's features once, before the flight; what that saves stands apart, for it and for OpenCV. It "
-    "also judges the pose and states a covariance. NCC stands here because the paper compares the two. The "
-    "first table states how many times as long SIFT takes."
-)
 PAPER_RATIO = 121 / 40  # Table I of the paper: SIFT's time over NCC's
 COLOURS = {
     "scenematch": "#d55e00",
@@ -57,11 +25,12 @@ COLOURS = {
 }
 
 
-def sections(rows: list[Row]) -> list[str]:
-    """Markdown of both sections, of what was measured."""
+def sections(rows: list[Row]) -> dict[str, list[str]]:
+    """Lines of both sections by their names, of what was measured."""
     features = [row for row in rows if row["task"] == "features"]
     steps = [row for row in rows if row["task"] == "sift step"]
-    return (_features_section(features) if features else []) + (_step_section(steps) if steps else [])
+    found = {"features": _features_section(features)} if features else {}
+    return found | ({"sift step": _step_section(steps)} if steps else {})
 
 
 def charts(rows: list[Row]) -> dict[str, Figure]:
@@ -106,9 +75,7 @@ def _both(row: Row, name: str, form: str) -> str:
 
 def _features_section(rows: list[Row]) -> list[str]:
     batch = max(row["batch"] for row in rows)
-    lines = ["## Features: a picture in, at most 300 keypoints with descriptors out", ""]
-    lines += paragraph(TIMES.format(batch=batch)) + paragraph(PAIRS) + bullets(*FIGURES) + paragraph(CONDITIONS)
-    lines += ["![time and correct matches](img/sift-quality.png)", ""]
+    lines = []
     columns = ["who", "1 thread", "2 threads", f"{batch}, 1 thread", f"{batch}, 2 threads", "ratio"]
     columns += ["keypoints", "repeat %", "score %", "right %", "matches", "error px"]
     for size in _sizes(rows):
@@ -183,9 +150,6 @@ def _step_section(rows: list[Row]) -> list[str]:
     )
     found = (("fixes", "found", "s"), ("RMS m", "rms_m", ".2f"), ("height RMS m", "height_rms_m", ".2f"))
     return [
-        "## The whole SIFT step: a 300 x 300 colour frame in, pose out",
-        "",
-        *paragraph(STEP),
         *table(["threads", "paper, published", "paper's recipe, here", "scenematch"], _step_ratios(time_ms)),
         *table_of(told, ("who", "peer", "s"), ("threads", "threads", "d"), *times, *found),
     ]

@@ -6,7 +6,7 @@ import os
 import platform
 import subprocess
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import torch
 
-from bench import ROOT
+from bench import RESULTS, ROOT
 
 
 def table(columns: list[str], rows: list[list[str]]) -> list[str]:
@@ -47,18 +47,25 @@ def paragraph(text: str) -> list[str]:
     return [*textwrap.wrap(text, 115), ""]
 
 
-def bullets(*texts: str) -> list[str]:
-    """Lines of a list, an empty one after it."""
-    lines = [
-        line for text in texts for line in textwrap.wrap(text, 115, initial_indent="- ", subsequent_indent="  ")
-    ]
-    return [*lines, ""]
+def fill(page: Path, sections: Mapping[str, list[str]]) -> None:
+    """Put what was measured between the markers of a page, whose words are its own.
+
+    Args:
+        page: is filled; one that is not there becomes a copy of that in docs/results.
+        sections: lines by the name of their section, the last of them empty.
+    """
+    text = (page if page.exists() else RESULTS / page.name).read_text(encoding="utf-8")
+    for name, lines in sections.items():
+        begin, end = f"<!-- measured: {name} -->", f"<!-- end of {name} -->"
+        before, rest = text.split(begin)
+        text = "\n".join([before + begin, "", *lines, end + rest.split(end)[1]])
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text(text, encoding="utf-8")
 
 
-def rewrite(page: Path, begin: str, end: str, lines: list[str]) -> None:
-    """Put lines, the last of them empty, between two markers of a page."""
-    before, rest = page.read_text(encoding="utf-8").split(begin)
-    page.write_text("\n".join([before + begin, "", *lines, end + rest.split(end)[1]]), encoding="utf-8")
+def measured() -> dict[str, list[str]]:
+    """The section that says on what machine."""
+    return {"machine": paragraph(f"Measured on {machine()}.")}
 
 
 def machine() -> str:

@@ -26,9 +26,8 @@ import numpy as np
 from bench import RESULTS
 from bench.inputs.scenes import mosaic
 from bench.live.growth import resident_mb
-from bench.pages.text import machine, paragraph, rewrite, table_of
+from bench.pages.text import fill, machine, paragraph, table_of
 
-BEGIN, END = "<!-- bench.speed.large_map -->", "<!-- end of bench.speed.large_map -->"
 AT = (0.61234, 0.38765)
 """Where the town lies on the large map, as shares of its side: not in its middle."""
 AROUND_PX = 6000
@@ -227,7 +226,7 @@ def main() -> None:
         for name, site, surface, method in ways:
             runs.append(watch(name, site, surface, flight, method))
             print(section(runs[-1:], asked.side)[2])
-    rewrite(asked.docs / "large-maps.md", BEGIN, END, section(runs, asked.side))
+    fill(asked.docs / "large-maps.md", {"large map": section(runs, asked.side)})
 
 
 if __name__ == "__main__":
