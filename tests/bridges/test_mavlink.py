@@ -21,6 +21,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.quaternion import Quaternion
 
+from bench.live.bridge_counts import free_port
 from engine import Attitude, NavigatorOptions, NoFix, OptionError, Prior, Reason, TelemetryError
 from engine.camera import mount_rotation
 from engine.geo import LocalFrame
@@ -812,10 +813,7 @@ def bridge_to():
     opened = []
 
     def make(options=None, **more):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        navigator = Matched()
+        port, navigator = free_port(), Matched()
         link = parse_connection(f"udpin:127.0.0.1:{port}")
         bridge = MavlinkBridge(link, lambda _: navigator, options or MavlinkOptions(), **more)
         opened.append(bridge)

@@ -11,7 +11,6 @@ import rasterio
 from affine import Affine
 from pyproj import Transformer
 from rasterio.enums import Resampling
-from rasterio.windows import Window as RasterWindow
 
 from engine import Camera, OptionError, OrthoMap, TelemetryError
 from scenematch.check.availability import Flag, audit_site, fix_probability, predict_route
@@ -21,6 +20,7 @@ from scenematch.cli.app import run
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.route import read_route
 from tests.support.commands import refusal
+from tests.support.rasters import write_sparse
 from tests.support.towns import drawn_town
 
 CAMERA, HEIGHT_M = Camera.from_fov(300, 300, 60.0), 75.0
@@ -253,13 +253,9 @@ def huge_path(tmp_path_factory):
     """A sparse GeoTIFF with overviews; all but the town is nodata, over which averages would take long."""
     path = tmp_path_factory.mktemp("huge") / "huge.tif"
     at = Affine(0.5, 0.0, 600_000.0 - 0.5 * CORNER[0], 0.0, -0.5, 4_500_000.0 + 0.5 * CORNER[1])
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "crs": UTM, "transform": at, "nodata": 0}
-    profile |= {"tiled": True, "blockxsize": 512, "blockysize": 512, "sparse_ok": True, "compress": "deflate"}
-    profile |= {"width": HUGE_SIDE, "height": HUGE_SIDE}
-    with rasterio.Env(SPARSE_OK_OVERVIEW="ON"), rasterio.open(path, "w", **profile) as dataset:
-        dataset.write(np.maximum(town_gray(), 1), 1, window=RasterWindow(*CORNER, 900, 900))
-        dataset.build_overviews([2, 4, 8, 16, 32], Resampling.nearest)
-    return path
+    blocks = {"blockxsize": 512, "blockysize": 512}
+    town = np.maximum(town_gray(), 1)
+    return write_sparse(path, town, CORNER, HUGE_SIDE, Resampling.nearest, crs=UTM, transform=at, **blocks)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import pytest
 import rasterio
 from affine import Affine
 from rasterio.enums import Resampling
-from rasterio.windows import Window as RasterWindow
 from rich.console import Console
 
 from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher
@@ -18,7 +17,7 @@ from engine.values import Window
 from scenematch.cli import console
 from scenematch.cli.app import run
 from scenematch.runs.inputs import check_start
-from tests.support.rasters import from_corner, whole, write_raster
+from tests.support.rasters import from_corner, whole, write_raster, write_sparse
 
 SIDE = 17_000
 CORNER = (12_288, 6_656)  # of the town on the large map: on its cells, so that the same landmarks are chosen
@@ -36,14 +35,8 @@ def large_path(tmp_path_factory, sim_town, gray):
     """A sparse GeoTIFF of 17,000 x 17,000 pixels with overviews; all but the town is nodata."""
     path = tmp_path_factory.mktemp("large") / "map.tif"
     corner = from_corner(sim_town.pixel_to_crs) @ Affine.translation(-CORNER[0], -CORNER[1])
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "crs": UTM, "transform": corner, "nodata": 0}
-    profile |= {"tiled": True, "sparse_ok": True, "compress": "deflate", "width": SIDE, "height": SIDE}
-    around = np.pad(gray, MARGIN, mode="reflect")
-    with rasterio.Env(SPARSE_OK_OVERVIEW="ON"), rasterio.open(path, "w", **profile) as dataset:
-        place = RasterWindow(CORNER[0] - MARGIN, CORNER[1] - MARGIN, around.shape[1], around.shape[0])
-        dataset.write(around, 1, window=place)
-        dataset.build_overviews([2, 4, 8, 16, 32], Resampling.average)
-    return path
+    around, place = np.pad(gray, MARGIN, mode="reflect"), (CORNER[0] - MARGIN, CORNER[1] - MARGIN)
+    return write_sparse(path, around, place, SIDE, Resampling.average, crs=UTM, transform=corner)
 
 
 @pytest.fixture(scope="module")

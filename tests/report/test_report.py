@@ -140,6 +140,3 @@ def test_a_summary_is_json_without_nan():
     rows = [fix_at(0, 0, 0, sigma_m=(0.0, 0.0)), refusal_at(None), fix_at(1, 1, 1, sigma_m=(None, None))]
     for truth in (None, straight(), [truth_at(0, 0, 999)]):
         assert json.loads(json.dumps(summarise(rows, truth), allow_nan=False))
-
-
-# ---------------------------------------------------------------------------------- the telemetry's velocity

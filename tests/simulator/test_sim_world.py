@@ -22,7 +22,7 @@ from tests.support.towns import site_of, under_map
 TINY = {"width_px": 64, "height_px": 64}
 MIDDLING = {"width_px": 700, "height_px": 720}
 SMALL = {"width_px": 300, "height_px": 280}
-LEVEL, TURNED = Attitude(0.0, 0.0, 0.0), Attitude(-6.5, 3.0, 251.0)
+LEVEL = Attitude(0.0, 0.0, 0.0)
 PERFECT = SensorNoise(**dict.fromkeys(SensorNoise.__dataclass_fields__, 0.0))
 
 

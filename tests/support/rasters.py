@@ -10,6 +10,7 @@ import numpy as np
 import rasterio
 from affine import Affine
 from rasterio.enums import Resampling
+from rasterio.windows import Window as RasterWindow
 
 from engine import OrthoMap
 from engine.values import Window
@@ -47,4 +48,15 @@ def write_raster(
             dataset.write(data)
             if overviews:
                 dataset.build_overviews(list(overviews), Resampling.average)
+    return path
+
+
+def write_sparse(path: Path, data: Any, left_top: Any, side_px: int, resampling: Any, **profile: Any) -> Path:
+    """Write a sparse GeoTIFF of ``side_px`` squared with overviews: (H, W) at a column and row, else nodata."""
+    height, width = data.shape
+    settings = {"driver": "GTiff", "dtype": "uint8", "count": 1, "nodata": 0, "width": side_px, "height": side_px}
+    settings |= {"tiled": True, "sparse_ok": True, "compress": "deflate"}
+    with rasterio.Env(SPARSE_OK_OVERVIEW="ON"), rasterio.open(path, "w", **settings, **profile) as dataset:
+        dataset.write(data, 1, window=RasterWindow(*left_top, width, height))
+        dataset.build_overviews([2, 4, 8, 16, 32], resampling)
     return path
