@@ -18,22 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from engine.errors import MapError
+from engine.maps.accuracy import GEOREFERENCE_TAG, SLOPE_TAG, stated_sigma
 from engine.maps.georeference import Georeference
 from engine.maps.grids import Array, Grid, metric_grid, warp_between
 from engine.maps.metric_copy import ProgressCallback, open_readable
 from engine.maps.pyramid import Pyramid, check_arrays
-from engine.maps.rasters import (
-    GEOREFERENCE_TAG,
-    SLOPE_TAG,
-    Bounds,
-    Gray,
-    GrayReader,
-    Mask,
-    Source,
-    open_source,
-    stated_sigma,
-    vertical_datum,
-)
+from engine.maps.rasters import Bounds, Gray, GrayReader, Mask, Source, open_source, vertical_datum
 from engine.maps.surface import GROUND_PERCENT, SurfaceModel, open_surface
 from engine.values import Window
 

@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.errors import MapError, OptionError
+from engine.errors import MapError
 from engine.maps.grids import Array, Grid, earth_crs, wgs84
-from engine.maps.raster_formats import OWN_TAGS, local_path, open_raster
-from engine.values import MAX_SIGMA_M, Window
+from engine.maps.raster_formats import local_path, open_raster
+from engine.values import Window
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -41,10 +41,6 @@ DTYPES = "uint8", "uint16", "int16", "float32", "float64"
 """Element types of a map."""
 COLLAR_SHARE = 0.005
 STRETCH_PERCENT = (2.0, 98.0)
-GEOREFERENCE_TAG = "SCENEMATCH_GEOREFERENCE_SIGMA_M"
-"""Metadata item of a GeoTIFF: its georeferencing accuracy, one standard deviation in metres per axis."""
-SLOPE_TAG = "SCENEMATCH_SLOPE_SIGMA_DEG"
-"""Metadata item of a surface model: its slope accuracy, one standard deviation in degrees."""
 _GDAL_CACHE_BYTES = 128 * 2**20  # GDAL's own cache is a twentieth of the machine's memory
 MEMORY_LIMIT_PX = 256 * 2**20
 """Grey maps of up to this many pixels are held in memory; larger ones are read window by window."""
@@ -68,37 +64,6 @@ class Source:
     path: Path
     dataset: Any
     grid: Grid
-
-
-def stated_sigma(given: float | None, source: Source | None, tag: str) -> float | None:
-    """The given accuracy, else the one in a file's metadata, else None.
-
-    Args:
-        given: the user's value.
-        source: the file with the metadata.
-        tag: metadata item; the name of ``given`` in messages follows from it.
-
-    Raises:
-        OptionError: ``given`` is not above 0, or larger than any map.
-        MapError: the metadata item is not such a number.
-    """
-    text = None if source is None else source.dataset.tags().get(tag)
-    if given is not None:
-        if not 0.0 < given <= MAX_SIGMA_M:
-            argument = tag.removeprefix(OWN_TAGS).lower()
-            raise OptionError(f"{argument}: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {given}")
-        return float(given)
-    if source is None or text is None:
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value <= MAX_SIGMA_M:
-        raise MapError(
-            f"{source.path}: expected a number above 0 and at most {MAX_SIGMA_M:g} as {tag}, got {text!r}"
-        )
-    return value
 
 
 @contextmanager

@@ -25,7 +25,8 @@ from engine.orthomap import OrthoMap
 from engine.runtime import device as devices
 from engine.runtime import threads
 from engine.runtime import workers as processes
-from engine.runtime.scheduler import Costs, Scheduler, loops_compiled
+from engine.runtime.scheduler import Scheduler, loops_compiled
+from engine.runtime.step_costs import Costs
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, Window
 from engine.window import level_crop, level_for
 

@@ -40,7 +40,7 @@ def write_geotiff(
         pixel_to_crs: (2, 3) affine transform to units of the CRS.
         crs: EPSG code of the CRS, or the CRS.
         nodata: the value of pixels without data, or None.
-        tags: metadata items, such as :data:`engine.maps.rasters.GEOREFERENCE_TAG`.
+        tags: metadata items, such as :data:`engine.maps.accuracy.GEOREFERENCE_TAG`.
 
     Raises:
         ShapeError: an argument has the wrong shape.

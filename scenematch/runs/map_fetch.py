@@ -12,7 +12,7 @@ import numpy as np
 
 from engine.errors import OptionError
 from engine.geo import LocalFrame
-from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
+from engine.maps.accuracy import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.values import MAX_SIGMA_M
 from scenematch.fetch.grid import FINE_ENOUGH, Bounds, FetchSettings, Grid, Place, Wanted
 from scenematch.fetch.heights import GLO30, GLO30_SLOPE_SIGMA_DEG, Heights, files_for, read_part, write_heights

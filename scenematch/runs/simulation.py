@@ -14,7 +14,7 @@ from PIL import Image
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import wrap_heading_deg
-from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
+from engine.maps.accuracy import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.values import Frame, Truth
 from scenematch.files.flight import FRAME_COLUMNS, camera_info
 from scenematch.files.geotiff import write_geotiff

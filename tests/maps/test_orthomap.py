@@ -15,7 +15,7 @@ from rasterio.enums import ColorInterp, Resampling
 from rasterio.warp import calculate_default_transform, reproject
 
 from engine.errors import DtypeError, MapError, OptionError, ShapeError
-from engine.maps.rasters import GEOREFERENCE_TAG, SLOPE_TAG
+from engine.maps.accuracy import GEOREFERENCE_TAG, SLOPE_TAG
 from engine.orthomap import OrthoMap
 from engine.values import Window
 from scenematch.files.geotiff import write_geotiff

@@ -10,7 +10,7 @@ from affine import Affine
 from rasterio.shutil import copy
 
 from engine.errors import MapError
-from engine.maps.rasters import GEOREFERENCE_TAG
+from engine.maps.accuracy import GEOREFERENCE_TAG
 from engine.orthomap import OrthoMap
 from engine.values import Window
 from tests.support.rasters import write_raster

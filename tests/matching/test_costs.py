@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from engine.budget import Budget, Deadline
 from engine.runtime import scheduler, threads
 from engine.runtime.device import Device
-from engine.runtime.scheduler import MAX_WAIT_MS, RUNS, SEVERAL, Costs, OutOfTime, Scheduler
+from engine.runtime.scheduler import OutOfTime, Scheduler
+from engine.runtime.step_costs import MAX_WAIT_MS, RUNS, SEVERAL, Costs
 
 ANY_MS = st.floats(1e-3, 1e6)
 RUN = st.tuples(st.sampled_from("abc"), ANY_MS, st.floats(0.0, 1.0))  # step, time taken, and the share of it used

@@ -10,7 +10,8 @@ import pytest
 from engine import Budget, Fix, MatcherOptions, NccOptions, NoFix, Reason, SceneMatcher
 from engine.matching.ncc import Ncc, _Rungs
 from engine.matching.refinement import Refinement
-from engine.runtime.scheduler import Costs, OutOfTime, Scheduler
+from engine.runtime.scheduler import OutOfTime, Scheduler
+from engine.runtime.step_costs import Costs
 from tests.support.fixes import px_off
 
 NADIR = np.array([315.0, 296.0])

@@ -1,0 +1,49 @@
+"""How accurate a map is: the standard deviations that its user, or its file's metadata, states.
+
+If neither states one, the assumed errors of :class:`engine.AssumedErrors` hold.
+"""
+
+from __future__ import annotations
+
+import math
+
+from engine.errors import MapError, OptionError
+from engine.maps.raster_formats import OWN_TAGS
+from engine.maps.rasters import Source
+from engine.values import MAX_SIGMA_M
+
+GEOREFERENCE_TAG = "SCENEMATCH_GEOREFERENCE_SIGMA_M"
+"""Metadata item of a GeoTIFF: its georeferencing accuracy, one standard deviation in metres per axis."""
+SLOPE_TAG = "SCENEMATCH_SLOPE_SIGMA_DEG"
+"""Metadata item of a surface model: its slope accuracy, one standard deviation in degrees."""
+
+
+def stated_sigma(given: float | None, source: Source | None, tag: str) -> float | None:
+    """The given accuracy, else the one in a file's metadata, else None.
+
+    Args:
+        given: the user's value.
+        source: the file with the metadata.
+        tag: metadata item; the name of ``given`` in messages follows from it.
+
+    Raises:
+        OptionError: ``given`` is not above 0, or larger than any map.
+        MapError: the metadata item is not such a number.
+    """
+    text = None if source is None else source.dataset.tags().get(tag)
+    if given is not None:
+        if not 0.0 < given <= MAX_SIGMA_M:
+            argument = tag.removeprefix(OWN_TAGS).lower()
+            raise OptionError(f"{argument}: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {given}")
+        return float(given)
+    if source is None or text is None:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value <= MAX_SIGMA_M:
+        raise MapError(
+            f"{source.path}: expected a number above 0 and at most {MAX_SIGMA_M:g} as {tag}, got {text!r}"
+        )
+    return value
