@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.features import Features, chosen_backend, sift
-from engine.maps.landmark_cache import Kinds, NamedArrays, cache_key, load_arrays, save_arrays
+from engine.maps.landmark_cache import NamedArrays, cache_path, load_arrays, save_arrays
 from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import HALO_PX, TILE_PX, tiles_under, widened, within
@@ -43,7 +43,7 @@ MAX_LANDMARKS = 1 << 19
 If more were prepared before the flight, the limit rises to their number, up to 236 MB.
 """
 _SLOTS = 8192  # more than the detector finds in a tile
-_STORED: Kinds = {
+_STORED: dict[str, tuple[type[Any], tuple[int, ...]]] = {  # element type, and shape of one
     "xy_px": (np.float32, (2,)),  # in pixels of the level
     "scale_px": (np.float32, ()),
     "angle_deg": (np.float32, ()),
@@ -133,16 +133,16 @@ class LandmarkMap:
             self.tiles.get(*keys)
             return
         settings = (self._backend, DETECTOR_VERSION, TILE_PX, HALO_PX, CELL_PX, MAX_PER_CELL, upright)
-        name = cache_key(settings, (self._site.gray(whole, level), self._site.valid(whole, level)))
-        stored = load_arrays(name, _STORED)
+        path = cache_path(settings, (self._site.gray(whole, level), self._site.valid(whole, level)))
+        stored = load_arrays(path)
         if stored is None:
             tiles = self.tiles.get(*keys)
-            save_arrays(name, {field: np.concatenate([tile[field] for tile in tiles]) for field in _STORED})
+            save_arrays(path, {field: np.concatenate([tile[field] for tile in tiles]) for field in _STORED})
             return
         corner = np.rint(stored["xy_px"]).astype(np.int64) // TILE_PX * TILE_PX  # of each one's tile
         for key in keys:
             own = (corner == (key[2].x0, key[2].y0)).all(axis=1)
-            self.tiles[key] = self._with_points({field: values[own] for field, values in stored.items()}, level)
+            self.tiles[key] = self._with_points({field: stored[field][own] for field in _STORED}, level)
 
     def _keys(self, window: Window, level: int, upright: bool) -> list[_Key]:
         return [(level, upright, tile) for tile in tiles_under(window, TILE_PX, self._site.level_shape(level))]

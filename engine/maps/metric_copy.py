@@ -1,12 +1,12 @@
 """The metric copy of a map, used for matching: north-up in UTM, created once and cached on disk.
 
 A map in degrees, rotated or with oblong pixels is resampled; a large one without overviews gets them. A copy is
-one GeoTIFF, renamed when it is complete, with the hash of its content beside it: a damaged one is created again.
+one GeoTIFF, renamed when it is complete, with its size and time noted beside it: one that was changed or cut off
+is created again.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import math
 import os
@@ -24,7 +24,7 @@ from engine.errors import MapError
 from engine.maps.grids import Grid, Warp, apply_affine, by_corner, wgs84, window_about
 from engine.maps.rasters import BLOCK_PX, Gray, GrayReader, Source, is_large, map_errors, open_source
 from engine.maps.tiles import tiles_under
-from engine.runtime.cache_folder import cache_folder
+from engine.runtime.cache_folder import cache_folder, replaced
 from engine.values import Window
 
 GRID_VERSION = 2
@@ -36,7 +36,6 @@ MAX_SIDE_PX = 1_000_000
 ProgressCallback = Callable[[int, int], None]
 """Called while a copy is created, with the number of pixels done and in all."""
 _Block = tuple[Window, Gray]
-_CACHED_HASH_BYTES = 1 << 22  # the hashes of larger files are cached by size and time
 
 
 def _metric_grid(source: Grid) -> Grid:
@@ -136,7 +135,7 @@ def open_metric_copy(
 ) -> Source:
     """The source on its metric grid, from the cache if it has a copy.
 
-    The key is the SHA-256 of the content of the file and of the files beside it that GDAL uses, of the
+    The key is a hash of the names, sizes and times of the file and of those beside it that GDAL uses, of the
     georeference, and of the version of this format. If the cache cannot be written, the copy stays in the
     temporary directory while the map is open.
 
@@ -148,7 +147,7 @@ def open_metric_copy(
     """
     grid = source.grid if source.grid.is_metric else _metric_grid(source.grid)
     cache = cache_folder() if cache_dir is None else Path(cache_dir)
-    name = Path(_key(source, cache), "map.tif")
+    name = Path(_key(source), "map.tif")
     try:
         return _built(cache / name, source, reader, grid, on_progress)
     except OSError:
@@ -159,51 +158,39 @@ def open_metric_copy(
     return copy
 
 
-def _key(source: Source, cache: Path) -> str:
+def _key(source: Source) -> str:
     digest = hashlib.sha256(f"{GRID_VERSION} {source.grid.crs.to_wkt()}".encode())
     digest.update(source.grid.pixel_to_crs.tobytes())
     if source.dataset.driver == "VRT":
         digest.update(source.dataset.name.encode())  # its XML: the positions of the tiles
     for name in source.dataset.files:
-        digest.update(bytes.fromhex(_file_hash(Path(name), cache)))
+        digest.update(f"{Path(name).name} {_state(Path(name))}".encode())
     return digest.hexdigest()
 
 
-def _file_hash(path: Path, cache: Path) -> str:
-    """SHA-256 of a file's content; for a large file cached while its size and time stay the same."""
+def _state(path: Path) -> str:
+    """Size and time of a file, as text; those of a file that changed differ."""
     found = path.stat()
-    identity = hashlib.sha256(f"{path.absolute()} {found.st_size} {found.st_mtime_ns} {found.st_ino}".encode())
-    note = cache / "hashes" / identity.hexdigest()
-    if found.st_size > _CACHED_HASH_BYTES and note.is_file() and note.stat().st_size == 64:
-        return note.read_text(encoding="ascii")
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    if found.st_size > _CACHED_HASH_BYTES:
-        with contextlib.suppress(OSError):
-            note.parent.mkdir(parents=True, exist_ok=True)
-            note.write_text(digest, encoding="ascii")
-    return digest
+    return f"{found.st_size} {found.st_mtime_ns}"
 
 
 def _built(
     path: Path, source: Source, reader: GrayReader | None, grid: Grid, on_progress: ProgressCallback | None
 ) -> Source:
-    """The copy in a file, after it was written if it is missing or its content has another hash than noted.
+    """The copy in a file, after it was written if it is missing or is not as it was left.
 
     Raises:
         OSError: it cannot be written.
     """
-    noted, cache = path.with_suffix(".sha256"), path.parent.parent
-    known_hash = noted.read_text("ascii", "replace") if noted.is_file() else ""
-    if not path.is_file() or _file_hash(path, cache) != known_hash:
+    noted = path.with_suffix(".state")
+    left = noted.read_text("ascii", "replace") if noted.is_file() else ""
+    if not path.is_file() or _state(path) != left:
         report = on_progress or (lambda done_px, all_px: None)
         report(0, grid.area_px)  # before the file is read for the first time
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, suffix=".part") as folder:
-            written = Path(folder) / path.name
-            _write(written, grid, _copied(reader or GrayReader(source), source.grid, grid), report)
-            os.replace(written, path)
-        noted.write_text(_file_hash(path, cache), "ascii")
+        with replaced(path) as part:
+            _write(part, grid, _copied(reader or GrayReader(source), source.grid, grid), report)
+        noted.write_text(_state(path), "ascii")
     copy = open_source(path)
     return replace(copy, grid=replace(copy.grid, width_px=grid.width_px, height_px=grid.height_px))
 

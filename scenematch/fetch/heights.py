@@ -22,7 +22,7 @@ from engine.geo import Array
 from engine.maps.rasters import open_source, vertical_datum
 from scenematch.fetch.grid import Bounds, reason_of
 from scenematch.fetch.urls import PLACEHOLDER, check_url, shown, user_agent
-from scenematch.files.geotiff import replaced, write_geotiff
+from scenematch.files.geotiff import write_geotiff
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -237,5 +237,4 @@ def write_heights(heights: Heights, out: Path, tags: Mapping[str, object]) -> No
         MapError: it cannot be written.
     """
     known_m = np.nan_to_num(heights.heights_m, nan=NODATA)
-    with replaced(out) as part:
-        write_geotiff(part, known_m, heights.pixel_to_crs, heights.crs, NODATA, tags=tags)
+    write_geotiff(out, known_m, heights.pixel_to_crs, heights.crs, NODATA, tags=tags)

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import MapError
+from engine.runtime.cache_folder import replaced
 from scenematch.fetch.grid import Grid, reason_of
 from scenematch.fetch.urls import shown
-from scenematch.files.geotiff import replaced, tiled_profile
+from scenematch.files.geotiff import tiled_profile
 
 ATTEMPTS = 5
 """Attempts per picture before the fetch fails."""

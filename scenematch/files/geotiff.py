@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from engine.errors import DtypeError, MapError, OptionError, ShapeError
+from engine.runtime.cache_folder import replaced
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -35,7 +34,7 @@ def write_geotiff(
         corner of the top-left pixel; the offset of half a pixel is applied here.
 
     Args:
-        path: the file, overwritten if it exists.
+        path: the file, replaced in one step if it exists.
         array: (H, W) or (H, W, 3) of uint8, uint16, int16, float32 or float64.
         pixel_to_crs: (2, 3) affine transform to units of the CRS.
         crs: EPSG code of the CRS, or the CRS.
@@ -65,23 +64,12 @@ def write_geotiff(
     bands = array if array.ndim == 3 else array[:, :, None]
     try:
         profile = tiled_profile(bands.shape, bands.dtype.name, corner, crs)
-        with rasterio.open(path, "w", nodata=nodata, **profile) as file:
+        with replaced(Path(path)) as part, rasterio.open(part, "w", nodata=nodata, **profile) as file:
             file.write(np.moveaxis(bands, 2, 0))
             if tags:
                 file.update_tags(**{name: str(value) for name, value in tags.items()})
     except (RasterioError, OSError, ValueError) as error:
         raise MapError(f"{path}: cannot be written: {str(error).splitlines()[0]}") from None
-
-
-@contextmanager
-def replaced(out: Path) -> Iterator[Path]:
-    """A file beside ``out`` to write: it takes the place of ``out`` once it is complete, and else is removed."""
-    part = out.with_name(f"{out.name}.part")
-    try:
-        yield part
-        os.replace(part, out)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def tiled_profile(

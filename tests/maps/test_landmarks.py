@@ -167,30 +167,17 @@ OTHER_BYTES = {
     "something else": lambda _: b"PK\3\4 but no archive",
     "empty": lambda _: b"",
 }
-OTHER_ARRAYS = {
-    "of another map": ("key", lambda _: np.array("0" * 64)),
-    "pickled": ("rank", lambda rank: np.array([{"a": 1}] * len(rank), object)),
-    "not finite": ("scale_px", lambda scales: np.where(np.arange(len(scales)) == 3, np.nan, scales)),
-    "of two lengths": ("angle_deg", lambda angles: angles[:-1]),
-    "of another type": ("xy_px", lambda xy: xy.astype(np.float64)),
-}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", [*OTHER_BYTES, *OTHER_ARRAYS])
-def test_a_file_that_is_not_to_be_believed_is_made_anew(stored, how):
+@pytest.mark.parametrize("how", OTHER_BYTES)
+def test_a_damaged_file_is_made_anew(stored, how):
     first = prepared(stored[0])
     for path in stored[1].iterdir():
-        if how in OTHER_BYTES:
-            path.write_bytes(OTHER_BYTES[how](path.read_bytes()))
-        else:
-            name, other = OTHER_ARRAYS[how]
-            with np.load(path) as file:
-                arrays = dict(file)
-            np.savez(path, **arrays | {name: other(arrays[name])})
+        path.write_bytes(OTHER_BYTES[how](path.read_bytes()))
     np.testing.assert_array_equal(prepared(stored[0]), first)
     for path in stored[1].iterdir():
-        assert landmark_cache.load_arrays(path.stem, landmarks._STORED) is not None
+        assert landmark_cache.load_arrays(path) is not None
 
 
 def test_another_map_detector_or_backend_has_another_file(stored, monkeypatch):

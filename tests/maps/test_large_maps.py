@@ -183,7 +183,7 @@ def picture(request, tmp_path):
 
 def copy_in(cache):
     """The folder of the only copy in a cache."""
-    (folder,) = (path for path in cache.iterdir() if path.name != "hashes")
+    (folder,) = cache.iterdir()
     return folder
 
 
@@ -224,7 +224,7 @@ def test_a_large_map_without_overviews_is_copied_and_is_the_same(picture, tmp_pa
         assert both.mean() > 0.5
         assert np.abs(apart).mean() < 1.0
     folder = copy_in(tmp_path / "cache")
-    assert sorted(path.name for path in folder.iterdir()) == ["map.sha256", "map.tif"]
+    assert sorted(path.name for path in folder.iterdir()) == ["map.state", "map.tif"]
     with rasterio.open(folder / "map.tif") as dataset:
         assert dataset.overviews(1) == [2, 4, 8, 16, 32]
 
@@ -295,13 +295,13 @@ def test_a_terminal_shows_the_copying_and_a_pipe_does_not(picture, tmp_path, tin
     assert stream.getvalue() == shown  # the copy is there
 
 
-@pytest.mark.parametrize("damage", ["bytes", "cut", "gone", "hash cut off", "no hash"])
-def test_a_copy_that_is_not_what_its_hash_says_is_made_anew(picture, tmp_path, tiny_limits, made, damage):
+@pytest.mark.parametrize("damage", ["bytes", "cut", "gone", "note cut off", "no note"])
+def test_a_copy_that_is_not_as_it_was_left_is_made_anew(picture, tmp_path, tiny_limits, made, damage):
     cache = tmp_path / "cache"
     site = OrthoMap.open(picture, cache_dir=cache)
     pixels, valid = site.gray(whole(site)), site.valid(whole(site))
-    copy, noted = copy_in(cache) / "map.tif", copy_in(cache) / "map.sha256"
-    content, digest = copy.read_bytes(), noted.read_text()
+    copy, noted = copy_in(cache) / "map.tif", copy_in(cache) / "map.state"
+    content, state = copy.read_bytes(), noted.read_text()
     if damage == "bytes":
         copy.write_bytes(content[:-40] + bytes(40))
     elif damage == "cut":
@@ -309,7 +309,7 @@ def test_a_copy_that_is_not_what_its_hash_says_is_made_anew(picture, tmp_path, t
     elif damage == "gone":
         copy.unlink()
     else:
-        noted.write_text("" if damage == "no hash" else digest[:20])
+        noted.write_text("" if damage == "no note" else state[:20])
     made.clear()
     again = OrthoMap.open(picture, cache_dir=cache)
     assert made
