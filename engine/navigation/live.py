@@ -17,7 +17,7 @@ from functools import partial
 from engine.budget import Budget
 from engine.errors import EngineError, OptionError, StateError
 from engine.navigation.navigator import Navigator
-from engine.runtime.realtime import LoadWatch, Realtime, check_realtime, start_thread
+from engine.runtime.realtime import Realtime, check_realtime, start_thread
 from engine.values import Fix, Frame, NoFix, Prior, Reason, Result, check_positive
 
 _log = logging.getLogger("scenematch")
@@ -181,7 +181,6 @@ class Live:
 
     def _work(self, navigator: Navigator | None, number: int) -> None:
         """The worker: takes the newest frame, matches it, and delivers the result if it is not too late."""
-        load = LoadWatch(self._options.realtime)
         while True:
             navigator = navigator or self._create_navigator()
             with self._changed:
@@ -190,9 +189,7 @@ class Live:
                     return
                 job, self._working, self._waiting = self._waiting, self._waiting, None
                 self._changed.notify_all()
-            begin_s = time.monotonic()
             result, alive = self._match(navigator, job)
-            load.add(begin_s, time.monotonic())
             with self._changed:
                 if self._number != number:
                     return  # replaced meanwhile

@@ -24,8 +24,6 @@ _log = logging.getLogger("scenematch")
 
 _MLOCK = 1 | 2 | 4  # of mlockall(2): current and future pages, but only those that are used
 _CAP_IPC_LOCK = 14  # of capabilities(7)
-_KERNEL = Path("/proc/sys/kernel")
-_LOAD_OVER_S = 2.0  # two periods of the kernel's limit
 _FIFO_CURE = "CAP_SYS_NICE, `ulimit -r 20`, or in a unit of systemd LimitRTPRIO=20"
 _NICE_CURE = "CAP_SYS_NICE, `ulimit -e 40`, or in a unit of systemd LimitNICE=40"
 _MEMORY_CURE = "CAP_IPC_LOCK, `ulimit -l unlimited`, or in a unit of systemd LimitMEMLOCK=infinity"
@@ -131,48 +129,6 @@ def start_thread(
     thread = threading.Thread(target=run, name=name, daemon=True)
     thread.start()
     return thread
-
-
-class LoadWatch:
-    """Warns once that a thread computes so much that it reaches the kernel's limit.
-
-    Args:
-        realtime: of the thread; None and a nice value have no limit.
-    """
-
-    def __init__(self, realtime: Realtime | None) -> None:
-        self._watches = realtime is not None and realtime.nice is None and limited_share() < 1.0
-        self._begin_s: float | None = None
-        self._busy_s = 0.0
-
-    def add(self, begin_s: float, end_s: float) -> None:
-        """Record that the thread was busy between two times in seconds."""
-        if not self._watches:
-            return
-        if self._begin_s is None:
-            self._begin_s = begin_s
-        self._busy_s += end_s - begin_s
-        over_s = end_s - self._begin_s
-        if over_s < _LOAD_OVER_S:
-            return
-        if self._busy_s > limited_share() * over_s:
-            self._watches = False
-            _log.warning(
-                "real time: frames are matched for %.0f %% of the time; the kernel stops real-time threads that "
-                "run for more than %.0f %% (kernel.sched_rt_runtime_us): take fewer frames",
-                100.0 * self._busy_s / over_s,
-                100.0 * limited_share(),
-            )
-        self._begin_s, self._busy_s = None, 0.0
-
-
-def limited_share() -> float:
-    """The largest share of time that the kernel gives real-time threads; 1 if it does not limit them."""
-    try:
-        runtime, period = (int((_KERNEL / f"sched_rt_{name}_us").read_text()) for name in ("runtime", "period"))
-    except (OSError, ValueError):
-        return 1.0
-    return 1.0 if runtime < 0 else runtime / period
 
 
 # ------------------------------------------------------------------------------------------------- system calls

@@ -1,17 +1,15 @@
 """Real time: what the kernel says of a thread that asked for it, and what a refusal says."""
 
 import json
-import logging
 import os
 import sys
 import threading
-from pathlib import Path
 
 import pytest
 
 from engine import BackendError, Live, LiveOptions, OptionError
 from engine.runtime import realtime as module
-from engine.runtime.realtime import LoadWatch, Realtime, check_realtime, limited_share, set_realtime, start_thread
+from engine.runtime.realtime import Realtime, check_realtime, set_realtime, start_thread
 from scenematch.runs.mavlink_bridge import BridgeSettings
 from tests.support.interpreters import done_by
 
@@ -124,18 +122,3 @@ def test_priorities_out_of_range_are_refused(priority):
 
 def test_a_bridge_is_scheduled_as_usual_unless_told():
     assert BridgeSettings(nice=None, cores=()).scheduling() is None
-
-
-@pytest.mark.parametrize(("busy", "said"), [(0.5, 0), (0.99, 1)])
-def test_a_thread_that_computes_all_the_time_is_warned_of_once(tmp_path, monkeypatch, caplog, busy, said):
-    for name, value in (("runtime", "950000"), ("period", "1000000")):
-        (tmp_path / f"sched_rt_{name}_us").write_text(value)
-    monkeypatch.setattr(module, "_KERNEL", Path(tmp_path))
-    assert limited_share() == 0.95
-    watch = LoadWatch(PLAIN)
-    with caplog.at_level(logging.WARNING, "scenematch"):
-        for second in range(20):
-            watch.add(float(second), second + busy)
-    assert len(caplog.records) == said
-    (tmp_path / "sched_rt_runtime_us").write_text("-1")
-    assert limited_share() == 1.0
