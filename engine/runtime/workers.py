@@ -56,16 +56,13 @@ def in_order(work: Callable[[int], T], count: int, workers: int) -> Iterator[T]:
     Raises:
         BackendError: a worker ended.
     """
-    start_s, done = time.perf_counter(), 0
-    while done < count:
-        spent_s = time.perf_counter() - start_s
-        left_s = spent_s / done * (count - done) if done else 0.0
-        if workers > 1 and left_s > _WORTH_S:
-            break
-        yield work(done)
-        done += 1
-    if done < count:
-        yield from _by_workers(work, range(done, count), workers)
+    start_s = time.perf_counter()
+    for number in range(count):
+        left_s = (time.perf_counter() - start_s) / max(number, 1) * (count - number)
+        if workers > 1 and number and left_s > _WORTH_S:
+            yield from _by_workers(work, range(number, count), workers)
+            return
+        yield work(number)
 
 
 def start_helper(work: Callable[[], None]) -> BaseProcess | None:
