@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from engine.learned import KeypointMatcher, Keypoints
 from engine.maps.landmarks import MAX_LANDMARKS, as_picture
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import HALO_PX, tiles_under, widened
-from engine.runtime.device import CPU, as_tensor
+from engine.runtime.device import CPU, as_tensor, on_host
 from engine.runtime.tensors import torch
 from engine.values import Window
 
@@ -83,12 +84,10 @@ class KeypointMap:
 
     def _on_data(self, found: Keypoints, wide: Window, level: int) -> torch.Tensor:
         """Which keypoints (N,) of a window lie on the map's data and not at its edge."""
-        valid = torch.from_numpy(self._site.valid(wide, level))[None, None].float()
-        side = 2 * _NODATA_PX + 1
-        holes = torch.nn.functional.max_pool2d(1.0 - valid, side, stride=1, padding=_NODATA_PX)[0, 0]
-        x, y = found.xy_px.round().long().cpu().T
-        last_y, last_x = (n - 1 for n in holes.shape)
-        return (holes[y.clamp(0, last_y), x.clamp(0, last_x)] == 0).to(found.xy_px.device)
+        near = np.ones((2 * _NODATA_PX + 1, 2 * _NODATA_PX + 1), np.uint8)
+        solid = cv2.erode(self._site.valid(wide, level).astype(np.uint8), near) > 0
+        x, y = np.clip(on_host(found.xy_px.round().long()), 0, [wide.width_px - 1, wide.height_px - 1]).T
+        return torch.from_numpy(solid[y, x]).to(found.xy_px.device)
 
 
 def _fields(points: Keypoints) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -54,17 +54,11 @@ class SampleMap:
         step, parts = math.ceil(window.area_px / BLOCK_PX**2 / max_samples), []
         cells = self._cells_under(window, level)
         found = self.cells.get(*((cell, level) for cell in cells))
-        for cell, (samples, (rows, columns)) in zip(cells, found, strict=True):
+        for cell, (samples, blocks) in zip(cells, found, strict=True):
             x, y = window.x0 - cell.x0, window.y0 - cell.y0
-            last = (
-                min(rows, -(-(y + window.height_px) // BLOCK_PX)),
-                min(columns, -(-(x + window.width_px) // BLOCK_PX)),
-            )  # blocks; the remainder beyond a cell's last block has none
-            first = (min(max(0, y // BLOCK_PX), last[0]), min(max(0, x // BLOCK_PX), last[1]))
-            width = last[1] - first[1]
-            n = np.arange(0, (last[0] - first[0]) * width, step)
-            row, column = np.divmod(n, max(width, 1))
-            at = (first[0] + row) * columns + first[1] + column
+            rows = slice(max(0, y // BLOCK_PX), -(-(y + window.height_px) // BLOCK_PX))
+            columns = slice(max(0, x // BLOCK_PX), -(-(x + window.width_px) // BLOCK_PX))
+            at = blocks[rows, columns].ravel()[::step]
             fields = (samples.points_m, samples.values, samples.gradients, samples.weights)
             parts.append([field.take(at, axis=0) for field in fields])
         if len(parts) == 1:
@@ -79,8 +73,8 @@ class SampleMap:
         # The remainder beyond a level's last whole cell may be narrower than a block: it gives no sample.
         return [cell for cell in cells if min(cell.width_px, cell.height_px) >= BLOCK_PX]
 
-    def _sampled(self, cell: Window, level: int) -> tuple[Samples, tuple[int, int]]:
-        """Samples of a cell, row by row, and the number of their rows and columns."""
+    def _sampled(self, cell: Window, level: int) -> tuple[Samples, NDArray[np.intp]]:
+        """Samples of a cell, and their indices by row and column of their block; a remainder beyond has none."""
         picture, mask = enhanced_part(self._site, cell, level)
         across, down = (cv2.Sobel(picture, cv2.CV_32F, i, 1 - i, ksize=1, scale=0.5) for i in (1, 0))
         shape = (picture.shape[0] // BLOCK_PX, picture.shape[1] // BLOCK_PX)
@@ -93,7 +87,8 @@ class SampleMap:
         per_px = np.stack([across[rows, columns], down[rows, columns]], axis=-1).astype(np.float64)
         metres_per_px = self._site.enu_jacobian(xy_px[len(xy_px) // 2]) * 2.0**level  # nearly constant over a cell
         gradients = per_px @ np.linalg.inv(metres_per_px)
-        return Samples(points, picture[rows, columns].astype(np.float64), gradients, weights), shape
+        blocks = np.arange(len(rows)).reshape(shape)
+        return Samples(points, picture[rows, columns].astype(np.float64), gradients, weights), blocks
 
 
 def _steepest(size: NDArray[np.float32], shape: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

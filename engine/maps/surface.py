@@ -23,8 +23,6 @@ HEIGHT_RANGE_M = (-1000.0, 20000.0)
 """Surface heights outside are nodata, whether tagged or not (-9999, -32768, 3e38)."""
 GROUND_PERCENT = 20.0
 """Percentile of the surface used as the ground level."""
-MAX_TILES = 512
-"""Number of tiles that are cached, of 258 KiB each."""
 _LATTICE = square_lattice(np.linspace(-1.0, 1.0, 15))
 """Sample positions of a plane fit, relative to half the side of the square."""
 _ROUNDS = 8
@@ -41,7 +39,7 @@ class HeightTiles:
 
     def __init__(self, source: Source, part: Window) -> None:
         self._source, self._part, self._lock = source, part, threading.Lock()
-        self._tile = lru_cache(MAX_TILES)(self._read)
+        self._tile = lru_cache(COARSE_LIMIT_PX // TILE_PX**2)(self._read)
         self.shape = (part.height_px, part.width_px)
 
     def sample(self, at: Array) -> Array:

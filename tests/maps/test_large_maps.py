@@ -139,7 +139,6 @@ def test_a_surface_read_by_tiles_is_the_surface_in_memory(tmp_path, gray, sim_to
     kept = OrthoMap.open(tmp_path / "map.tif", tmp_path / "dsm.tif")
     monkeypatch.setattr("engine.maps.surface.SURFACE_LIMIT_PX", 10_000)
     monkeypatch.setattr("engine.maps.surface.TILE_PX", 100)
-    monkeypatch.setattr("engine.maps.surface.MAX_TILES", 3)
     tiled = OrthoMap.open(tmp_path / "map.tif", tmp_path / "dsm.tif")
     xy = np.random.default_rng(4).uniform(-5.0, [columns + 5.0, rows + 5.0], (60, 40, 2))
     heights = kept.surface_at(xy)
