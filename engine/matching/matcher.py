@@ -25,7 +25,7 @@ from engine.orthomap import OrthoMap
 from engine.runtime import device as devices
 from engine.runtime import threads
 from engine.runtime import workers as processes
-from engine.runtime.scheduler import Scheduler, loops_compiled
+from engine.runtime.scheduler import Scheduler
 from engine.runtime.step_costs import Costs
 from engine.values import MAX_SIGMA_M, Fix, Frame, NoFix, Prior, Reason, Window
 from engine.window import level_crop, level_for
@@ -86,6 +86,7 @@ class SceneMatcher:
         threads.default_threads()
         self._method: Method = build(site, self.device, self.options)
         self._costs = Costs()
+        self._is_warm = False
         # The camera of undistorted pictures; the mount stays.
         self._pinhole = replace(camera, distortion_model="plumb_bob", distortion=np.zeros(5))
 
@@ -118,6 +119,7 @@ class SceneMatcher:
         if self.site.is_searchable and not brief:
             for _ in range(2):  # a step that ran once has no cost yet and would always start
                 self._method.warmup_search(self._query(frame, None, Deadline(Budget())))
+        self._is_warm = True
         _give_back_memory()
         self.locate(*self._synthetic_frame(_WARMUP_SHARES[0]))  # allocates again what a frame needs
 
@@ -141,7 +143,7 @@ class SceneMatcher:
     @property
     def cache_counters(self) -> dict[str, int]:
         """How many entries of each cache were created so far; after :meth:`warmup` none rises on a small map."""
-        return self._method.cache_counters | {"compiled loops": loops_compiled()}
+        return self._method.cache_counters
 
     def locate(self, frame: Frame, prior: Prior | None = None, budget: Budget | None = None) -> Fix | NoFix:
         """The camera's position when the frame was taken.
@@ -155,9 +157,8 @@ class SceneMatcher:
         Raises:
             CalibrationError: the frame is not of the camera's resolution.
         """
-        compiled = loops_compiled()
         result = self._located(frame, prior, budget or Budget())
-        if isinstance(result, NoFix) and result.reason is Reason.LATE and loops_compiled() != compiled:
+        if isinstance(result, NoFix) and result.reason is Reason.LATE and not self._is_warm:
             return replace(result, detail=f"{result.detail}; compiling: call warmup() before take-off")
         return result
 

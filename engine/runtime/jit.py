@@ -8,7 +8,6 @@ from importlib import import_module
 from typing import Any
 
 from numba import njit
-from numba.core import event
 from numba.core.sigutils import normalize_signature
 
 from engine.runtime import workers
@@ -73,24 +72,3 @@ def prepare(modules: Iterable[str], report: Callable[[int, int], None] = lambda 
 def _compile(loops: list[tuple[Any, Any]]) -> None:
     for loop, signature in loops:
         loop.compile(signature)
-
-
-class _Watch(event.Listener):
-    """Counts compiled and loaded loops."""
-
-    count = 0
-
-    def on_start(self, event: Any) -> None:
-        self.count += 1
-
-    def on_end(self, event: Any) -> None:
-        pass
-
-
-_watch = _Watch()
-event.register("numba:compiler_lock", _watch)  # type: ignore[no-untyped-call]
-
-
-def count() -> int:
-    """How often a loop was compiled, or loaded from the cache, so far."""
-    return _watch.count

@@ -6,7 +6,6 @@ recent run would be too long.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,13 +18,7 @@ from engine.runtime.step_costs import Costs
 ANSWER = "answer"
 """What follows the last step, as a step."""
 
-Stopwatch = Callable[[], tuple[float, float] | None]
-
-
-def loops_compiled() -> int:
-    """How often numba compiled a loop, or loaded one from its cache, so far; numba need not be imported."""
-    jit = sys.modules.get("engine.runtime.jit")
-    return 0 if jit is None else jit.count()
+Stopwatch = Callable[[], tuple[float, float]]
 
 
 class OutOfTime(Exception):  # noqa: N818 - no error, and never seen by a caller of the engine
@@ -85,16 +78,15 @@ class Scheduler:
             raise
         else:
             for key, since in [(step, spent), *self._begun]:
-                if (used_and_took := since()) is not None:
-                    self.costs.learn(key, work, *used_and_took)
+                self.costs.learn(key, work, *since())
         finally:
             self._step, self._begun = outer
             self._since_step = self._stopwatch()
 
     def note_answer(self) -> None:
         """Learn how long the answer takes after the last step."""
-        if self._since_step is not None and (spent := self._since_step()) is not None:
-            self.costs.learn(ANSWER, 1.0, *spent)
+        if self._since_step is not None:
+            self.costs.learn(ANSWER, 1.0, *self._since_step())
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -114,17 +106,16 @@ class Scheduler:
         finally:
             synchronise(self._device)
             self.stages_ms[name] = self.stages_ms.get(name, 0.0) + self.deadline.elapsed_ms - start_ms
-        if (used_and_took := spent()) is not None:
-            self.costs.note_stage(*used_and_took)
+        self.costs.note_stage(*spent())
 
     def _stopwatch(self) -> Stopwatch:
-        """A function that gives the milliseconds used and taken since; None if loops were compiled."""
-        start_ms, start_ns, compiled = self.deadline.elapsed_ms, time.thread_time_ns(), loops_compiled()
+        """A function that gives the milliseconds used and taken since."""
+        start_ms, start_ns = self.deadline.elapsed_ms, time.thread_time_ns()
 
-        def spent() -> tuple[float, float] | None:
+        def spent() -> tuple[float, float]:
             took_ms, used_ms = self.deadline.elapsed_ms - start_ms, (time.thread_time_ns() - start_ns) * 1e-6
             if self._device.type != "cpu" or threads.count() > 1:  # other threads worked while this one waited
                 used_ms = took_ms
-            return (used_ms, took_ms) if loops_compiled() == compiled else None
+            return used_ms, took_ms
 
         return spent

@@ -217,13 +217,3 @@ def test_only_if_one_thread_works_its_waiting_is_told_apart(count, used_ms, monk
     with one.costed("step", 5.0):
         pass
     assert learned == [("step", 5.0, pytest.approx(used_ms), pytest.approx(9.0))]
-
-
-def test_what_compiled_is_nobodys_cost(monkeypatch):
-    compiled = iter([0, 1, 1, 1, 1, 1])
-    monkeypatch.setattr(scheduler, "loops_compiled", lambda: next(compiled))
-    costs = Costs()
-    for _ in range(2):
-        with Scheduler(Deadline(Budget()), Device("cpu"), costs).costed("step", 5.0):
-            pass
-    assert len(costs._runs["step"]) == 1
