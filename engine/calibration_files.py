@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,14 +55,8 @@ class _Loader(yaml.SafeLoader):
     """YAML with OpenCV's matrices, which are mappings with a tag."""
 
 
-def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
-    if not isinstance(node, yaml.MappingNode):
-        raise yaml.constructor.ConstructorError(None, None, "expected rows, cols and data of a matrix")
-    return loader.construct_mapping(node, deep=True)
-
-
 for _tag in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _matrix)
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", partial(_Loader.construct_mapping, deep=True))
 
 
 def _plain_yaml(text: str) -> str:

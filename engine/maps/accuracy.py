@@ -6,6 +6,7 @@ If neither states one, the assumed errors of :class:`engine.AssumedErrors` hold.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from engine.errors import MapError, OptionError
 from engine.maps.raster_formats import OWN_TAGS
@@ -30,20 +31,16 @@ def stated_sigma(given: float | None, source: Source | None, tag: str) -> float 
         OptionError: ``given`` is not above 0, or larger than any map.
         MapError: the metadata item is not such a number.
     """
-    text = None if source is None else source.dataset.tags().get(tag)
-    if given is not None:
-        if not 0.0 < given <= MAX_SIGMA_M:
-            argument = tag.removeprefix(OWN_TAGS).lower()
-            raise OptionError(f"{argument}: expected a number above 0 and at most {MAX_SIGMA_M:g}, got {given}")
-        return float(given)
-    if source is None or text is None:
+    stated: Any = source.dataset.tags().get(tag) if given is None and source is not None else given
+    if stated is None:
         return None
     try:
-        value = float(text)
+        value = float(stated)
     except ValueError:
         value = math.nan
-    if not 0.0 < value <= MAX_SIGMA_M:
-        raise MapError(
-            f"{source.path}: expected a number above 0 and at most {MAX_SIGMA_M:g} as {tag}, got {text!r}"
-        )
-    return value
+    if 0.0 < value <= MAX_SIGMA_M:
+        return value
+    expected = f"expected a number above 0 and at most {MAX_SIGMA_M:g}"
+    if given is None and source is not None:
+        raise MapError(f"{source.path}: {expected} as {tag}, got {stated!r}")
+    raise OptionError(f"{tag.removeprefix(OWN_TAGS).lower()}: {expected}, got {given}")

@@ -47,13 +47,10 @@ class Pyramid:
     """
 
     def __init__(self, width_px: int, height_px: int, pixels: GrayReader | tuple[Gray, Mask]) -> None:
-        self._size, self._cached = (height_px, width_px), dict[int, tuple[Gray, Mask]]()
+        self._size = (height_px, width_px)
         self.levels = max(1, int(math.log2(max(1.0, min(self._size) / MIN_LEVEL_PX))) + 1)
-        self._file: GrayReader | None = None
-        if isinstance(pixels, tuple):
-            self._cached[0] = pixels
-        else:
-            self._file = pixels
+        self._file = None if isinstance(pixels, tuple) else pixels
+        self._cached = {0: pixels} if isinstance(pixels, tuple) else {}
         self.is_large = self._file is not None and is_large(width_px * height_px)
         """Whether it is too large for memory."""
         areas_px = [math.prod(self.shape(level)) for level in range(self.levels - 1)]

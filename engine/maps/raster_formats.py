@@ -28,7 +28,6 @@ OWN_TAGS = "SCENEMATCH_"
 """Prefix of this project's metadata items; a folder of tiles has the items that all its tiles share."""
 OFF_GRID_PX = 0.05
 """Largest offset of a tile from whole pixels of the first tile's grid; a larger one would need resampling."""
-_VRT_HEAD = b"<VRTDataset"
 
 
 class NoRasterError(MapError):
@@ -90,14 +89,9 @@ def _open_file(file: Path, drivers: list[str], argument: str) -> Any:
     except RasterioIOError as error:
         if "not recognized" not in str(error):
             raise
-    with file.open("rb") as stream:
-        if _VRT_HEAD in stream.read(1024):
-            raise NoRasterError(
-                f"{argument}: expected no VRT, got {file}; "
-                "give its folder of tiles, or a GeoTIFF by gdal_translate"
-            )
     raise NoRasterError(
-        f"{argument}: expected a raster file ({', '.join(drivers)}), got {file}, which is none of these"
+        f"{argument}: expected a raster file ({', '.join(drivers)}), got {file}, which is none of these; "
+        "of a VRT give the folder of its tiles, or a GeoTIFF by gdal_translate"
     )
 
 

@@ -59,17 +59,11 @@ class RecentlyUsed(Generic[V]):
                     self.created += 1
             self[key] = entry
             found.append(entry)
-        self._evict(keep=len(keys))
-        return found
-
-    def _evict(self, keep: int) -> None:
-        """Evict the least recently used entries until their sizes fit the limit, but not the last ``keep``."""
         with self._lock:
-            used = sum(self._size(*entry) for entry in self._entries.items())
-            for key in list(self._entries)[: len(self._entries) - keep]:
-                if used <= self.limit:
-                    break
-                freed = self._size(key, self._entries[key])
-                if freed:
-                    used -= freed
+            sizes = {key: self._size(key, entry) for key, entry in self._entries.items()}
+            used = sum(sizes.values())
+            for key, size in list(sizes.items())[: len(sizes) - len(keys)]:  # not what was just asked for
+                if used > self.limit and size:
+                    used -= size
                     del self._entries[key]
+        return found

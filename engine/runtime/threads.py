@@ -83,26 +83,24 @@ def in_parallel(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
     helpers = min(count(), len(pieces)) - 1
     if helpers < 1 or threading.current_thread().name.startswith(_WORKER):
         return [work(piece) for piece in pieces]
-    done: dict[int, R] = {}
     left = iter(range(len(pieces)))
 
-    def take() -> None:
+    def take() -> dict[int, R]:
         try:
-            for number in left:
-                done[number] = work(pieces[number])
+            return {number: work(pieces[number]) for number in left}
         except BaseException:
             for _ in left:  # start nothing more
                 pass
             raise
 
     waiting = [_workers(count()).submit(take) for _ in range(helpers)]
-    try:
-        take()  # the calling thread works, too, and waits for no worker that has not woken before all is taken
+    try:  # the calling thread works, too, and waits for no worker that has not woken before all is taken
+        done = take()
     finally:  # no thread still writes when the caller continues
         begun = [worker for worker in waiting if not worker.cancel()]
         wait(begun)
     for worker in begun:
-        worker.result()
+        done |= worker.result()
     return [done[number] for number in range(len(pieces))]
 
 

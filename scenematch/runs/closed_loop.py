@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from engine.camera import Camera
+from engine.camera import NADIR_PITCH_DEG, Camera
 from engine.errors import OptionError
 from engine.matching import CLASSICAL
 from engine.matching.matcher import SceneMatcher
@@ -27,7 +27,7 @@ from scenematch.runs.results import LOOP, NOTES, SUMMARY, TRACK
 from scenematch.runs.simulation import FOLDER_OWNED, LOOP_OWNED, WorldSettings, picture_name, write_folder
 from scenematch.simulator import FlightStyle, Town, picture_at
 from scenematch.simulator.faults import FAULT_KINDS, Fault
-from scenematch.simulator.flight import NADIR_PITCH_DEG, reach_m, truth_at
+from scenematch.simulator.flight import reach_m, truth_at
 from scenematch.simulator.light import Image
 from scenematch.simulator.loop import FRAME_RATE_HZ, ClosedLoop, LoopAnswer
 from scenematch.simulator.pilot import plan_rounds

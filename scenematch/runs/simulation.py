@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from engine.camera import Camera
+from engine.camera import NADIR_PITCH_DEG, Camera
 from engine.errors import OptionError
 from engine.geo import wrap_heading_deg
 from engine.maps.accuracy import GEOREFERENCE_TAG, SLOPE_TAG
@@ -25,7 +25,7 @@ from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder
 from scenematch.runs.results import OWNED
 from scenematch.simulator import CONDITIONS, FlightPlan, FlightStyle, Town, build_town, plan_flight, world_from_map
-from scenematch.simulator.flight import NADIR_PITCH_DEG, paper_camera, reach_m
+from scenematch.simulator.flight import paper_camera, reach_m
 from scenematch.simulator.town import EXACT, MAX_RELIEF_M
 
 FOLDER_OWNED = ("frames/[0-9]*.jpg", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif")

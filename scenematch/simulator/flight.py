@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.camera import Camera
+from engine.camera import NADIR_PITCH_DEG, Camera
 from engine.errors import OptionError
 from engine.geo import Array, LocalFrame, wrap_difference_deg
 from engine.values import Attitude, Frame, Truth
@@ -31,8 +31,6 @@ from scenematch.simulator.vehicle import (
     simulate_telemetry,
 )
 
-NADIR_PITCH_DEG = -90.0
-"""Pitch of a camera that looks straight down."""
 EDGE_M = 20.0
 """Distance of footprints from the map's edge while the camera looks straight down."""
 DRONE_SENSOR = Sensor(

@@ -156,7 +156,9 @@ def test_tiles_that_do_not_fit_together_are_refused(tmp_path, picture, changed, 
 def test_a_vrt_is_refused_with_what_to_give_instead(tmp_path):
     path = tmp_path / "map.vrt"
     path.write_text('<VRTDataset rasterXSize="1" rasterYSize="1"/>')
-    words = r"expected no VRT, got .*map\.vrt; give its folder of tiles, or a GeoTIFF by gdal_translate"
+    words = (
+        r"got .*map\.vrt, which is none of these; of a VRT give the folder of its tiles, or a GeoTIFF by gdal_tr"
+    )
     assert re.search(words, refusal(OrthoMap.open, path, error=MapError))
 
 
