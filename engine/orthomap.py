@@ -209,11 +209,6 @@ class OrthoMap(Georeference):
         middle = self.grid.centre_px
         return middle if bool(self._pyramid.valid_at(middle)) else self._pyramid.innermost_px()
 
-    @property
-    def fully_valid(self) -> bool:
-        """Whether no pixel is nodata; true for a large map only if its file format cannot mark nodata."""
-        return self._pyramid.fully_valid
-
     def gray(self, window: Window, level: int = 0) -> Gray:
         """Grey values of a window.
 

@@ -191,7 +191,7 @@ class OpenCvFeatures:
     def _described(self, crop: Window, level: int, most: int | None) -> Keypoints:
         """Features of a piece of the map, as dense as those of the frame."""
         site, options = self.site, self._options
-        mask = None if site.fully_valid else site.valid(crop, level).astype(np.uint8)
+        mask = site.valid(crop, level).astype(np.uint8)
         frame_px = self._camera.width_px * self._camera.height_px * options.scale**2
         count = round(options.max_keypoints * max(1.0, crop.area_px / frame_px))
         return _opencv_features(site.gray(crop, level), min(count, most or count), mask)

@@ -77,9 +77,7 @@ class KeypointMap:
         found = self._matcher.extract(picture, math.ceil(wide.area_px / PX_PER_KEYPOINT))
         xy = found.xy_px + found.xy_px.new_tensor([wide.x0, wide.y0])
         low, size = xy.new_tensor([tile.x0, tile.y0]), xy.new_tensor([tile.width_px, tile.height_px])
-        own = ((xy >= low - 0.5) & (xy < low + size - 0.5)).all(dim=1)
-        if not self._site.fully_valid:
-            own &= self._on_data(found, wide, level)
+        own = ((xy >= low - 0.5) & (xy < low + size - 0.5)).all(dim=1) & self._on_data(found, wide, level)
         return Keypoints(xy, found.strength, found.descriptors).only(own)
 
     def _on_data(self, found: Keypoints, wide: Window, level: int) -> torch.Tensor:

@@ -155,7 +155,7 @@ class LandmarkMap:
         wide = widened(own, HALO_PX, self._site.level_shape(level))
         inner = within(own, wide)
         mask = np.zeros((wide.height_px, wide.width_px), np.bool_)
-        mask[inner] = True if self._site.fully_valid else self._site.valid(wide, level)[inner]
+        mask[inner] = self._site.valid(wide, level)[inner]
         if not mask.any():
             return {field: np.zeros((0, *shape), dtype) for field, (dtype, shape) in _STORED.items()}
         found = sift(

@@ -120,13 +120,10 @@ def enhanced_part(site: OrthoMap, window: Window, level: int) -> tuple[FloatImag
         (H, W) float32, and (H, W) bool, False on nodata; None if all pixels are valid.
     """
     wide = widened(window, RADIUS_PX + 1, site.level_shape(level))
-    mask: NDArray[np.bool_] | None = None
-    if not site.fully_valid:
-        mask = site.valid(wide, level)
-        mask = None if mask.all() else mask
-    picture = enhance(site.gray(wide, level), valid=mask)
+    gray, mask = site.gray(wide, level), site.valid(wide, level)
+    picture = enhance(gray, valid=None if mask.all() else mask)
     inner = within(window, wide)
-    own = None if mask is None or mask[inner].all() else np.ascontiguousarray(mask[inner])
+    own = None if mask[inner].all() else np.ascontiguousarray(mask[inner])
     return np.ascontiguousarray(picture[inner]), own
 
 

@@ -109,13 +109,6 @@ class Pyramid:
             last = self._last = ((window, level), self._from_file(window, level))
         return last[1]
 
-    @property
-    def fully_valid(self) -> bool:
-        """Whether no pixel is nodata; true for a large map only if its file format cannot mark nodata."""
-        if self._file is not None and self.is_large:
-            return self._file.all_valid
-        return self.nodata_share == 0.0
-
     @cached_property
     def nodata_share(self) -> float:
         """Share of the pixels that are not valid, at the finest level in memory."""

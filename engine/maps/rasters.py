@@ -234,13 +234,6 @@ class GrayReader:
         if data.dtype != np.uint8:
             self._limits = np.percentile(_luma(data)[valid], STRETCH_PERCENT)
 
-    @property
-    def all_valid(self) -> bool:
-        """Whether no pixel can be nodata."""
-        flags = self._source.dataset.mask_flag_enums
-        never = all("all_valid" in {flag.name for flag in of_band} for of_band in flags)
-        return never and not self._collars and np.dtype(self.dtype).kind != "f"
-
     def _read(self, window: Window, size: tuple[int, int], *, smooth: bool = False) -> tuple[NDArray[Any], Mask]:
         """Bands and validity of a window in pixels of the file, resampled to ``size`` (rows, columns)."""
         from rasterio.enums import Resampling

@@ -80,10 +80,8 @@ def _scores(
     height, width = aligned.template.shape
     if crop.width_px < width + 2 or crop.height_px < height + 2:
         return None
-    gray, valid = query.site.gray(crop, aligned.level), None
-    if not query.site.fully_valid:
-        valid = query.site.valid(crop, aligned.level)
-        valid = None if valid.all() else valid
+    gray, mask = query.site.gray(crop, aligned.level), query.site.valid(crop, aligned.level)
+    valid = None if mask.all() else mask
     search = _channels(gray, valid)
     scores = on_host(ncc(to_device(search, query.device), to_device(templates, query.device)).mean(0))
     if valid is not None:

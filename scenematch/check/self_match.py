@@ -93,7 +93,7 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px:
     if not plan.contains(center_px):
         return nothing
     extent = Window(x0, y0, width, height)
-    if not site.fully_valid and site.valid(extent, level).mean() < MIN_VALID_SHARE:
+    if site.valid(extent, level).mean() < MIN_VALID_SHARE:
         return nothing
     gray = site.gray(extent, level)
     region = prepared.cut(_window(plan, middle), level)

@@ -88,7 +88,6 @@ def test_coarse_levels_are_the_files_own_overviews_at_the_same_place(large, smal
 
 def test_what_holds_no_map_is_nodata_and_the_warm_up_finds_a_place_that_does(large):
     assert large.is_large
-    assert not large.fully_valid
     assert not large.valid(Window(100, 100, 50, 50)).any()
     assert large.info()["nodata_share"] > 0.98
     x, y = np.rint(large.inner_px).astype(int)

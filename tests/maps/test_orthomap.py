@@ -167,7 +167,7 @@ def test_colour_becomes_luma_of_the_first_three_bands(tmp_path):
     site = OrthoMap.open(write(tmp_path / "map.tif", data, photometric="minisblack"))
     luma = np.tensordot([0.299, 0.587, 0.114], data[:3].astype(float), axes=1)
     assert np.abs(site.gray(whole(site)) - luma).max() <= 1.0
-    assert site.fully_valid
+    assert site.valid(whole(site)).all()
 
 
 def test_colour_table_is_expanded(tmp_path):
@@ -215,7 +215,6 @@ def test_nodata_comes_from_tag_alpha_and_mask(tmp_path, how):
             dataset.write_mask(expected)
     site = OrthoMap.open(path)
     assert np.array_equal(site.valid(whole(site)), expected)
-    assert not site.fully_valid
     assert site.info()["nodata_share"] == pytest.approx(52 / 2000)
     coarse = site.valid(whole(site, 1), 1)
     assert np.array_equal(coarse, expected.reshape(20, 2, 25, 2).all(axis=(1, 3)))
@@ -239,7 +238,8 @@ def test_untagged_collar_is_nodata_and_dark_pixels_inside_are_not(tmp_path, colo
 def test_a_few_black_pixels_at_the_border_are_no_collar(tmp_path):
     data = noise(100, 100)
     data[0, :40] = 0  # 0.4 %
-    assert OrthoMap.open(write(tmp_path / "map.tif", data)).fully_valid
+    site = OrthoMap.open(write(tmp_path / "map.tif", data))
+    assert site.valid(whole(site)).all()
 
 
 def test_a_tag_ends_the_search_for_a_collar(tmp_path):
@@ -308,7 +308,6 @@ def test_map_too_large_for_memory_reads_the_same_from_the_file(tmp_path, monkeyp
         window = Window(3, 2, width - 5, height - 3)
         assert np.array_equal(streamed.gray(window, level), kept.gray(window, level))
         assert np.array_equal(streamed.valid(window, level), kept.valid(window, level))
-    assert not streamed.fully_valid
 
 
 # --- surface ------------------------------------------------------------------------------------------------
