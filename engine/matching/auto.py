@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.matching.agreement import agree_in_height, agree_in_place, offset_between_m
 from engine.matching.candidates import Candidate
@@ -16,6 +15,7 @@ from engine.matching.ladder import Answer, is_accepted, is_late
 from engine.matching.method import Method
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
+from engine.matching.refinement import reaching
 from engine.matching.sift import Sift
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
@@ -94,7 +94,8 @@ class Auto(Method):
             best = max(both or [first, second], key=_nats)
             return best if is_one_place else best.against([first, second])
         if not _agree(first.fix, second.fix):
-            return replace(second, fix=_vaguer(second.fix, offset_m))
+            # A telemetry error shifts the patch that NCC searches for, and the pose less so.
+            return replace(second, fix=reaching(second.fix, first.fix))
         greater, best = max(both, key=_nats).evidence, min(both, key=lambda each: each.fix.sigma_m)
         return replace(best, fix=replace(best.fix, stage="verified")).weighed(greater)
 
@@ -114,14 +115,3 @@ def _nats(candidate: Candidate) -> float:
 
 def _agree(first: Fix, second: Fix) -> bool:
     return agree_in_place(first, second) and agree_in_height(first, second)
-
-
-def _vaguer(second: Fix, offset_m: NDArray[np.float64]) -> Fix:
-    """SIFT's fix if NCC found the same place, but further away than both state.
-
-    No other place is so near. A telemetry error shifts the patch that NCC searches for, and the pose less so.
-    Which of the two is off is unknown: the covariance covers both.
-    """
-    covariance_m2 = second.covariance_m2.copy()
-    covariance_m2[:2, :2] += offset_m[:, None] * offset_m
-    return replace(second, covariance_m2=covariance_m2)

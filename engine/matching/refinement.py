@@ -24,7 +24,7 @@ from engine.kernels.dense import (
 from engine.kernels.scores import RADIUS_PX, enhance
 from engine.maps.grids import window_about
 from engine.maps.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
-from engine.matching.agreement import agree_in_height, are_consistent
+from engine.matching.agreement import agree_in_height, are_consistent, offset_between_m
 from engine.matching.align import shrink
 from engine.matching.candidates import PeakCandidate
 from engine.matching.covariance import tilt_covariance
@@ -102,11 +102,11 @@ class Refinement:
     def refine(self, found: PeakCandidate) -> PeakCandidate | NoFix:
         """The candidate with its whole pose refined and the evidence of that, a less certain one, or a refusal.
 
-        If the picture hardly confirms the telemetry's attitude over a surface model, the pose is refined again as
-        if roll and pitch were hardly known, and the more probable pose counts. If neither has evidence, a wrong
-        attitude is as probable as a right one: right poses can be refined in 98 of 100 frames, and attitudes are
-        right in 99 of 100. Only a prior then confirms the attitude, and the fix is no more certain than that.
-        Without a surface model relief may be the reason: the fix stays as it is, unless a prior disagrees with it.
+        If the picture hardly confirms the telemetry's attitude, the pose is refined again as if roll and pitch
+        were hardly known, and the more probable pose counts. If neither has evidence, a wrong attitude is as
+        probable as a right one: right poses can be refined in 98 of 100 frames, and attitudes are right in 99 of
+        100. Only a prior then confirms the attitude, and the fix is no more certain than that. Without a surface
+        model relief may be the reason as well: the fix stays at the peak, and its covariance reaches that pose.
         """
         query, has_tilt, found = self.query, self.query.telemetry.has_tilt, replace(found, by_refinement=True)
         refined = self.refine_pose(found.fix)
@@ -114,10 +114,12 @@ class Refinement:
         if refined is not None and is_clear and found.suffices(query.risk):
             return replace(found, fix=refined.fix)
         own = self._weighed(found, refined)
-        best = self._or_doubted(found, own) if has_tilt and query.site.has_surface and not is_clear else own
+        best = self._or_doubted(found, own) if has_tilt and not is_clear else own
+        if best is not None and own is None and has_tilt and not query.site.has_surface:
+            return replace(found, fix=replace(reaching(found.fix, best.fix), stage="unconfirmed"))
         if best is not None:
             return best
-        if has_tilt and query.site.has_surface and not is_oblique(query, query.telemetry.known_attitude):
+        if has_tilt and not is_oblique(query, query.telemetry.known_attitude):
             found = found.weighed(replace(found.evidence, refined=-math.inf))  # of few right places
         if not found.promises(query.risk):
             return found
@@ -179,11 +181,8 @@ class Refinement:
         """A peak whose known attitude no picture confirms; refused if the prior disagrees with it."""
         query, fix = self.query, found.fix
         off = query.prior_chi_square(fix)
-        agrees = off <= chi_square_of(CHANCE, 2) if off is not None else not query.site.has_surface
-        if agrees:
-            if query.site.has_surface and query.prior is not None:
-                fix = _less_certain(fix, query.prior.sigma_m)
-            return replace(found, fix=replace(fix, stage="unconfirmed"))
+        if off is not None and query.prior is not None and off <= chi_square_of(CHANCE, 2):
+            return replace(found, fix=replace(_less_certain(fix, query.prior.sigma_m), stage="unconfirmed"))
         against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
         return fix.refused(Reason.BAD_POSE, f"the picture does not confirm roll and pitch, and {against}")
 
@@ -373,6 +372,13 @@ class Refinement:
 def with_tilt_doubt(query: Query, fix: Fix) -> Fix:
     """The fix of a frame whose picture does not confirm its attitude, with a covariance for a wrong tilt."""
     return _less_certain(fix, query.telemetry.known_height_m * math.radians(_TILT_DOUBT_DEG))
+
+
+def reaching(fix: Fix, other: Fix) -> Fix:
+    """The fix with a covariance that covers another as well: which of the two is right is unknown."""
+    offset_m, covariance_m2 = offset_between_m(fix, other), fix.covariance_m2.copy()
+    covariance_m2[:2, :2] += offset_m[:, None] * offset_m
+    return replace(fix, covariance_m2=covariance_m2)
 
 
 def _less_certain(fix: Fix, sigma_m: float) -> Fix:

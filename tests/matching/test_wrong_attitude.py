@@ -52,6 +52,19 @@ def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, matchers, camera, 
     assert abs(fix.attitude.pitch_deg - TRUE["pitch_deg"]) < 0.5
 
 
+@pytest.mark.parametrize("method", ["ncc", "auto"])
+@pytest.mark.parametrize("pitch_deg", [6.0, 9.0, 12.0])
+def test_over_a_map_alone_a_camera_that_only_says_it_is_level_gives_no_wrong_fix(
+    ground, camera, method, pitch_deg
+):
+    """Taken for a slope of the ground, its tilt would move the fix by 16 to 32 m."""
+    frame = replace(ground.frame(camera, NADIR, 150.0, pitch_deg=pitch_deg), pitch_deg=0.0)
+    result = SceneMatcher(ground.map_of(georeference_sigma_m=0.1), camera, method, "cpu").locate(
+        frame, ground.prior(NADIR)
+    )
+    assert isinstance(result, NoFix) or ground.chi_square(result, NADIR) < 9.0
+
+
 @pytest.mark.parametrize(
     ("method", "knows_place"), [("ncc", True), ("ncc", False), ("sift", True), ("auto", True)]
 )
