@@ -72,11 +72,13 @@ class Auto(Method):
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
-        first = self.ncc.locate(query, widely=False)  # SIFT finds the heading by itself
+        first = self.ncc.look(query)
         if is_accepted(first, query) and _is_settled(first, query):
             return first
         with query.scheduler.with_fix(is_accepted(first, query)):
             second = self.sift.locate(query)
+        if not (is_accepted(first, query) or is_accepted(second, query)):
+            first = self.ncc.search(query, first)
         if isinstance(first, Candidate) and isinstance(second, Candidate):
             return self._posterior(query, first, second)
         return first if is_accepted(first, query) or is_late(second) else second

@@ -28,7 +28,8 @@ Array = NDArray[np.float64]
 METHOD = "ncc"
 MIN_VALID_SHARE = 0.9
 """A place counts only if this share of the patch lies on valid map."""
-_COARSER = (0, 1, 2)  # levels above the frame's own that may be matched if time is short
+COARSER = (0, 1, 2)
+"""Levels above the frame's own that are matched if time is short, or if the own one leaves doubt."""
 MIN_SIDE_PX = 24
 """Least side of a template on a coarser level."""
 _EVERY_PLACE = "every place of a wide window"  # a step
@@ -248,7 +249,7 @@ def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:
     assert query.prior is not None
     own = query.level_of(height_m)
     out = {}
-    for coarser in _COARSER:
+    for coarser in COARSER:
         gsd_m = site.gsd_m_per_px * 2.0 ** (own + coarser)
         per_px = height_m / (camera.focal_px * gsd_m)
         side_px = FRACTION * min(camera.width_px, camera.height_px) * per_px

@@ -22,7 +22,7 @@ from engine.matching.evidence import Evidence, probability
 from engine.matching.feature_matching import Matched, match_views
 from engine.matching.pose import MIN_INLIERS, PoseStats, solve_pose
 from engine.matching.query import Query
-from engine.matching.views import TelemetryHypothesis, level_at, view_in, views_of, x_axis_deg
+from engine.matching.views import TelemetryHypothesis, coarser_scale, level_at, view_in, views_of, x_axis_deg
 from engine.matching.votes import Vote
 from engine.options import MIN_HEIGHT_M, PAPER_SCALE, SiftOptions
 from engine.orthomap import OrthoMap
@@ -96,15 +96,22 @@ class FeatureMatcher:
         return found.weighed(replace(found.evidence, null=surprise, is_tested=True))
 
     def _attempts(self) -> Iterator[tuple[FeatureMatcher, TelemetryHypothesis]]:
-        """Hypotheses to try in turn: the telemetry, the same at the frame's full resolution, then wider ones."""
+        """Hypotheses to try in turn: the telemetry, the same a level coarser and at full resolution, wider ones.
+
+        A map is often blurrier than its pixels, and a coarser level leaves out what it does not show.
+        """
         query, options = self.query, self.options
         height_m = query.telemetry.height_agl_m
         unknown = (MIN_HEIGHT_M, options.max_height_m)
         known = TelemetryHypothesis(unknown if height_m is None else (height_m, height_m), x_axis_deg(query))
         yield self, known
-        drawn = height_m is not None and known.x_axis_deg is not None and self.finder is None
-        if drawn and level_at(query, known.heights_m[0], options.scale) > level_at(query, known.heights_m[0], 1.0):
-            yield replace(self, options=replace(options, scale=1.0)), known
+        if height_m is not None and known.x_axis_deg is not None and self.finder is None:
+            own = level_at(query, height_m, options.scale)
+            coarser = coarser_scale(query, height_m, options.scale)
+            if coarser is not None:
+                yield replace(self, options=replace(options, scale=coarser)), known
+            if own > level_at(query, height_m, 1.0):
+                yield replace(self, options=replace(options, scale=1.0)), known
         wide = TelemetryHypothesis(unknown if height_m is None else (height_m / 2.0, height_m * 2.0), None)
         if options.search_widely and wide != known:
             yield self, wide

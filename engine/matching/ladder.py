@@ -38,7 +38,7 @@ class Rung:
     look: Callable[[Answer | None, Hashable], Answer | None]
 
 
-def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Answer:
+def climb(query: Query, method: str, rungs: Sequence[Rung], answer: Answer | None = None) -> Answer:
     """The answer after every rung that can change it and that time allows.
 
     With a fix, work ends before a deadline that would make it late; a refusal for lack of time replaces no fix.
@@ -48,8 +48,8 @@ def climb(query: Query, method: str, rungs: Sequence[Rung]) -> Answer:
         query: the frame.
         method: named in the refusal of a frame for which there was no time.
         rungs: in their order, cheap ones first.
+        answer: to go on from; None begins.
     """
-    answer: Answer | None = None
     for rung in rungs:
         if not query.scheduler.deadline.met:
             break  # no step is refused for its cost

@@ -88,16 +88,22 @@ class Ncc(Method):
         found = self.find(query)
         return found if isinstance(found, NoFix) else found.weighed(Evidence(nats, 0.0, math.e, 1.0, None))
 
-    def locate(self, query: Query, *, widely: bool = True) -> Answer:
-        """The place of a coarse peak whose pose the picture confirms, else of the finest level that time allows.
+    def locate(self, query: Query) -> Answer:
+        """The place by the frame's own heading and height, else by others that they may be mistaken for."""
+        return self.search(query, self.look(query))
 
-        Args:
-            query: the frame.
-            widely: whether to search for the heading and height of a frame that would be refused.
-        """
+    def look(self, query: Query) -> Answer:
+        """The place of a coarse peak if the picture confirms its pose, else of the finest level in time."""
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
-        return climb(query, METHOD, _Rungs(self, query).all(widely=widely))
+        return climb(query, METHOD, _Rungs(self, query).looks)
+
+    def search(self, query: Query, answer: Answer) -> Answer:
+        """The answer, or if it is refused that of a search for the frame's heading and height."""
+        if isinstance(answer, NoFix):
+            return answer
+        rungs = _Rungs(self, query)
+        return climb(query, METHOD, [rungs.search, rungs.refinement], answer)
 
     def works(self, query: Query) -> Works:
         """Correlation on each level, the frame's own first; or the search of the whole map."""
@@ -219,14 +225,14 @@ class _Rungs:
         self.structure = Rung(self._if_unseen, self._match_structure)
         self.search = Rung(self._if_refused, self._search)
 
-    def all(self, *, widely: bool) -> list[Rung]:
-        """In their order; ``widely`` is that of :meth:`Ncc.locate`.
+    @property
+    def looks(self) -> list[Rung]:
+        """Those at the frame's own heading and height, in their order.
 
         A null hypothesis is tested if refinement leaves doubt: the pose is stronger evidence, and cheaper.
         """
         coarse = [self.coarsest, self.at_once, self.null]
-        fine = [self.levels, self.refinement, self.null, self.structure, self.refinement, self.null]
-        return [*coarse, *fine, *([self.search, self.refinement] if widely else [])]
+        return [*coarse, self.levels, self.refinement, self.null, self.structure, self.refinement, self.null]
 
     def _if_coarse_suffices(self, answer: Answer | None) -> Works:
         """The coarsest level, if refinement may start from its peak and there is time for both.
@@ -283,6 +289,10 @@ class _Rungs:
             return found
         if self._is_coarse(answer) and self._is_refused(found) and self._is_same(answer.fix, found.fix):
             found = found.weighed(answer.evidence)
+        return self._resting(found)
+
+    def _resting(self, found: PeakCandidate) -> PeakCandidate:
+        """The candidate; if it is coarse, it rests on a tilt that no picture confirmed."""
         rests_on_tilt = found.fix.stage == "coarse" and self._query.telemetry.has_tilt
         return replace(found, fix=with_tilt_doubt(self._query, found.fix)) if rests_on_tilt else found
 
@@ -299,13 +309,15 @@ class _Rungs:
     def _match_structure(self, answer: Answer | None, step: Hashable) -> Answer | None:
         """Structure where the refused peak lies; it sees what grey levels see, and more: its peak counts."""
         assert isinstance(answer, PeakCandidate)  # or it was not offered
-        return self._ncc.match_structure(self._query, answer)
+        found = self._ncc.match_structure(self._query, answer)
+        return None if found is None else self._resting(found)
 
     def _if_unrefined(self, answer: Answer | None) -> Works:
         """The pose of a peak, of which it is stronger evidence."""
         if not isinstance(answer, PeakCandidate) or answer.by_refinement or not self._ncc.can_refine(self._query):
             return {}
-        offered = answer.counts and (answer.fix.stage == "fine" or self._is_refused(answer))
+        is_last = answer.fix.stage == "fine" or answer.by_structure or self._is_refused(answer)
+        offered = answer.counts and is_last  # of a coarse peak that suffices a finer level comes first
         return {_REFINEMENT: self._frame_px} if offered else {}
 
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer:

@@ -17,7 +17,7 @@ from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance, orientation
 from engine.kernels.sums import counts, share_on_map
 from engine.matching.candidates import PeakCandidate
-from engine.matching.correlation import MIN_VALID_SHARE, Aligned, Correlator
+from engine.matching.correlation import COARSER, MIN_SIDE_PX, MIN_VALID_SHARE, Aligned, Correlator
 from engine.matching.peak_evidence import candidate_of
 from engine.ncc_fft import ncc
 from engine.runtime.device import on_host, to_device
@@ -28,9 +28,10 @@ FloatImage = NDArray[np.float32]
 
 
 def match_structure(correlator: Correlator, found: PeakCandidate, window: Window) -> PeakCandidate | None:
-    """The candidate of the highest peak by grey levels and structure, out of every place of a window.
+    """The candidate of the highest peak by grey levels and structure, on the first level where it suffices.
 
-    Its rival is the better of the best elsewhere and of what chance reaches.
+    A map is often blurrier than its pixels: what a coarser level leaves out, it does not show. If no level
+    suffices, it is the candidate with the most evidence.
 
     Args:
         correlator: of the frame.
@@ -40,7 +41,24 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
     Returns:
         PeakCandidate | None: None if the template is nowhere on the map.
     """
-    aligned = found.aligned
+    best: PeakCandidate | None = None
+    for coarser in COARSER:
+        seen = _on_level(correlator, found, window, coarser)
+        if seen is not None and (best is None or seen.evidence.nats > best.evidence.nats):
+            best = seen
+        if best is not None and best.suffices(correlator.query.risk):
+            break
+    return best
+
+
+def _on_level(correlator: Correlator, found: PeakCandidate, window: Window, coarser: int) -> PeakCandidate | None:
+    """The candidate out of every place of a window, so many levels above that of the candidate by grey levels.
+
+    Its rival is the better of the best elsewhere and of what chance reaches.
+    """
+    aligned = _coarser(correlator, found, coarser)
+    if aligned is None:
+        return None
     scored = _scores(correlator, aligned, window, _templates(correlator, aligned))
     if scored is None:
         return None
@@ -58,11 +76,23 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
         replace(peak, x=peak.x + crop.x0, y=peak.y + crop.y0, second_score=rival),
         window,
         is_fitted=found.is_fitted,
-        tried=found.evidence.tried,
+        tried=found.evidence.tried * (coarser + 1.0),  # levels as well
         sigma=max(float(chance.std(dtype=np.float64)), 1e-3),
     )
     evidence, fix = replace(own.evidence, is_tested=True), replace(own.fix, window=found.fix.window)
     return replace(own, by_structure=True, evidence=evidence, fix=fix)
+
+
+def _coarser(correlator: Correlator, found: PeakCandidate, coarser: int) -> Aligned | None:
+    """The candidate's hypothesis so many levels above its own; None if it shows too little there."""
+    own = found.aligned
+    level = own.level + coarser
+    if coarser == 0:
+        return own
+    if level >= correlator.query.site.levels or min(own.template.shape) >> coarser < MIN_SIDE_PX:
+        return None
+    aligned = correlator.align(own.pose, level, correlator.nadir_px(found.peak, own))
+    return aligned if isinstance(aligned, Aligned) else None
 
 
 def _templates(correlator: Correlator, aligned: Aligned) -> FloatImage:

@@ -220,7 +220,7 @@ def test_without_a_wide_search_a_height_off_by_two_is_refused(ground, camera, fr
     assert isinstance(with_sift(ground, camera, search_widely=False).locate(wrong, prior), NoFix)
 
 
-@pytest.mark.parametrize(("budget_ms", "looks"), [(50.0, 1), (60_000.0, 3)])
+@pytest.mark.parametrize(("budget_ms", "looks"), [(50.0, 1), (60_000.0, 4)])
 def test_a_wide_search_is_not_begun_where_the_budget_does_not_hold_it(
     ground, camera, frame, prior, monkeypatch, budget_ms, looks
 ):
@@ -235,7 +235,7 @@ def test_a_wide_search_is_not_begun_where_the_budget_does_not_hold_it(
     monkeypatch.setattr(FeatureMatcher, "_find_with", look)
     result = with_sift(ground, camera).locate(frame, prior, Budget(total_ms=budget_ms))
     assert result.reason is Reason.TOO_FEW_MATCHES
-    expected = [(False, (150.0, 150.0))] * 2 + [(True, (75.0, 300.0))]  # whether the heading is unknown, heights
+    expected = [(False, (150.0, 150.0))] * 3 + [(True, (75.0, 300.0))]  # whether the heading is unknown, heights
     assert [(tried.x_axis_deg is None, tried.heights_m) for tried in hypotheses] == expected[:looks]
 
 
@@ -243,9 +243,9 @@ def test_a_wide_search_is_not_begun_where_the_budget_does_not_hold_it(
     ("found_nats", "looks", "fixed_at_m"),
     [
         ([12.0], 1, 0.0),  # as the telemetry has it
-        ([None, 12.0, 500.0], 3, 200.0),  # a place found after it failed gives way to another
-        ([None, 12.0, 15.0], 3, None),
-        ([None, 12.0, None], 3, 100.0),
+        ([None, 12.0, None, 500.0], 4, 300.0),  # a place found after it failed gives way to another
+        ([None, 12.0, None, 15.0], 4, None),
+        ([None, 12.0, None, None], 4, 100.0),
     ],
 )
 def test_what_is_found_after_the_telemetry_failed_is_weighed_against_other_places(
