@@ -30,8 +30,8 @@ FloatImage = NDArray[np.float32]
 def match_structure(correlator: Correlator, found: PeakCandidate, window: Window) -> PeakCandidate | None:
     """The candidate of the highest peak by grey levels and structure, on the first level where it suffices.
 
-    A map is often blurrier than its pixels: what a coarser level leaves out, it does not show. If no level
-    suffices, it is the candidate with the most evidence.
+    A map is often blurrier than its pixels: what a coarser level leaves out, it does not show. If none suffices,
+    it is that of the own level, where a rival that looks the same scores the same, whatever the pixels' phase.
 
     Args:
         correlator: of the frame.
@@ -41,14 +41,14 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
     Returns:
         PeakCandidate | None: None if the template is nowhere on the map.
     """
-    best: PeakCandidate | None = None
-    for coarser in COARSER:
+    risk, own = correlator.query.risk, _on_level(correlator, found, window, 0)
+    if own is not None and own.suffices(risk):
+        return own
+    for coarser in COARSER[1:]:
         seen = _on_level(correlator, found, window, coarser)
-        if seen is not None and (best is None or seen.evidence.nats > best.evidence.nats):
-            best = seen
-        if best is not None and best.suffices(correlator.query.risk):
-            break
-    return best
+        if seen is not None and seen.suffices(risk):
+            return seen
+    return own
 
 
 def _on_level(correlator: Correlator, found: PeakCandidate, window: Window, coarser: int) -> PeakCandidate | None:
