@@ -49,6 +49,7 @@ class Evidence:
         elsewhere: the evidence for the best other place that another attempt found.
         is_tested: whether the null hypothesis was tested, is among the rivals, or needs no test because a picture
             confirmed the pose; if not, only evidence beyond doubt counts.
+        least_alike: how much places looked alike to another look at the frame, on another level; at least 1.
         refined: the surprise of the pose refined there, less what was tried for it, -inf if there is none; None if
             it was not tried, or says nothing.
     """
@@ -62,6 +63,7 @@ class Evidence:
     null: float = 0.0
     elsewhere: float = 0.0
     is_tested: bool = False
+    least_alike: float = 1.0
     refined: float | None = None
 
     @property
@@ -70,10 +72,14 @@ class Evidence:
         return max(self.rival, self.null)
 
     @property
+    def alike(self) -> float:
+        """How much less a surprise is worth because places look alike: 1 if they do not."""
+        return max(self.least_alike, min(self.chance, self.surprise) / math.log(self.measured))
+
+    @property
     def nats(self) -> float:
         """The greater of what the match and its refined pose show, plus what was known before, less elsewhere."""
-        alike = max(1.0, min(self.chance, self.surprise) / math.log(self.measured))
-        seen = max(self.surprise / alike - math.log(self.tried), 0.0)
+        seen = max(self.surprise / self.alike - math.log(self.tried), 0.0)
         if self.refined is not None:  # peak and pose compare the same picture: the greater evidence counts
             seen = max(seen + math.log(_UNREFINABLE), self.of_refinement)
         return seen + _of_position(self.prior_chi_square) + _of_height(self.height_chi_square) - self.elsewhere

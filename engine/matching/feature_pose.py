@@ -82,7 +82,9 @@ class FeatureMatcher:
         best, matcher, hypothesis = max(found, key=lambda each: each[0].evidence.nats)
         if len(found) == 1 and best.suffices(query.risk):
             return best
-        return matcher._null_tested(best.against(each for each, _, _ in found), hypothesis)
+        alike = max(each.evidence.alike for each, _, _ in found)
+        best = best.weighed(replace(best.evidence, least_alike=alike)).against(each for each, _, _ in found)
+        return matcher._null_tested(best, hypothesis)
 
     def find_at_once(self) -> PoseCandidate | NoFix:
         """The pose of a frame by its own telemetry, with no second attempt and no null hypothesis."""

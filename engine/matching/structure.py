@@ -44,9 +44,10 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
     risk, own = correlator.query.risk, _on_level(correlator, found, window, 0)
     if own is not None and own.suffices(risk):
         return own
+    alike = 1.0 if own is None else own.evidence.alike
     for coarser in COARSER[1:]:
         seen = _on_level(correlator, found, window, coarser)
-        if seen is not None and seen.suffices(risk):
+        if seen is not None and seen.weighed(replace(seen.evidence, least_alike=alike)).suffices(risk):
             return seen
     return own
 
