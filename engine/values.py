@@ -394,7 +394,7 @@ class Fix:
         return self.sigma_m * math.sqrt(-2.0 * math.log(left)) if left > 0.0 else math.inf
 
     def refused(self, reason: Reason, detail: str) -> NoFix:
-        """Turn this fix into a refusal that keeps its measurements."""
+        """Turn this fix into a refusal that keeps it as its :attr:`NoFix.match`."""
         return NoFix(
             reason=reason,
             detail=detail,
@@ -403,6 +403,7 @@ class Fix:
             score=self.score,
             window=self.window,
             timings=self.timings,
+            match=self,
         )
 
 

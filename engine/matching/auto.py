@@ -81,7 +81,7 @@ class Auto(Method):
             first = self.ncc.search(query, first)
         if isinstance(first, Candidate) and isinstance(second, Candidate):
             return self._posterior(query, first, second)
-        return first if is_accepted(first, query) or is_late(second) else second
+        return first if isinstance(first, Candidate) or is_late(second) else second
 
     def _posterior(self, query: Query, first: Candidate, second: Candidate) -> Candidate:
         """Of one place the more accurate candidate, of two the more evident one, with the other against it.

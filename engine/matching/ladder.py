@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeAlias, TypeGuard
 
 from engine.matching import refusals
@@ -70,7 +70,7 @@ def settled(query: Query, answer: Candidate | Result) -> Result:
         return answer
     if answer.suffices(query.risk):
         return answer.fix
-    return replace(answer.fix.refused(*refusals.of_candidate(answer, query.risk)), match=answer.fix)
+    return answer.fix.refused(*refusals.of_candidate(answer, query.risk))
 
 
 def is_accepted(answer: Answer | None, query: Query) -> TypeGuard[Candidate]:

@@ -47,8 +47,9 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
     alike = 1.0 if own is None else own.evidence.alike
     for coarser in COARSER[1:]:
         seen = _on_level(correlator, found, window, coarser)
-        if seen is not None and seen.weighed(replace(seen.evidence, least_alike=alike)).suffices(risk):
-            return seen
+        weighed = None if seen is None else seen.weighed(replace(seen.evidence, least_alike=alike))
+        if weighed is not None and weighed.suffices(risk):
+            return weighed
     return own
 
 

@@ -306,7 +306,7 @@ class Navigator:
         self._refusals += 1
         best = moment.tracks.best
         if best is not None and self._is_known(best) and best.estimate.chi_square(fix) > self._options.gate:
-            return replace(best.estimate.refusal(fix), match=fix)
+            return best.estimate.refusal(fix)
         asked = f"{1.0 - self._options.risk:g} is required"
         return fix.refused(
             Reason.UNCONFIRMED, f"right with a probability of {probability(weighed.log_odds):.4f}, {asked}"
