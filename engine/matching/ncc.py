@@ -90,20 +90,22 @@ class Ncc(Method):
 
     def locate(self, query: Query) -> Answer:
         """The place by the frame's own heading and height, else by others that they may be mistaken for."""
-        return self.search(query, self.look(query))
-
-    def look(self, query: Query) -> Answer:
-        """The place of a coarse peak if the picture confirms its pose, else of the finest level in time."""
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
+        rungs = _Rungs(self, query)
+        return climb(query, METHOD, [*rungs.looks, *rungs.searches])
+
+    def look(self, query: Query) -> Answer:
+        """The place of a coarse peak if the picture confirms its pose, else of the finest level in time.
+
+        Args:
+            query: the frame, with its height.
+        """
         return climb(query, METHOD, _Rungs(self, query).looks)
 
     def search(self, query: Query, answer: Answer) -> Answer:
-        """The answer, or if it is refused that of a search for the frame's heading and height."""
-        if isinstance(answer, NoFix):
-            return answer
-        rungs = _Rungs(self, query)
-        return climb(query, METHOD, [rungs.search, rungs.refinement], answer)
+        """The answer of :meth:`look`, or if it is refused that of a search for the frame's heading and height."""
+        return climb(query, METHOD, _Rungs(self, query).searches, answer)
 
     def works(self, query: Query) -> Works:
         """Correlation on each level, the frame's own first; or the search of the whole map."""
@@ -233,6 +235,11 @@ class _Rungs:
         """
         coarse = [self.coarsest, self.at_once, self.null]
         return [*coarse, self.levels, self.refinement, self.null, self.structure, self.refinement, self.null]
+
+    @property
+    def searches(self) -> list[Rung]:
+        """Those at other headings and heights, if the looks are refused."""
+        return [self.search, self.refinement]
 
     def _if_coarse_suffices(self, answer: Answer | None) -> Works:
         """The coarsest level, if refinement may start from its peak and there is time for both.

@@ -115,7 +115,7 @@ class Refinement:
             return replace(found, fix=refined.fix)
         own = self._weighed(found, refined)
         best = self._or_doubted(found, own) if has_tilt and not is_clear else own
-        if best is not None and own is None and has_tilt and not query.site.has_surface:
+        if best is not None and own is None and not query.site.has_surface:  # the doubted one
             return replace(found, fix=replace(reaching(found.fix, best.fix), stage="unconfirmed"))
         if best is not None:
             return best
