@@ -10,7 +10,7 @@ from engine.assumed_errors import AssumedErrors
 from engine.geo import chi_square_of
 from engine.learned.pairs import PairMatcher
 from engine.sift import BACKENDS
-from engine.values import CHANCE, RISK, check, check_choice, check_positive
+from engine.values import RISK, SIGNIFICANCE, check, check_choice, check_positive
 
 if TYPE_CHECKING:
     from engine.orthomap import OrthoMap
@@ -197,7 +197,7 @@ class NavigatorOptions:
     max_speed_mps: float = 15.0
     default_interval_s: float = 0.2
     gate: float = round(chi_square_of(RISK, 2), 1)
-    risk: float = CHANCE
+    risk: float = SIGNIFICANCE
     lost_sigma_m: float = 100.0
     memory_s: float = 30.0
     attitude_lag_s: float = 0.1

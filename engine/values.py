@@ -24,7 +24,7 @@ MAX_SIGMA_M = 1e6
 """Upper bound on the standard deviation of a position or of a map's georeference."""
 RISK = 1e-4
 """Probability of an error that is allowed unless another is chosen."""
-CHANCE = 1e-3
+SIGNIFICANCE = 1e-3
 """Two estimates contradict each other if chance sets them so far apart less often than this."""
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import chi_square, chi_square_of
-from engine.values import CHANCE, Fix
+from engine.values import SIGNIFICANCE, Fix
 
 Array = NDArray[np.float64]
 
@@ -19,9 +19,9 @@ def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:
         covariance_m2: (2, 2) sum of their covariances.
 
     Returns:
-        bool: False if they contradict each other, see :data:`CHANCE`.
+        bool: False if they contradict each other, see :data:`SIGNIFICANCE`.
     """
-    return chi_square(apart_m, covariance_m2) <= chi_square_of(CHANCE, 2)
+    return chi_square(apart_m, covariance_m2) <= chi_square_of(SIGNIFICANCE, 2)
 
 
 def offset_between_m(first: Fix, second: Fix) -> Array:
@@ -54,4 +54,4 @@ def agree_in_height(first: Fix, second: Fix) -> bool:
         return True
     variance_m2 = float(first.covariance_m2[2, 2] + second.covariance_m2[2, 2])
     variance_m2 -= first.map_sigma_m**2 + second.map_sigma_m**2  # they share this error
-    return (first.up_m - second.up_m) ** 2 <= chi_square_of(CHANCE, 1) * variance_m2
+    return (first.up_m - second.up_m) ** 2 <= chi_square_of(SIGNIFICANCE, 1) * variance_m2

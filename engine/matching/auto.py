@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from engine.matching.agreement import agree_in_height, agree_in_place, offset_between_m
-from engine.matching.candidates import Candidate
+from engine.matching.candidates import Candidate, nats
 from engine.matching.evidence import is_beyond_doubt
 from engine.matching.for_reports import Explanation
 from engine.matching.ladder import Answer, is_accepted, is_late
@@ -72,7 +72,7 @@ class Auto(Method):
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
-        first = self.ncc.look(query)
+        first = self.ncc.by_telemetry(query)
         if is_accepted(first, query) and _is_settled(first, query):
             return first
         with query.scheduler.with_fix(is_accepted(first, query)):
@@ -93,12 +93,12 @@ class Auto(Method):
         is_near = float(np.hypot(*offset_m)) < self.ncc.options.exclusion_m
         is_one_place = is_near or agree_in_place(first.fix, second.fix)
         if len(both) < 2 or not is_one_place:
-            best = max(both or [first, second], key=_nats)
+            best = max(both or [first, second], key=nats)
             return best if is_one_place else best.against([first, second])
         if not _agree(first.fix, second.fix):
             # A telemetry error shifts the patch that NCC searches for, and the pose less so.
             return replace(second, fix=reaching(second.fix, first.fix))
-        greater, best = max(both, key=_nats).evidence, min(both, key=lambda each: each.fix.sigma_m)
+        greater, best = max(both, key=nats).evidence, min(both, key=lambda each: each.fix.sigma_m)
         return replace(best, fix=replace(best.fix, stage="verified")).weighed(greater)
 
     def explain(self, query: Query, window: Window) -> Explanation:
@@ -109,10 +109,6 @@ class Auto(Method):
 def _is_settled(first: Candidate, query: Query) -> bool:
     """Whether the picture confirmed the whole pose, and its place is beyond doubt."""
     return first.fix.stage == "refined" and is_beyond_doubt(first.evidence.nats, query.risk)
-
-
-def _nats(candidate: Candidate) -> float:
-    return candidate.evidence.nats
 
 
 def _agree(first: Fix, second: Fix) -> bool:

@@ -97,3 +97,8 @@ class PoseCandidate(Candidate):
 
     is_quick: bool = False
     is_refinable: bool = True
+
+
+def nats(candidate: Candidate) -> float:
+    """The evidence for a candidate: the key by which the more evident one is chosen."""
+    return candidate.evidence.nats

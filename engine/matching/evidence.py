@@ -81,20 +81,21 @@ class Evidence:
         """The greater of what the match and its refined pose show, plus what was known before, less elsewhere."""
         seen = max(self.surprise / self.alike - math.log(self.tried), 0.0)
         if self.refined is not None:  # peak and pose compare the same picture: the greater evidence counts
-            seen = max(seen + math.log(_UNREFINABLE), self.of_refinement)
+            is_refined = _UNREFINABLE + (1.0 - _UNREFINABLE) * probability(self.of_pose)
+            seen = max(seen + math.log(is_refined), self._of_correlation - math.log(self.tried))
         return seen + _of_position(self.prior_chi_square) + _of_height(self.height_chi_square) - self.elsewhere
 
     @property
-    def of_refinement(self) -> float:
-        """The evidence of the refined pose's correlation, in nats; a rival as good as the peak leaves none."""
-        if self.refined is None or self.chance >= self.surprise:
-            return -math.inf
-        return self.refined * (1.0 - self.chance / self.surprise) - math.log(self.tried)
+    def of_pose(self) -> float:
+        """The evidence for the refined pose at this place, against other poses there."""
+        return self._of_correlation + _of_position(self.prior_chi_square)
 
     @property
-    def of_pose(self) -> float:
-        """The evidence for the refined pose itself, its peak apart: of its correlation and of the prior."""
-        return self.of_refinement + _of_position(self.prior_chi_square)
+    def _of_correlation(self) -> float:
+        """The evidence of the refined pose's correlation at one place; a rival as good as the peak leaves none."""
+        if self.refined is None or self.chance >= self.surprise:
+            return -math.inf
+        return self.refined * (1.0 - self.chance / self.surprise)
 
     def promises(self, risk: float) -> bool:
         """Whether it suffices unless the null hypothesis, if that is not tested yet, does as well."""

@@ -31,11 +31,11 @@ class Rung:
     Attributes:
         offers: the variants of its step, the best first, that may change the answer so far (None if there is none
             yet); empty if it cannot.
-        look: gets the answer so far and a variant, and gives the new answer; None leaves the old one.
+        run: gets the answer so far and a variant, and gives the new answer; None leaves the old one.
     """
 
     offers: Callable[[Answer | None], Works]
-    look: Callable[[Answer | None, Hashable], Answer | None]
+    run: Callable[[Answer | None, Hashable], Answer | None]
 
 
 def climb(query: Query, method: str, rungs: Sequence[Rung], answer: Answer | None = None) -> Answer:
@@ -58,7 +58,7 @@ def climb(query: Query, method: str, rungs: Sequence[Rung], answer: Answer | Non
             step = _affordable(query.scheduler, works)
             if step is not None:
                 with query.scheduler.costed(step, works[step]):
-                    looked = rung.look(answer, step)
+                    looked = rung.run(answer, step)
                 if looked is not None and not (has_fix and is_late(looked)):
                     answer = looked
     return answer or refusals.late(query, method)
@@ -83,7 +83,7 @@ def rehearse(query: Query, rung: Rung, answer: Answer | None) -> list[Answer | N
     answers = []
     for step, work in rung.offers(answer).items():
         with query.scheduler.costed(step, work):
-            answers.append(rung.look(answer, step))
+            answers.append(rung.run(answer, step))
     return answers
 
 

@@ -14,7 +14,7 @@ from engine.maps.samples import SampleMap
 from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.matching import hypothesis_search, refusals
 from engine.matching.agreement import agree_in_place, offset_between_m
-from engine.matching.candidates import PeakCandidate
+from engine.matching.candidates import PeakCandidate, nats
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
 from engine.matching.evidence import Evidence
 from engine.matching.for_reports import Explanation, explain_correlation
@@ -93,18 +93,18 @@ class Ncc(Method):
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
         rungs = _Rungs(self, query)
-        return climb(query, METHOD, [*rungs.looks, *rungs.searches])
+        return climb(query, METHOD, [*rungs.by_telemetry, *rungs.searches])
 
-    def look(self, query: Query) -> Answer:
+    def by_telemetry(self, query: Query) -> Answer:
         """The place of a coarse peak if the picture confirms its pose, else of the finest level in time.
 
         Args:
             query: the frame, with its height.
         """
-        return climb(query, METHOD, _Rungs(self, query).looks)
+        return climb(query, METHOD, _Rungs(self, query).by_telemetry)
 
     def search(self, query: Query, answer: Answer) -> Answer:
-        """The answer of :meth:`look`, or if it is refused that of a search for the frame's heading and height."""
+        """The answer of :meth:`by_telemetry`; if refused, that of a search of headings and heights."""
         return climb(query, METHOD, _Rungs(self, query).searches, answer)
 
     def works(self, query: Query) -> Works:
@@ -228,7 +228,7 @@ class _Rungs:
         self.search = Rung(self._if_refused, self._search)
 
     @property
-    def looks(self) -> list[Rung]:
+    def by_telemetry(self) -> list[Rung]:
         """Those at the frame's own heading and height, in their order.
 
         A null hypothesis is tested if refinement leaves doubt: the pose is stronger evidence, and cheaper.
@@ -290,13 +290,15 @@ class _Rungs:
         return {step: work for step, work in finer if self._is_coarse(answer) and affordable({step: work})}
 
     def _correlate(self, answer: Answer | None, step: Hashable) -> Answer:
-        """The peak of one level; beside a coarser one of the same place it has the evidence for that."""
+        """The peak of one level, which sees more than a coarser one; of one place the greater evidence counts."""
         found = self._find(step)
         if not isinstance(found, PeakCandidate):
             return found
-        if self._is_coarse(answer) and self._is_refused(found) and self._is_same(answer.fix, found.fix):
-            found = found.weighed(answer.evidence)
-        return self._resting(found)
+        found = self._resting(found)
+        if self._is_coarse(answer) and self._is_same(answer.fix, found.fix):
+            best = max(answer, found, key=nats)
+            found = replace(best, fix=replace(found.fix, confidence=best.fix.confidence))
+        return found
 
     def _resting(self, found: PeakCandidate) -> PeakCandidate:
         """The candidate; if it is coarse, it rests on a tilt that no picture confirmed."""
@@ -309,7 +311,7 @@ class _Rungs:
 
     def _if_unseen(self, answer: Answer | None) -> Works:
         """Structure about a refused peak, once."""
-        if not self._is_refused(answer) or answer.by_structure:
+        if not self._falls_short(answer) or answer.by_structure:
             return {}
         return {_STRUCTURE: answer.aligned.work_px(self._ncc.surroundings(self._query, answer))}
 
@@ -323,7 +325,7 @@ class _Rungs:
         """The pose of a peak, of which it is stronger evidence."""
         if not isinstance(answer, PeakCandidate) or answer.by_refinement or not self._ncc.can_refine(self._query):
             return {}
-        is_last = answer.fix.stage == "fine" or answer.by_structure or self._is_refused(answer)
+        is_last = answer.fix.stage == "fine" or answer.by_structure or self._falls_short(answer)
         offered = answer.counts and is_last  # of a coarse peak that suffices a finer level comes first
         return {_REFINEMENT: self._frame_px} if offered else {}
 
@@ -333,7 +335,7 @@ class _Rungs:
 
     def _if_refused(self, answer: Answer | None) -> Works:
         """The search of headings and heights, if a peak is refused."""
-        return {_HYPOTHESES: max(self._works.values())} if self._is_refused(answer) else {}
+        return {_HYPOTHESES: max(self._works.values())} if self._falls_short(answer) else {}
 
     def _search(self, answer: Answer | None, step: Hashable) -> Answer | None:
         """The best of all headings and heights within three sigmas, if structure confirms it.
@@ -353,7 +355,7 @@ class _Rungs:
     def _is_promising(self, answer: Answer | None) -> TypeGuard[PeakCandidate]:
         return isinstance(answer, PeakCandidate) and answer.promises(self._query.risk)
 
-    def _is_refused(self, answer: Answer | None) -> TypeGuard[PeakCandidate]:
+    def _falls_short(self, answer: Answer | None) -> TypeGuard[PeakCandidate]:
         return isinstance(answer, PeakCandidate) and not answer.suffices(self._query.risk)
 
     @property

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.values import CHANCE
+from engine.values import SIGNIFICANCE
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -107,7 +107,7 @@ def ransac(problem: Problem) -> Start | None:
     """
     params = cv2.UsacParams()
     params.threshold = problem.tolerance_px
-    params.confidence = 1.0 - CHANCE
+    params.confidence = 1.0 - SIGNIFICANCE
     params.maxIterations = _MAX_SAMPLES
     params.randomGeneratorState = 0
     params.sampler = cv2.SAMPLING_UNIFORM

@@ -34,7 +34,7 @@ from engine.matching.pnp import (
 )
 from engine.matching.votes import chance_of_agreeing
 from engine.options import PoseOptions
-from engine.values import CHANCE
+from engine.values import SIGNIFICANCE
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -299,7 +299,9 @@ def _other_pose(problem: Problem, fit: Fit, options: PoseOptions) -> Fit | None:
     other = gauss_newton(problem, R, center)
     if other is None or _same(other.rotation, fit.rotation):
         return None
-    close = _cost(problem, other.rotation, other.view, fit.variance_px2, options) < cost + chi_square_of(CHANCE, 1)
+    close = _cost(problem, other.rotation, other.view, fit.variance_px2, options) < cost + chi_square_of(
+        SIGNIFICANCE, 1
+    )
     return other if close else None
 
 

@@ -34,7 +34,7 @@ from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.options import NccOptions
 from engine.runtime.scheduler import OutOfTime
-from engine.values import CHANCE, Attitude, Fix, NoFix, Reason, Window
+from engine.values import SIGNIFICANCE, Attitude, Fix, NoFix, Reason, Window
 
 Array = NDArray[np.float64]
 
@@ -145,7 +145,7 @@ class Refinement:
     def _weighed(
         self, found: PeakCandidate, refined: Refined | None, log_prior: float = 0.0
     ) -> PeakCandidate | None:
-        """The candidate with a refined pose; None if chance may have given that pose as well.
+        """The candidate with a refined pose; None if chance gives such a pose as well, and it is not clear.
 
         Args:
             found: the candidate.
@@ -157,9 +157,10 @@ class Refinement:
         tilts, off = 1 if self._knows_tilt else len(_TILTS) ** 2, self.query.prior_chi_square(refined.fix)
         surprise = self.surprise_of(refined) - math.log(tilts) + log_prior
         evidence = replace(found.evidence, refined=surprise, prior_chi_square=off)
-        if evidence.of_pose < self.query.needed_nats:
-            return None
-        return replace(found, fix=refined.fix).weighed(evidence)
+        moved = replace(found, fix=refined.fix)
+        if evidence.of_pose >= self.query.needed_nats:
+            return moved.weighed(evidence)
+        return moved if refined.is_clear else None
 
     def surprise_of(self, refined: Refined) -> float:
         """The surprise of a refined pose's correlation, by what the picture reaches about it; 0 if unknown."""
@@ -181,7 +182,7 @@ class Refinement:
         """A peak whose known attitude no picture confirms; refused if the prior disagrees with it."""
         query, fix = self.query, found.fix
         off = query.prior_chi_square(fix)
-        if off is not None and query.prior is not None and off <= chi_square_of(CHANCE, 2):
+        if off is not None and query.prior is not None and off <= chi_square_of(SIGNIFICANCE, 2):
             return replace(found, fix=replace(_less_certain(fix, query.prior.sigma_m), stage="unconfirmed"))
         against = "no prior does" if off is None else f"the prior does not, at a chi-square of {off:.0f}"
         return fix.refused(Reason.BAD_POSE, f"the picture does not confirm roll and pitch, and {against}")

@@ -40,7 +40,8 @@ def _of_peak(candidate: PeakCandidate, risk: float) -> Refusal:
         among = f"{needed:.1f} are needed among {evidence.tried:,.0f} places"
         return Reason.LOW_SCORE, f"best NCC {score:.3f}, {sigmas:.1f} sigmas may be chance: {among}"
     which = "mirrored frame" if evidence.null > evidence.rival else "rival"
-    figures = f"NCC {sigmas:.1f} sigmas, {which} at {rival:.1f}, {_from_prior(candidate)}"
+    pose = "" if evidence.refined is None else f", its pose at {max(evidence.of_pose, 0.0):.1f} nats"
+    figures = f"NCC {sigmas:.1f} sigmas, {which} at {rival:.1f}, {_from_prior(candidate)}{pose}"
     if not evidence.promises(risk):
         return Reason.AMBIGUOUS, f"{_wrong(candidate, risk)} ({figures})"
     if candidate.by_search:

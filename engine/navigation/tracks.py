@@ -16,7 +16,7 @@ import numpy as np
 from engine.matching.evidence import RELIABILITY, nats_of, needed_nats
 from engine.navigation.motion import Array, PositionEstimate, Step, Ways, en_m, place_of
 from engine.options import NavigatorOptions
-from engine.values import CHANCE, RISK, Fix
+from engine.values import RISK, SIGNIFICANCE, Fix
 
 MAX_TRACKS = 16
 MIN_FRAMES = 3
@@ -35,7 +35,7 @@ def stated_nats(fix: Fix) -> float:
 
     One that states none, as the paper's, is as good as a navigator asks for by default.
     """
-    return needed_nats(CHANCE) if fix.confidence is None else nats_of(fix.confidence)
+    return needed_nats(SIGNIFICANCE) if fix.confidence is None else nats_of(fix.confidence)
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ def told(site, camera, frame, prior, monkeypatch):
     """The answer of auto if NCC's fix is this far off, by the evidence for each; and SIFT's fix."""
 
     def answer(off_m, ncc_nats, sift_nats):
-        by_ncc, by_sift, seen = Ncc.look, Sift.locate, []
+        by_ncc, by_sift, seen = Ncc.by_telemetry, Sift.locate, []
 
         def off(self, query, *args, **kwargs):
             found = by_ncc(self, query, *args, **kwargs)
@@ -29,7 +29,7 @@ def told(site, camera, frame, prior, monkeypatch):
             seen.append(weighed(by_sift(self, query, *args), sift_nats))
             return seen[-1]
 
-        monkeypatch.setattr(Ncc, "look", off)
+        monkeypatch.setattr(Ncc, "by_telemetry", off)
         monkeypatch.setattr(Sift, "locate", noted)
         return SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior), seen[0].fix
 
