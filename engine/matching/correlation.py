@@ -14,7 +14,7 @@ from engine.kernels.scores import enhance
 from engine.maps.prepared import PreparedMap, Region
 from engine.matching import refusals
 from engine.matching.align import FRACTION, MIN_SHRINK, GroundView, Patch, rectify, view_of
-from engine.matching.oblique import is_oblique, oblique_patch
+from engine.matching.oblique import is_oblique, relief_patch
 from engine.matching.query import Query
 from engine.ncc_fft import match_template, surface
 from engine.options import NccOptions
@@ -46,6 +46,8 @@ class Aligned:
         view: how the ground is seen.
         patch: the rectified frame.
         template: (h, w) the patch, enhanced.
+        nadir_px: (2,) where the ground's relief was looked up; None takes it for level.
+        is_over_relief: whether it was drawn over that, and not on a plane.
     """
 
     pose: GridPose
@@ -54,6 +56,8 @@ class Aligned:
     view: GroundView
     patch: Patch
     template: NDArray[np.float32]
+    nadir_px: Array | None = None
+    is_over_relief: bool = False
 
     def work_px(self, window: Window) -> float:
         """Pixels of a window on this level."""
@@ -74,20 +78,22 @@ class Correlator:
     prepared: PreparedMap
     options: NccOptions
 
-    def align(self, pose: GridPose, level: int, nadir_px: Array | None = None) -> Aligned | NoFix:
+    def align(
+        self, pose: GridPose, level: int, nadir_px: Array | None = None, *, over_relief: bool = False
+    ) -> Aligned | NoFix:
         """Equations 2 and 3: the frame in the pixels of one map level.
 
         Args:
             pose: the height and heading to align it by.
             level: of the pyramid.
-            nadir_px: (2,) where to look up the ground of an oblique frame; None takes
-                the prior's place, or level ground.
+            nadir_px: (2,) where to look up the ground's relief; None takes the prior's place, or level ground.
+            over_relief: whether to draw the frame over the relief, as every oblique one is, and not on a plane.
         """
         query = self.query
         attitude, height = pose.known_attitude, pose.known_height_m
         jacobian = query.jacobian * 2.0**level
-        if is_oblique(query, attitude):
-            return self._align_oblique(pose, level, nadir_px)
+        if over_relief or is_oblique(query, attitude):
+            return self._align_over_relief(pose, level, nadir_px)
         view = view_of(query.camera, attitude, height, jacobian)
         if view is None:
             return refusals.tilted(query, attitude, METHOD)
@@ -98,34 +104,36 @@ class Correlator:
         if patch is None:
             detail = "the frame covers fewer than 8 x 8 pixels of the map"
             return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
-        enhanced = enhance(patch.gray)
-        return Aligned(pose, level, jacobian, view, patch, enhanced)
+        return Aligned(pose, level, jacobian, view, patch, enhance(patch.gray))
 
     def nowhere(self, aligned: Aligned) -> list[NDArray[np.uint8]]:
         """Patches for the null hypothesis, as large as the frame's: upside down, and mirrored.
 
         They show no place on Earth, unless the compass is wrong by half a turn or the camera mirrors its picture.
         """
-        query, own = self.query, aligned.patch.gray
-        turned, patch = np.ascontiguousarray(own[::-1, ::-1]), None
-        if not is_oblique(query, aligned.pose.known_attitude):
-            mirrored = np.ascontiguousarray(query.gray[:, ::-1])
-            patch = rectify(mirrored, query.camera, aligned.view)
-        return [turned, np.ascontiguousarray(own[:, ::-1]) if patch is None else patch.gray]
+        own = aligned.patch.gray
+        mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
+        again = replace(self, query=mirrored).align(
+            aligned.pose, aligned.level, aligned.nadir_px, over_relief=aligned.is_over_relief
+        )
+        turned, patch = np.ascontiguousarray(own[::-1, ::-1]), np.ascontiguousarray(own[:, ::-1])
+        if isinstance(again, Aligned) and again.patch.gray.shape == own.shape:
+            patch = again.patch.gray
+        return [turned, patch]
 
-    def _align_oblique(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
-        """An oblique frame drawn over the ground's relief; its view is that of the correlated part."""
+    def _align_over_relief(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
+        """The frame drawn over the ground's relief; its view is that of the correlated part."""
         query = self.query
         attitude, height = pose.known_attitude, pose.known_height_m
         place = query.prior_px if nadir_px is None else nadir_px
-        patch = oblique_patch(query, attitude, height, level, place)
+        patch = relief_patch(query, attitude, height, level, place)
         if patch is None:
             return refusals.tilted(query, attitude, METHOD)
         size = np.array(patch.gray.shape[::-1], np.float64)
         extent = (float(size[0]), float(size[1]))
         view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))
         enhanced = enhance(patch.gray)
-        return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, enhanced)
+        return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, enhanced, place, is_over_relief=True)
 
     def window(self, aligned: Aligned) -> Window | None:
         """The adaptive window in full-resolution map pixels; the whole map without a prior."""

@@ -1,4 +1,4 @@
-"""The part of an oblique frame to correlate: an upright rectangle over the relief, without the far field."""
+"""The part of a frame over relief to correlate: an upright rectangle without the far field."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def is_oblique(query: Query, attitude: Attitude) -> bool:
     return -float(query.camera.enu_from_camera(attitude)[2, 2]) < math.cos(math.radians(OBLIQUE_DEG))
 
 
-def oblique_patch(
+def relief_patch(
     query: Query, attitude: Attitude, height_m: float, level: int, nadir_px: Array | None
 ) -> Patch | None:
-    """The largest upright part of an oblique frame that shows ground of the map, in pixels of a level.
+    """The largest upright part of a frame over the relief that shows ground of the map, in pixels of a level.
 
     Args:
         query: the frame.

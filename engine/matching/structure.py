@@ -2,8 +2,9 @@
 
 Another season, year or sun changes grey levels and swaps the brighter side of an edge, but not the position and
 direction of edges. The surface is the mean over grey levels and both orientation channels
-(:func:`engine.kernels.scores.orientation`). Null-hypothesis templates, the frame's own upside down and mirrored,
-measure in the same window what chance reaches.
+(:func:`engine.kernels.scores.orientation`). With a surface model the frame is drawn over the ground's relief, and
+not on a plane, which takes longer. Null-hypothesis templates, the frame's own upside down and mirrored, measure in
+the same window what chance reaches.
 """
 
 from __future__ import annotations
@@ -86,14 +87,18 @@ def _on_level(correlator: Correlator, found: PeakCandidate, window: Window, coar
 
 
 def _coarser(correlator: Correlator, found: PeakCandidate, coarser: int) -> Aligned | None:
-    """The candidate's hypothesis so many levels above its own; None if it shows too little there."""
-    own = found.aligned
-    level = own.level + coarser
-    if coarser == 0:
+    """The candidate's hypothesis over the relief, so many levels above its own; None if it shows too little.
+
+    A peak that was refused by its own level is no better guess of the place than the prior.
+    """
+    own, site = found.aligned, correlator.query.site
+    if coarser == 0 and (own.is_over_relief or not site.has_surface):
         return own
-    if level >= correlator.query.site.levels or min(own.template.shape) >> coarser < MIN_SIDE_PX:
+    level = own.level + coarser
+    if coarser and (level >= site.levels or min(own.template.shape) >> coarser < MIN_SIDE_PX):
         return None
-    aligned = correlator.align(own.pose, level, correlator.nadir_px(found.peak, own))
+    place = correlator.nadir_px(found.peak, own) if coarser or correlator.query.prior is None else None
+    aligned = correlator.align(own.pose, level, place, over_relief=site.has_surface)
     return aligned if isinstance(aligned, Aligned) else None
 
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher
+from engine import Budget, Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher
+from engine.budget import Deadline
 from engine.kernels.dense import Pose
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.options import NccOptions
@@ -211,3 +212,21 @@ def test_over_slopes_the_peak_s_fix_stands(ground, site, camera, shape):
     frame, _ = seen(ground, camera, shape)
     peak, fix = (matcher_of(site, camera, refine).locate(frame, ground.prior(NADIR)) for refine in (False, True))
     assert px_off(fix, NADIR) < px_off(peak, NADIR) + 1.0
+
+
+def test_drawn_over_the_relief_a_frame_matches_steep_ground_better_than_on_a_plane(ground, camera):
+    """On a plane the hill's side is displaced; the efforts of a refused peak draw the frame over it."""
+    site, (frame, _) = site_on(ground, hill), seen(ground, camera, hill)
+    matcher = matcher_of(site, camera)
+    true = replace(frame, **ATTITUDE, height_agl_m=HEIGHT_M)
+    query = matcher._query(true, ground.prior(NADIR), Deadline(Budget()))
+    correlator = matcher._method._correlator(query)
+    scores = {}
+    for over_relief in (False, True):
+        aligned = correlator.align(query.telemetry, 0, over_relief=over_relief)
+        peak = correlator.search(aligned, correlator.window(aligned))
+        scores[over_relief] = peak.score
+        assert np.hypot(*(correlator.nadir_px(peak, aligned) - NADIR)) < (2.0 if over_relief else 10.0)
+        nowhere = correlator.nowhere(aligned)
+        assert [patch.shape for patch in nowhere] == [aligned.patch.gray.shape] * 2
+    assert scores[True] > scores[False] + 0.1
