@@ -131,7 +131,10 @@ class Refinement:
         return found.fix.refused(Reason.BAD_POSE, detail)
 
     def _or_doubted(self, found: PeakCandidate, own: PeakCandidate | None) -> PeakCandidate | None:
-        """The candidate refined by a known attitude, or as if that were hardly known; the more probable one."""
+        """The candidate refined by a known attitude, or as if that were hardly known; the more probable one.
+
+        Unless the other one is less probable than the allowed risk, the covariance covers it.
+        """
         doubting = self._doubting()
         try:
             other = doubting._weighed(found, doubting.refine_pose(found.fix), math.log(1.0 - RELIABILITY))
@@ -139,8 +142,12 @@ class Refinement:
             if own is None:
                 raise
             return own
-        both = [each for each in (own, other) if each is not None]
-        return max(both, key=lambda each: each.evidence.of_pose, default=None)
+        if own is None or other is None:
+            return own or other
+        worse, best = sorted((own, other), key=lambda each: each.evidence.of_pose)
+        if best.evidence.of_pose - worse.evidence.of_pose >= self.query.needed_nats:
+            return best
+        return replace(best, fix=reaching(best.fix, worse.fix))
 
     def _weighed(
         self, found: PeakCandidate, refined: Refined | None, log_prior: float = 0.0
@@ -238,10 +245,13 @@ class Refinement:
         covariance = pose_covariance[:3, :3].copy()
         height_m = fit.pose.center_m[2] - query.site.ground_m
         covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
-        slope_rad = 0.0
-        if not query.site.has_surface and not self._knows_tilt:  # a slope of the ground was mistaken for a tilt
+        slope_rad, slope = 0.0, fit.pose.slope
+        if self._is_on_unknown_slope:  # it may be a tilt of the camera, which looks the same
+            slope_rad = math.hypot(*slope)
+            covariance[:2, :2] += height_m**2 * slope[:, None] * slope
+        elif not query.site.has_surface:  # and a tilt may be a slope of the ground
             slope_rad = math.radians(errors.unknown_slope_deg)
-        covariance[:2, :2] += (height_m * slope_rad) ** 2 * np.eye(2)
+            covariance[:2, :2] += (height_m * slope_rad) ** 2 * np.eye(2)
         nadir_px = query.site.pixel_from_enu(fit.pose.center_m[:2])
         doubt_m = query.scale_doubt_m(nadir_px, float(fit.pose.center_m[2]), fit.pose.rotation[2], errors)
         covariance[:2, :2] += doubt_m**2 * np.eye(2)
