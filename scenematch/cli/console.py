@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scenematch.cli.argument_names import as_typed
@@ -38,7 +39,7 @@ def next_step(command: str, *, as_json: bool = False, hint: str = "") -> None:
     Args:
         command: without the program's name; what the user must still choose is in capitals.
         as_json: whether the results went to a program.
-        hint: what to do before it, such as a file to open.
+        hint: what to do before it, such as a file to open, or what to repeat.
     """
     if not as_json:
         say(f"next: {f'{hint}; ' if hint else ''}scenematch {command}")
@@ -49,10 +50,11 @@ def quoted(value: object) -> str:
     return shlex.quote(str(value))
 
 
-def options(**values: object) -> str:
-    """Options with their values as the user types them, without those that are None: ``log_offset_s=2``."""
-    given = ((name, value) for name, value in values.items() if value is not None)
-    return " ".join(f"--{name.replace('_', '-')} {quoted(value)}" for name, value in given)
+def after_track(out: Path, fixes: float, *, as_json: bool = False) -> None:
+    """Suggest what follows a track: its export, or a check if it has no fix."""
+    command = f"export {quoted(out)} --format geojson" if fixes else "check"
+    hint = f"open {quoted(out / 'report.html')}" + ("" if fixes else "; with the same files")
+    next_step(command, as_json=as_json, hint=hint)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Options that several commands share, the objects they build, and how to print them for the next command.
+"""Options that several commands share, and the objects they build.
 
 Options:
     surface: Surface model, a GeoTIFF of heights.
@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from scenematch.cli import console
 from scenematch.cli.argument_names import name_settings
 from scenematch.files.settings import field_descriptions
 
@@ -239,28 +238,3 @@ def live_view(rerun: Sequence[str] | None) -> LiveViewTarget:
             raise OptionError(f"{kind}: expected one file and one viewer at most, got {given[kind]} and {text}")
         given[kind] = text
     return LiveViewTarget(**given)
-
-
-def flight_options(files: FlightFiles, *, settings: Sequence[str] | None = None, start: str | None = None) -> str:
-    """The files of a flight with their settings, typed as options of `check` and `track`."""
-    from scenematch.runs.settings import InputSettings
-
-    values = files.flat()
-    named = {each.name: values[each.name] for each in fields(FlightOptions)}
-    if settings is None:
-        nothing = InputSettings()
-        rest = {name: values[name] for name in nothing.of(type(files), type(files.map), type(files.camera))}
-        changed = {name: value for name, value in rest.items() if value != getattr(nothing, name)}
-        settings = [f"input.{name}={str(v).lower() if v is True else v}" for name, v in changed.items()]
-    words = [f"--correct {console.quoted(text)}" for text in files.corrections.texts()]
-    words += [f"--settings {console.quoted(text)}" for text in settings]
-    return " ".join([console.options(**named, start=start), *words])
-
-
-def after_track(
-    files: FlightFiles, out: Path, fixes: int, *, settings: Sequence[str] | None = None, start: str | None = None
-) -> str:
-    """The next command after a track: its export, or if it has no fix, a check."""
-    if fixes:
-        return f"export {console.quoted(out)} --format geojson"
-    return f"check {flight_options(files, settings=settings, start=start)}"

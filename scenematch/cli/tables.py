@@ -24,7 +24,7 @@ _RUN = (
 
 
 def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Path) -> None:
-    """Print the figures of a track, and where its files are."""
+    """Print the figures of a track, where its files are, and what to do next."""
     if as_json:
         console.print_json(summary)
         return
@@ -37,6 +37,7 @@ def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Pa
     pairs += list((summary["settings"].get("diagnosis") or {}).items())
     console.print_pairs(title, pairs)
     console.say(f"written to {out}")
+    console.after_track(out, summary["fixes"])
 
 
 def print_comparison(results: Mapping[str, Mapping[str, Any]], title: str) -> None:

@@ -104,18 +104,16 @@ def mavlink(
         measure_delay: Measure the camera's latency, then exit.
         supervise: Keep a loaded standby process that takes over if the worker dies.
     """
-    given, hint = options.read_settings(settings), ""
+    given = options.read_settings(settings)
     if out is not None:
-        following = _write_parameters(autopilot, given, out, force, as_json)
-        hint = f"load {out} into the autopilot"
+        _write_parameters(autopilot, given, out, force, as_json)
     elif autopilot.connect is None:
         raise OptionError("connect: expected a link to the autopilot, got none")
     elif measure_delay:
-        following = _measure_delay(autopilot, pictures, given, as_json)
+        _measure_delay(autopilot, pictures, given, as_json)
     else:
         shown = options.live_view(rerun)
-        following = _bridge(autopilot, pictures, matching, site, given, supervise, shown, as_json)
-    console.next_step(following, as_json=as_json, hint=hint)
+        _bridge(autopilot, pictures, matching, site, given, supervise, shown, as_json)
 
 
 def _bridge(
@@ -127,8 +125,8 @@ def _bridge(
     supervise: bool,
     shown: LiveViewTarget,
     as_json: bool,
-) -> str:
-    """Run the bridge to its end; returns the next command."""
+) -> None:
+    """Run the bridge to its end."""
     from scenematch.runs.bridge_files import BridgeFiles
     from scenematch.runs.mavlink_bridge import run_mavlink_bridge
 
@@ -143,16 +141,11 @@ def _bridge(
     link, how = autopilot.link(given), _bridge_settings(matching, given)
     status = run_mavlink_bridge(files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"{link.kind} to {link.connect}")
-    flown = console.options(
-        map=site.map, surface=site.surface, camera=pictures.camera, hfov_deg=pictures.hfov_deg,
-        frames=pictures.frames, telemetry=pictures.telemetry,
-    )  # fmt: skip
-    recorded = "" if pictures.frames else " --frames VIDEO --telemetry LOG"
-    return f"track {flown}{recorded} --out out"
+    console.next_step("track --map MAP --frames VIDEO --telemetry LOG --out out", as_json=as_json)
 
 
-def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings, as_json: bool) -> str:
-    """Measure and print; returns the next command."""
+def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings, as_json: bool) -> None:
+    """Measure and print."""
     from scenematch.runs.camera_delay import measure_camera_delay
 
     source = pictures.camera_source
@@ -165,15 +158,12 @@ def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: S
     delay_ms = round(1e3 * found.delay_s)
     values = {"exposure_to_grab_ms": delay_ms, "correlation": found.correlation}
     console.facts(values, as_json, title=f"camera {source}")
-    same = console.options(
-        connect=link.connect, camera=pictures.camera, hfov_deg=pictures.hfov_deg, camera_source=source,
-        settings=f"input.exposure_to_grab_ms={delay_ms}",
-    )  # fmt: skip
-    return f"bridge mavlink --map MAP {same}"
+    measured = f"--settings input.exposure_to_grab_ms={delay_ms}"
+    console.next_step(f"bridge mavlink --map MAP {measured}", as_json=as_json, hint="with the same options")
 
 
-def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, force: bool, as_json: bool) -> str:
-    """Write the file and say so; returns the next command."""
+def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, force: bool, as_json: bool) -> None:
+    """Write the file and say so."""
     from scenematch.runs.mavlink_parameters import write_parameter_file
 
     wanted = table(settings, "parameters")
@@ -182,7 +172,8 @@ def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, fo
         console.print_json({"parameters": str(file), "delay_ms": wanted.delay_ms})
     else:
         console.say(f"written to {file}, for a delay of {wanted.delay_ms} ms")
-    return "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE"
+    following = "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE"
+    console.next_step(following, as_json=as_json, hint=f"load {file} into the autopilot")
 
 
 @with_options
@@ -228,5 +219,4 @@ def ros(
     how = _bridge_settings(matching, given)
     status = run_ros_bridge(node, how, live_view=options.live_view(rerun), progress=console.PROGRESS)
     console.facts(asdict(status), as_json, title=f"ROS {version} on {node.topics.image}")
-    flown = console.options(map=site.map, surface=site.surface)
-    console.next_step(f"track {flown} --frames BAG --out out", as_json=as_json)
+    console.next_step("track --map MAP --frames BAG --out out", as_json=as_json)

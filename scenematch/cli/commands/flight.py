@@ -37,8 +37,7 @@ def check(
     else:
         rows = as_rows(found, corrected=not files.corrections.changes_nothing)
         console.print_pairs(f"check of {flight.frames}", rows)
-    following = options.flight_options(files, settings=settings, start=start)
-    console.next_step(f"track {following} --out out", as_json=as_json)
+    console.next_step("track --out out", as_json=as_json, hint="with the same files")
 
 
 @with_options
@@ -74,8 +73,6 @@ def track(
     summary = track_flight(files, out, how, force=force, live_view=shown, progress=console.PROGRESS)
     title = f"{how.method} ({how.profile} profile) on {flight.frames}"
     tables.print_summary(summary, as_json, title=title, out=out)
-    following = options.after_track(files, out, summary["fixes"], settings=settings, start=start)
-    console.next_step(following, as_json=as_json, hint=f"open {out / 'report.html'}")
 
 
 @with_options
@@ -102,16 +99,15 @@ def compare(
 
     given = options.read_settings(settings)
     parsed = parse_runs(runs or [], settings=settings or (), start=start)
-    files = flight.files(given)
-    results = compare_runs(files, out, parsed, force=force, progress=console.PROGRESS)
+    results = compare_runs(flight.files(given), out, parsed, force=force, progress=console.PROGRESS)
     if as_json:
         console.print_json(results)
     else:
         tables.print_comparison(results, str(flight.frames))
         console.say(f"written to {out}")
     drawn = out / COMPARISON if (out / COMPARISON).is_file() else out
-    following = f"track {options.flight_options(files, settings=settings, start=start)} --out out"
-    console.next_step(following, as_json=as_json, hint=f"open {console.quoted(drawn)}")
+    hint = f"open {console.quoted(drawn)}; with the same files"
+    console.next_step("track --out out", as_json=as_json, hint=hint)
 
 
 @with_options
@@ -133,16 +129,11 @@ def evaluate(
         out: Page that compares several runs (default: comparison.html).
     """
     from scenematch.runs.evaluation import evaluate as evaluate_track
-    from scenematch.runs.evaluation import recorded_files, report
-    from scenematch.runs.record import read_record
-    from scenematch.runs.results import PAGE, SUMMARY
+    from scenematch.runs.evaluation import report
 
     if len(runs) == 1 and out is None:
         summary = evaluate_track(runs[0], truth, force=force, progress=console.PROGRESS)
         tables.print_summary(summary, as_json, title=f"track in {runs[0]}", out=runs[0])
-        record = read_record(runs[0] / SUMMARY)
-        following = options.after_track(recorded_files(record), runs[0], summary["fixes"], start=record.start)
-        console.next_step(following, as_json=as_json, hint=f"open {runs[0] / PAGE}")
         return
     if truth is not None:
         raise OptionError("truth: expected with one run only")
@@ -177,7 +168,4 @@ def export(
 
     facts = export_track(directory, kind, out, truth=truth, force=force)
     console.facts(facts, as_json, title=f"track in {directory}")
-    if kind == "tum" and truth is None:
-        console.next_step(f"export {console.quoted(directory)} --format tum --truth TRUTH", as_json=as_json)
-    else:
-        console.next_step(f"evaluate {console.quoted(directory)} OTHER_RUN", as_json=as_json)
+    console.next_step(f"evaluate {console.quoted(directory)} OTHER_RUN", as_json=as_json)

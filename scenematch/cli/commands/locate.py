@@ -62,11 +62,10 @@ def locate(
     facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)
     facts["latency_ms"] = result.timings.total_ms
     console.facts(facts, as_json, title=str(image))
-    if isinstance(result, Fix):
-        console.next_step(f"track {console.options(map=site.map)} --frames FRAMES --out out", as_json=as_json)
-    else:
-        console.next_step(f"map info {console.quoted(site.map)}", as_json=as_json)
-    raise typer.Exit(0 if isinstance(result, Fix) else 1)
+    found, place = isinstance(result, Fix), console.quoted(site.map)
+    following = f"track --map {place} --frames FRAMES --out out" if found else f"map info {place}"
+    console.next_step(following, as_json=as_json)
+    raise typer.Exit(0 if found else 1)
 
 
 def _fix_facts(fix: Fix, as_json: bool) -> dict[str, Any]:

@@ -80,8 +80,7 @@ def audit(
     else:
         tables.print_audit(result, str(map_path))
         console.say(f"written to {out}")
-    files_given = console.options(map=map_path, surface=surface, camera=camera)
-    console.next_step(f"track {files_given} --frames FRAMES --out out", as_json=as_json)
+    console.next_step(f"track --map {console.quoted(map_path)} --frames FRAMES --out out", as_json=as_json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,9 +129,6 @@ def fetch(
     facts = fetch_map(wanted, out, console.PROGRESS)
     console.facts(facts, as_json, title=f"map around {what.around}")
     if dry_run:
-        place = console.options(around=what.around, radius_m=what.radius_m)
-        console.next_step(
-            f"map fetch {place} --source URL --out FILE", as_json=as_json, hint="leave out --dry-run"
-        )
+        console.next_step("map fetch", as_json=as_json, hint="with the same options, without --dry-run")
     else:
         console.next_step(f"map info {console.quoted(out)}", as_json=as_json)

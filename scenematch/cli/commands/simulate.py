@@ -128,10 +128,9 @@ def simulate(
         check_unused(given | {"rerun": rerun}, "closed_loop")
         facts = simulate_flight(out, world, frames=frames, force=force, progress=console.PROGRESS)
     console.facts(facts, as_json, title=f"simulated flight {town.seed}")
-    flight = {name: out / file for name, file in FOLDER_LAYOUT.items() if name != "truth"}
-    if not loop.closed_loop:
-        console.next_step(f"track {console.options(**flight, out=f'{out}-track')}", as_json=as_json)
+    if loop.closed_loop:
+        console.after_track(out, facts["availability"], as_json=as_json)
         return
-    export = f"export {console.quoted(out)} --format geojson"
-    following = export if facts["availability"] else f"check {console.options(**flight)}"
-    console.next_step(following, as_json=as_json, hint=f"open {out / 'report.html'}")
+    paths = {name: out / file for name, file in FOLDER_LAYOUT.items() if name != "truth"} | {"out": f"{out}-track"}
+    given_again = " ".join(f"--{name} {console.quoted(path)}" for name, path in paths.items())
+    console.next_step(f"track {given_again}", as_json=as_json)
