@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from scenematch.cli import console
 from scenematch.cli.argument_names import name_settings
 from scenematch.files.settings import field_descriptions
 
@@ -150,7 +151,7 @@ class MatchingOptions:
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace a command's parameters of the types above by their fields, one option each.
+    """Replace a command's parameters of the types above by their fields, one option each, and add ``--json``.
 
     The help of an option is its description in a docstring: under "Options" of the command, whose own help leaves
     them out, under "Attributes" of the type, or for shared options under "Options" of this module.
@@ -176,8 +177,13 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
             default = inspect.Parameter.empty if each.default is MISSING else each.default
             parameters.append(inspect.Parameter(each.name, keyword, default=default, annotation=types[each.name]))
 
+    _describe(JsonOption, _SHARED["as_json"])
+    json = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=JsonOption)
+    parameters.append(json)
+
     @wraps(command)
-    def call(**given: Any) -> None:
+    def call(*, as_json: bool, **given: Any) -> None:
+        console.AS_JSON.set(as_json)
         made = {
             name: kind(**{each.name: given.pop(each.name) for each in fields(kind)})
             for name, kind in groups.items()

@@ -23,10 +23,9 @@ _RUN = (
 """Columns of a table of runs, after the name: head, figure, form."""
 
 
-def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Path) -> None:
+def print_summary(summary: Mapping[str, Any], title: str, out: Path) -> None:
     """Print the figures of a track, where its files are, and what to do next."""
-    if as_json:
-        console.print_json(summary)
+    if console.answered_as_json(summary):
         return
     from scenematch.report.verdict import key_figures
 

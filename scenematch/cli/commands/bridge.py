@@ -90,7 +90,6 @@ def mavlink(
     settings: options.SettingsOption = None,
     rerun: options.RerunOption = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Send fixes to an autopilot by MAVLink.
 
@@ -106,14 +105,14 @@ def mavlink(
     """
     given = options.read_settings(settings)
     if out is not None:
-        _write_parameters(autopilot, given, out, force, as_json)
+        _write_parameters(autopilot, given, out, force)
     elif autopilot.connect is None:
         raise OptionError("connect: expected a link to the autopilot, got none")
     elif measure_delay:
-        _measure_delay(autopilot, pictures, given, as_json)
+        _measure_delay(autopilot, pictures, given)
     else:
         shown = options.live_view(rerun)
-        _bridge(autopilot, pictures, matching, site, given, supervise, shown, as_json)
+        _bridge(autopilot, pictures, matching, site, given, supervise, shown)
 
 
 def _bridge(
@@ -124,7 +123,6 @@ def _bridge(
     given: Settings,
     supervise: bool,
     shown: LiveViewTarget,
-    as_json: bool,
 ) -> None:
     """Run the bridge to its end."""
     from scenematch.runs.bridge_files import BridgeFiles
@@ -140,11 +138,11 @@ def _bridge(
     )
     link, how = autopilot.link(given), _bridge_settings(matching, given)
     status = run_mavlink_bridge(files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS)
-    console.facts(asdict(status), as_json, title=f"{link.kind} to {link.connect}")
-    console.next_step("track --map MAP --frames VIDEO --telemetry LOG --out out", as_json=as_json)
+    console.facts(asdict(status), title=f"{link.kind} to {link.connect}")
+    console.next_step("track --map MAP --frames VIDEO --telemetry LOG --out out")
 
 
-def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings, as_json: bool) -> None:
+def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings) -> None:
     """Measure and print."""
     from scenematch.runs.camera_delay import measure_camera_delay
 
@@ -157,23 +155,21 @@ def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: S
     found = measure_camera_delay(link, camera, source, seconds=seconds, progress=console.PROGRESS)
     delay_ms = round(1e3 * found.delay_s)
     values = {"exposure_to_grab_ms": delay_ms, "correlation": found.correlation}
-    console.facts(values, as_json, title=f"camera {source}")
+    console.facts(values, title=f"camera {source}")
     measured = f"--settings input.exposure_to_grab_ms={delay_ms}"
-    console.next_step(f"bridge mavlink --map MAP {measured}", as_json=as_json, hint="with the same options")
+    console.next_step(f"bridge mavlink --map MAP {measured}", hint="with the same options")
 
 
-def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, force: bool, as_json: bool) -> None:
+def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, force: bool) -> None:
     """Write the file and say so."""
     from scenematch.runs.mavlink_parameters import write_parameter_file
 
     wanted = table(settings, "parameters")
     write_parameter_file(file, autopilot.link(settings), wanted, force=force)
-    if as_json:
-        console.print_json({"parameters": str(file), "delay_ms": wanted.delay_ms})
-    else:
+    if not console.answered_as_json({"parameters": str(file), "delay_ms": wanted.delay_ms}):
         console.say(f"written to {file}, for a delay of {wanted.delay_ms} ms")
     following = "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE"
-    console.next_step(following, as_json=as_json, hint=f"load {file} into the autopilot")
+    console.next_step(following, hint=f"load {file} into the autopilot")
 
 
 @with_options
@@ -187,7 +183,6 @@ def ros(
     firmware: Annotated[str | None, option("--firmware", "none|ardupilot|px4", INPUT)] = None,
     settings: options.SettingsOption = None,
     rerun: options.RerunOption = None,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Run as a node of ROS 1 or ROS 2.
 
@@ -218,5 +213,5 @@ def ros(
         node = replace(node, topics=replace(node.topics, image=image))
     how = _bridge_settings(matching, given)
     status = run_ros_bridge(node, how, live_view=options.live_view(rerun), progress=console.PROGRESS)
-    console.facts(asdict(status), as_json, title=f"ROS {version} on {node.topics.image}")
-    console.next_step("track --map MAP --frames BAG --out out", as_json=as_json)
+    console.facts(asdict(status), title=f"ROS {version} on {node.topics.image}")
+    console.next_step("track --map MAP --frames BAG --out out")

@@ -19,7 +19,6 @@ def check(
     correct: options.CorrectOption = None,
     start: options.StartOption = None,
     settings: options.SettingsOption = None,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Find errors in a flight's inputs.
 
@@ -32,12 +31,10 @@ def check(
     files = flight.files(given, correct)
     names = given.track().telemetry_columns
     found = diagnose_flight(files, start, columns=names, progress=console.PROGRESS)
-    if as_json:
-        console.print_json(asdict(found))
-    else:
+    if not console.answered_as_json(asdict(found)):
         rows = as_rows(found, corrected=not files.corrections.changes_nothing)
         console.print_pairs(f"check of {flight.frames}", rows)
-    console.next_step("track --out out", as_json=as_json, hint="with the same files")
+    console.next_step("track --out out", hint="with the same files")
 
 
 @with_options
@@ -53,7 +50,6 @@ def track(
     settings: options.SettingsOption = None,
     rerun: options.RerunOption = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Track a flight; write track.csv and a report.
 
@@ -72,7 +68,7 @@ def track(
     shown = options.live_view(rerun)
     summary = track_flight(files, out, how, force=force, live_view=shown, progress=console.PROGRESS)
     title = f"{how.method} ({how.profile} profile) on {flight.frames}"
-    tables.print_summary(summary, as_json, title=title, out=out)
+    tables.print_summary(summary, title=title, out=out)
 
 
 @with_options
@@ -83,7 +79,6 @@ def compare(
     start: options.StartOption = None,
     settings: options.SettingsOption = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Compare methods or settings on one flight.
 
@@ -100,14 +95,12 @@ def compare(
     given = options.read_settings(settings)
     parsed = parse_runs(runs or [], settings=settings or (), start=start)
     results = compare_runs(flight.files(given), out, parsed, force=force, progress=console.PROGRESS)
-    if as_json:
-        console.print_json(results)
-    else:
+    if not console.answered_as_json(results):
         tables.print_comparison(results, str(flight.frames))
         console.say(f"written to {out}")
     drawn = out / COMPARISON if (out / COMPARISON).is_file() else out
     hint = f"open {console.quoted(drawn)}; with the same files"
-    console.next_step("track --out out", as_json=as_json, hint=hint)
+    console.next_step("track --out out", hint=hint)
 
 
 @with_options
@@ -116,7 +109,6 @@ def evaluate(
     truth: Annotated[Path | None, option("--truth", "FILE")] = None,
     out: Annotated[Path | None, option("--out", "FILE", OUTPUT)] = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Score finished tracks and redraw their reports.
 
@@ -133,16 +125,14 @@ def evaluate(
 
     if len(runs) == 1 and out is None:
         summary = evaluate_track(runs[0], truth, force=force, progress=console.PROGRESS)
-        tables.print_summary(summary, as_json, title=f"track in {runs[0]}", out=runs[0])
+        tables.print_summary(summary, title=f"track in {runs[0]}", out=runs[0])
         return
     if truth is not None:
         raise OptionError("truth: expected with one run only")
     page = report(runs, out, force=force, progress=console.PROGRESS)
-    if as_json:
-        console.print_json({"report": str(page.resolve()), "runs": [str(run) for run in runs]})
-    else:
+    if not console.answered_as_json({"report": str(page.resolve()), "runs": [str(run) for run in runs]}):
         console.say(f"written to {page}")
-    console.next_step(f"export {console.quoted(runs[0])} --format geojson", as_json=as_json, hint=f"open {page}")
+    console.next_step(f"export {console.quoted(runs[0])} --format geojson", hint=f"open {page}")
 
 
 @with_options
@@ -152,7 +142,6 @@ def export(
     out: Annotated[Path | None, option("--out", "FILE", OUTPUT)] = None,
     truth: Annotated[Path | None, option("--truth", "FILE")] = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Export a finished track as GPX, GeoJSON or TUM.
 
@@ -167,5 +156,5 @@ def export(
     from scenematch.runs.track_export import export_track
 
     facts = export_track(directory, kind, out, truth=truth, force=force)
-    console.facts(facts, as_json, title=f"track in {directory}")
-    console.next_step(f"evaluate {console.quoted(directory)} OTHER_RUN", as_json=as_json)
+    console.facts(facts, title=f"track in {directory}")
+    console.next_step(f"evaluate {console.quoted(directory)} OTHER_RUN")

@@ -20,7 +20,6 @@ def demo(
     frames: Annotated[int | None, option("--frames", "N", min=2)] = None,
     seed: Annotated[int, option("--seed", "N", min=0)] = 1,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Track a built-in flight with both methods.
 
@@ -36,14 +35,10 @@ def demo(
 
     options.use_threads()
     results = run_demo(out, frames=frames, seed=seed, force=force, progress=console.PROGRESS)
-    if as_json:
-        console.print_json(results)
-    else:
+    if not console.answered_as_json(results):
         tables.print_paper_table(results, seed)
     console.say(f"report: {out.resolve()}")
-    console.next_step(
-        "check --map MAP --frames FRAMES", as_json=as_json, hint=f"open {out}/ncc-engine/report.html"
-    )
+    console.next_step("check --map MAP --frames FRAMES", hint=f"open {out}/ncc-engine/report.html")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +92,6 @@ def simulate(
     frames: Annotated[int | None, option("--frames", "N", min=1)] = None,
     rerun: options.RerunOption = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate a flight, with ground truth.
 
@@ -127,10 +121,10 @@ def simulate(
 
         check_unused(given | {"rerun": rerun}, "closed_loop")
         facts = simulate_flight(out, world, frames=frames, force=force, progress=console.PROGRESS)
-    console.facts(facts, as_json, title=f"simulated flight {town.seed}")
+    console.facts(facts, title=f"simulated flight {town.seed}")
     if loop.closed_loop:
-        console.after_track(out, facts["availability"], as_json=as_json)
+        console.after_track(out, facts["availability"])
         return
     paths = {name: out / file for name, file in FOLDER_LAYOUT.items() if name != "truth"} | {"out": f"{out}-track"}
     given_again = " ".join(f"--{name} {console.quoted(path)}" for name, path in paths.items())
-    console.next_step(f"track {given_again}", as_json=as_json)
+    console.next_step(f"track {given_again}")
