@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("bare_runs")
 @pytest.mark.parametrize("words", LEAVES, ids=" ".join)
 def test_every_command_says_what_is_next(words):
     """By itself, or by the function that ends it."""
-    ending = r"next_step\(|after_track\(|print_summary\(|_bridge\(|_measure_delay\(|_write_parameters\("
+    ending = r"next_step\(|after_track\(|print_summary\(|_measure_delay\(|_write_parameters\("
     assert re.search(ending, inspect.getsource(inspect.unwrap(LEAVES[words].callback)))
 
 

@@ -13,7 +13,7 @@ from scenematch.cli import console, options
 from scenematch.cli.options import EXPERT, INPUT, MAP, OUTPUT, flag, option, table, with_options
 
 if TYPE_CHECKING:
-    from scenematch.runs.live_viewing import LiveViewTarget
+    from scenematch.runs.bridge_files import BridgeFiles
     from scenematch.runs.map_input import MapInput
     from scenematch.runs.mavlink_bridge import BridgeSettings, MavlinkSettings
     from scenematch.runs.settings import Settings
@@ -38,21 +38,6 @@ class LinkOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureOptions(options.CameraOptions):
-    """The camera, or recorded pictures.
-
-    Attributes:
-        frames: Recorded pictures, replayed in real time.
-        telemetry: telemetry.csv that times the replay (default: the video's own timestamps).
-        camera_source: A camera, a stream, or a command that writes JPEGs.
-    """
-
-    frames: Annotated[Path | None, option("--frames", "DIR|VIDEO", INPUT)] = None
-    telemetry: Annotated[Path | None, option("--telemetry", "FILE", INPUT)] = None
-    camera_source: Annotated[str | None, option("--camera-source", "N|URL|exec:CMD", INPUT)] = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class OptionalMapOptions:
     """The map, needed only to send fixes.
 
@@ -68,6 +53,34 @@ class OptionalMapOptions:
         if self.map is None:
             raise OptionError("map: expected a file, got none")
         return options.MapOptions(map=self.map, surface=self.surface).map_input(settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions(options.CameraOptions):
+    """The camera, or recorded pictures.
+
+    Attributes:
+        frames: Recorded pictures, replayed in real time.
+        telemetry: telemetry.csv that times the replay (default: the video's own timestamps).
+        camera_source: A camera, a stream, or a command that writes JPEGs.
+    """
+
+    frames: Annotated[Path | None, option("--frames", "DIR|VIDEO", INPUT)] = None
+    telemetry: Annotated[Path | None, option("--telemetry", "FILE", INPUT)] = None
+    camera_source: Annotated[str | None, option("--camera-source", "N|URL|exec:CMD", INPUT)] = None
+
+    def files(self, site: OptionalMapOptions, settings: Settings) -> BridgeFiles:
+        """The map and the pictures combined with their settings."""
+        from scenematch.runs.bridge_files import BridgeFiles
+
+        return BridgeFiles(
+            map=site.map_input(settings),
+            camera=self.camera_input(settings),
+            frames=self.frames,
+            telemetry=self.telemetry,
+            camera_source=self.camera_source,
+            **table(settings, "input").of(BridgeFiles),
+        )
 
 
 def _bridge_settings(matching: options.MatchingOptions, settings: Settings) -> BridgeSettings:
@@ -111,35 +124,15 @@ def mavlink(
     elif measure_delay:
         _measure_delay(autopilot, pictures, given)
     else:
+        from scenematch.runs.mavlink_bridge import run_mavlink_bridge
+
+        files, link, how = pictures.files(site, given), autopilot.link(given), _bridge_settings(matching, given)
         shown = options.live_view(rerun)
-        _bridge(autopilot, pictures, matching, site, given, supervise, shown)
-
-
-def _bridge(
-    autopilot: LinkOptions,
-    pictures: PictureOptions,
-    matching: options.MatchingOptions,
-    site: OptionalMapOptions,
-    given: Settings,
-    supervise: bool,
-    shown: LiveViewTarget,
-) -> None:
-    """Run the bridge to its end."""
-    from scenematch.runs.bridge_files import BridgeFiles
-    from scenematch.runs.mavlink_bridge import run_mavlink_bridge
-
-    files = BridgeFiles(
-        map=site.map_input(given),
-        camera=pictures.camera_input(given),
-        frames=pictures.frames,
-        telemetry=pictures.telemetry,
-        camera_source=pictures.camera_source,
-        **table(given, "input").of(BridgeFiles),
-    )
-    link, how = autopilot.link(given), _bridge_settings(matching, given)
-    status = run_mavlink_bridge(files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS)
-    console.facts(asdict(status), title=f"{link.kind} to {link.connect}")
-    console.next_step("track --map MAP --frames VIDEO --telemetry LOG --out out")
+        status = run_mavlink_bridge(
+            files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS
+        )
+        console.facts(asdict(status), title=f"{link.kind} to {link.connect}")
+        console.next_step("track --map MAP --frames VIDEO --telemetry LOG --out out")
 
 
 def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings) -> None:
