@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from bench.accuracy.rebuilt import rebuilt
 from bench.accuracy.shutter import Shutter, ShutterFlight
 from bench.accuracy.truth import answered, pooled, rows_of, true_start
 from bench.command import parser_on_one_thread
@@ -94,9 +95,10 @@ def flights(seeds: tuple[int, ...], frames: int | None) -> Iterator[Run]:
 def harder(seeds: tuple[int, ...], frames: int | None) -> Iterator[Run]:
     """What the first table leaves out, by the engine alone."""
     for name, options in HARDER.items():
-        town = {key: value for key, value in options.items() if key != "shutter"}
+        town = {key: value for key, value in options.items() if key not in ("shutter", "changed")}
         for seed in seeds:
-            plan = plan_flight(seed, frames=frames, rate_hz=RATE_HZ, **town)
+            rebuild = rebuilt(seed, options.get("changed", 0.0))
+            plan = plan_flight(seed, frames=frames, rate_hz=RATE_HZ, rebuild=rebuild, **town)
             plan = ShutterFlight.of(plan, options["shutter"]) if "shutter" in options else plan
             yield from fly(plan, matchers(plan, WAYS[:2]), name)
 
