@@ -104,7 +104,7 @@ def run_ros_bridge(
     camera = None if ros.camera.camera is None else ros.camera.load(None)
     node = node or _node(ros.version, ros.arguments)
     camera = camera or _heard_camera(node, ros, progress)
-    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher)
+    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
 

@@ -153,7 +153,14 @@ class FlightPlan:
             yield self._frame(k, rng)
 
     def moments(self, k: int) -> Sequence[Float32]:
-        """Of a picture's exposure, see :func:`scenematch.simulator.optics.take_picture`; none freezes motion."""
+        """Moments of a picture's exposure; none freezes motion.
+
+        Args:
+            k: index of the frame.
+
+        Returns:
+            (H, W, 2) each, see :func:`scenematch.simulator.optics.take_picture`.
+        """
         return ()
 
     def _frame(self, k: int, rng: np.random.Generator) -> Frame:

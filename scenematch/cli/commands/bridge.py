@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -86,8 +86,9 @@ class PictureOptions(options.CameraOptions):
 def _bridge_settings(matching: options.MatchingOptions, settings: Settings) -> BridgeSettings:
     """How a bridge matches frames: the options combined with the settings."""
     how = matching.track_settings(settings)
-    same = {name: getattr(how, name) for name in ("method", "device", "start", "navigator")}
-    made: BridgeSettings = table(settings, "bridge", **same, matcher=how)
+    made: BridgeSettings = table(
+        settings, "bridge", **{each.name: getattr(how, each.name) for each in fields(how)}
+    )
     return made
 
 
