@@ -81,8 +81,7 @@ class MapOptions:
         """The map combined with its settings."""
         from scenematch.runs.map_input import MapInput
 
-        rest = table(settings, "input").of(MapInput)
-        return MapInput(self.map, surface=self.surface, **rest)
+        return MapInput(self.map, surface=self.surface, **table(settings, "input").of(MapInput))
 
 
 @dataclass(frozen=True, kw_only=True)

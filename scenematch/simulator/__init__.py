@@ -3,7 +3,6 @@
 from scenematch.simulator.conditions import CONDITIONS, Condition
 from scenematch.simulator.flight import FlightPlan, picture_at, plan_flight
 from scenematch.simulator.light import LIGHTS, Light
-from scenematch.simulator.optics import take_picture
 from scenematch.simulator.raster_world import world_from_map
 from scenematch.simulator.render import World, render_frame
 from scenematch.simulator.town import Town, build_town
@@ -24,6 +23,5 @@ __all__ = [
     "picture_at",
     "plan_flight",
     "render_frame",
-    "take_picture",
     "world_from_map",
 ]

@@ -86,9 +86,8 @@ class PictureOptions(options.CameraOptions):
 def _bridge_settings(matching: options.MatchingOptions, settings: Settings) -> BridgeSettings:
     """How a bridge matches frames: the options combined with the settings."""
     how = matching.track_settings(settings)
-    made: BridgeSettings = table(
-        settings, "bridge", **{each.name: getattr(how, each.name) for each in fields(how)}
-    )
+    same = {each.name: getattr(how, each.name) for each in fields(how)}
+    made: BridgeSettings = table(settings, "bridge", **same)
     return made
 
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from engine.errors import OptionError
 from scenematch.cli import console, options, tables
 from scenematch.cli.options import MAP, OUTPUT, flag, option, with_options
-
-if TYPE_CHECKING:
-    from scenematch.runs.simulation import WorldSettings
 
 
 @with_options
@@ -60,12 +57,6 @@ class WorldOptions:
     surface: options.SurfaceOption = None
     camera_pitch_deg: Annotated[float, option("--camera-pitch-deg", "P")] = -90.0
 
-    def world(self) -> WorldSettings:
-        """The options in the form that the run takes."""
-        from scenematch.runs.simulation import WorldSettings
-
-        return WorldSettings(**asdict(self))
-
 
 @dataclass(frozen=True, kw_only=True)
 class LoopOptions:
@@ -103,9 +94,10 @@ def simulate(
         frames: Fly only the first N frames.
     """
     from scenematch.runs.inputs import FOLDER_LAYOUT
+    from scenematch.runs.simulation import WorldSettings
 
     options.use_threads()
-    world = town.world()
+    world = WorldSettings(**asdict(town))
     given: dict[str, Any] = {"minutes": loop.minutes, "method": loop.method, "fault": loop.fault}
     if loop.closed_loop:
         from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
