@@ -20,8 +20,6 @@ from scenematch.report.page_map import TrackMap, draw_map, loop_marks, map_of_tr
 from scenematch.report.page_parts import CROSS, Legend, fill_page
 from scenematch.report.verdict import MEANINGS, key_figures, loop_sentence, metres, verdict_of
 
-Pairs = list[tuple[str, str]]
-"""Names and values."""
 _FACTS = {
     "map": "map", "map_sigma_m": "map sigma (m)", "surface": "surface model", "camera": "camera",
     "frames": "frames", "every": "one frame in", "image_topic": "image topic", "telemetry": "telemetry",
@@ -207,7 +205,7 @@ def _refusals(track: FinishedTrack, shown: Sequence[SliderFrame]) -> list[tuple[
     return rows
 
 
-def _inputs(settings: Mapping[str, Any]) -> Pairs:
+def _inputs(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Inputs and settings of a run, in words."""
     pairs = [(name, "-" if settings.get(key) is None else str(settings[key])) for key, name in _FACTS.items()]
     if settings.get("heights"):
@@ -216,7 +214,7 @@ def _inputs(settings: Mapping[str, Any]) -> Pairs:
     return pairs
 
 
-def _versions() -> Pairs:
+def _versions() -> list[tuple[str, str]]:
     """Versions of what computed the page."""
     return [
         ("scenematch", metadata.version("scenematch-engine")),
