@@ -222,8 +222,7 @@ def test_an_interrupted_fetch_goes_on_where_it_was(server, settings, tmp_path):
     first_asked = list(server.asked)
     server.asked.clear()
     server.trouble[:] = [(first_asked[4], (403, {}))]
-    with pytest.raises(MapError, match="answers 403: access denied"):
-        fetch_map(wanted, out)
+    assert "answers 403: access denied" in refusal(fetch_map, wanted, out, error=MapError)
     assert len(server.asked) == 5
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith("map.tif")] == ["map.tif.tiles"]
     (tmp_path / "map.tif.tiles" / "mine.txt").write_text("the user's own", encoding="utf-8")
