@@ -272,8 +272,7 @@ def test_where_nothing_is(server, settings, tmp_path):
         (f"http://no-such-host.invalid/{tile}", "Could not resolve host: no-such-host"),
         (f"http://127.0.0.1:9/{tile}", "Failed to connect to 127"),
     ):
-        with pytest.raises(MapError, match=re.escape(words)):
-            fetch_map(settings(source), tmp_path / "map.tif")
+        assert words in refusal(fetch_map, settings(source), tmp_path / "map.tif", error=MapError)
     with pytest.raises(MapError, match="source: the server has no data there on level 'EPSG:3857'"):
         fetch_map(replace(settings(f"{server.url}/wms", gsd_m_per_px=None), around="10,10"), tmp_path / "map.tif")
 
