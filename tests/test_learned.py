@@ -260,8 +260,7 @@ def test_a_pickle_that_runs_code_is_refused(by, tmp_path):
         torch.save({"state_dict": Malicious(mark)}, path)
     else:
         path.write_bytes(pickle.dumps(Malicious(mark), protocol=2))
-    with pytest.raises(OptionError, match=r"evil.pth: expected tensors alone"):
-        load_matcher([path], device="cpu")
+    assert "evil.pth: expected tensors alone" in refusal(load_matcher, [path], device="cpu", error=OptionError)
     assert not mark.exists()
 
 
@@ -271,12 +270,9 @@ def test_a_pickle_that_runs_code_is_refused(by, tmp_path):
 def test_wrong_arguments_are_named(files):
     matcher = Loftr(Brightest(), 0.5)
     good = torch.zeros(1, 1, 20, 20)
-    with pytest.raises(ShapeError, match=r"frame: expected \(1, 1, H, W\), got \(20, 20\)"):
-        matcher(good[0, 0], good)
-    with pytest.raises(ShapeError, match="crop"):
-        matcher(good, good.expand(2, -1, -1, -1))
-    with pytest.raises(DtypeError, match="crop: expected floating point"):
-        matcher(good, good.to(torch.uint8))
+    assert "frame: expected (1, 1, H, W), got (20, 20)" in refusal(matcher, good[0, 0], good, error=ShapeError)
+    assert "crop" in refusal(matcher, good, good.expand(2, -1, -1, -1), error=ShapeError)
+    assert "crop: expected floating point" in refusal(matcher, good, good.to(torch.uint8), error=DtypeError)
     for name, value in (("min_confidence", 1.5), ("max_keypoints", 1)):
         with pytest.raises(OptionError, match=name):
             load_matcher([files / "loftr.ckpt"], **{name: value})

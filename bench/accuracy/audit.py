@@ -29,7 +29,8 @@ from bench.pages.text import fill, measured, shown, table
 from engine import Camera, Fix, Frame, Navigator, NoFix, OrthoMap, SceneMatcher
 from engine.geo import Array
 from engine.values import Attitude, Window
-from scenematch.check.availability import audit_site, regressors
+from scenematch.check.availability import audit_of, regressors
+from scenematch.check.plan import plan_audit
 from scenematch.report.metrics import WRONG_M
 
 Gray = NDArray[np.uint8]
@@ -174,7 +175,7 @@ def photograph(ground: Ground, place_m: Array, height_m: float, rng: np.random.G
 def trials(ground: Ground, height_m: float, count: int, rng: np.random.Generator) -> list[Trial]:
     """Frames at random places of a map, matched by the engine, beside what the audit says of each place."""
     site = ground.site
-    found = audit_site(site, CAMERA, height_m)
+    found = audit_of(plan_audit(site, CAMERA, height_m))
     matcher = SceneMatcher(site, CAMERA, "ncc", "cpu")
     statistics = found.statistics
     at_places = regressors(statistics.texture, statistics.score, statistics.lead)
@@ -272,7 +273,7 @@ def flight_rows(quick: bool) -> list[list[str]]:
             continue
         flight = recorded(name, step * (10 if quick else 2))
         heights = [frame.height_agl_m for frame, _ in flight.frames if frame.height_agl_m is not None]
-        found = audit_site(flight.site, flight.camera, float(np.median(heights)))
+        found = audit_of(plan_audit(flight.site, flight.camera, float(np.median(heights))))
         navigator = Navigator(SceneMatcher(flight.site, flight.camera, "ncc", "cpu"), true_start(flight.truth))
         results = [navigator.update(*each) for each in flight.frames]
         places = [(result, flight.true_place_m(result.timestamp_ns)) for result in results]
@@ -298,7 +299,7 @@ def time_rows() -> list[list[str]]:
     for side in (1000, 4000):
         site = OrthoMap.from_arrays(mosaic(side), GRID, UTM)
         start = time.perf_counter()
-        found = audit_site(site, CAMERA, 150.0)
+        found = audit_of(plan_audit(site, CAMERA, 150.0))
         spent_s = time.perf_counter() - start
         rows.append([f"{side:,} x {side:,} px", str(len(found.plan)), f"{spent_s:.0f} s"])
         print(" | ".join(rows[-1]), flush=True)

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from bench.accuracy.field import figures
+from bench.accuracy.rebuilt import rebuilt
 from bench.accuracy.truth import START_SIGMA_M, answered, prior_about, prior_at, rows_of, true_places_m
 from bench.command import parser_on_one_thread
 from bench.pages import scenes as page
@@ -71,7 +72,7 @@ def snow(seed: int, frames: int | None) -> Scene:
 def city(seed: int, frames: int | None) -> Scene:
     """A city from 120 m, its map without heights 5 m off, its camera tilted by 9 degrees that nothing tells."""
     rng = np.random.default_rng([seed, 5])
-    town = build_town(seed, condition="overcast", changed=CITY_CHANGED)
+    town = build_town(seed, condition="overcast", rebuild=rebuilt(seed, CITY_CHANGED))
     calibrated, style = _photographing(), FlightStyle(height_agl_m=CITY_HEIGHT_M)
     side = rng.uniform(0.0, 2.0 * np.pi)
     tilt = enu_from_body(0.0, 0.0, 0.0).T @ enu_from_body(
@@ -111,9 +112,8 @@ def _web_map(seed: int, rng: np.random.Generator, shift_m: Array) -> OrthoMap:
 def oblique(seed: int, frames: int | None) -> Scene:
     """A 45 degree camera over hills of 60 m in autumn or winter, on the map of summer with its surface."""
     season = SEASONS[seed % len(SEASONS)]
-    town = build_town(
-        seed, width_px=1000, height_px=1100, condition=season, relief_m=HILLS_M, river=True, changed=0.05
-    )
+    hilly = {"width_px": 1000, "height_px": 1100, "relief_m": HILLS_M, "river": True}
+    town = build_town(seed, **hilly, condition=season, rebuild=rebuilt(seed, 0.05))
     camera = replace(_photographing(), mount=paper_camera(HILLS_PITCH_DEG).mount)
     plan = plan_flight(
         seed,

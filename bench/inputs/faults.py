@@ -323,8 +323,8 @@ _TELEMETRY: dict[str, tuple[str, dict[str, Callable[[FlightInputs], FlightInputs
     "velocity": ("velocity", {
         "swapped": _velocity(lambda e, n: (n, e)), "in km/h": _velocity(lambda e, n: (3.6 * e, 3.6 * n)),
         "reversed": _velocity(lambda e, n: (-e, -n))}),
-    "stamps in": ("stamps", {"milliseconds": _stamps(1e-6), "microseconds": _stamps(1e-3)}),
-    "frame rate times": ("stamps velocity", {"1.5": _stamps(1 / 1.5), "0.5": _stamps(2.0)}),
+    "stamps in": ("velocity", {"milliseconds": _stamps(1e-6), "microseconds": _stamps(1e-3)}),
+    "frame rate times": ("velocity", {"1.5": _stamps(1 / 1.5), "0.5": _stamps(2.0)}),
 }  # fmt: skip
 _CAMERA: dict[str, tuple[str, dict[str, Callable[[FlightInputs], FlightInputs]]]] = {
     "focal length off by": ("focal height", {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from engine.errors import OptionError
-from engine.values import check_positive
+from engine.values import check, check_choice, check_positive
 
 MAX_DELAY_MS = 250.0
 """Upper bound of ArduPilot's VISO_DELAY_MS."""
@@ -51,17 +51,13 @@ class MavlinkOptions:
 
     def __post_init__(self) -> None:
         check_positive(self, "max_sigma_m")
-        if not 1 <= self.system_id <= 255:
-            raise OptionError(f"system_id: expected 1 to 255, got {self.system_id}")
-        if not 2 <= self.component_id <= 255:
-            raise OptionError(f"component_id: expected 2 to 255 (1 is the autopilot), got {self.component_id}")
-        if self.firmware not in MESSAGES:
-            raise OptionError(f"firmware: expected one of {', '.join(MESSAGES)}, got {self.firmware!r}")
+        check(self, "system_id", "1 to 255", lambda number: 1 <= number <= 255)
+        check(self, "component_id", "2 to 255 (1 is the autopilot)", lambda number: 2 <= number <= 255)
+        check_choice(self, "firmware", tuple(MESSAGES))
         if self.message and self.message not in MESSAGES[self.firmware]:
             known = ", ".join(MESSAGES[self.firmware])
             raise OptionError(f"message: expected one of {known} for {self.firmware}, got {self.message!r}")
-        if not 0 <= self.gps_id <= _MAX_GPS_ID:
-            raise OptionError(f"gps_id: expected 0 to {_MAX_GPS_ID}, got {self.gps_id}")
+        check(self, "gps_id", f"0 to {_MAX_GPS_ID}", lambda number: 0 <= number <= _MAX_GPS_ID)
         if self.gps_id and self.kind != "gps_input":
             raise OptionError(f"gps_id: expected with gps_input only, got {self.kind}")
         if self.max_sigma_m > 100.0:

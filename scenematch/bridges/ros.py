@@ -302,3 +302,8 @@ def find_class(name: str) -> Any:
     """The message class of a name such as "sensor_msgs/msg/Image", imported from ROS."""
     package, _, kind = name.split("/")
     return getattr(importlib.import_module(f"{package}.msg"), kind)
+
+
+def topic_of(output: str, own: str) -> str:
+    """The name of an output's topic; ``own`` is what a node's own names begin with."""
+    return "/diagnostics" if output == "diagnostics" else f"{own}{output}"

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from engine.errors import BackendError
-from scenematch.bridges.ros import OUTPUTS, Handler, find_class
+from scenematch.bridges.ros import OUTPUTS, Handler, find_class, topic_of
 from scenematch.files.ros.messages import MessageFactory
 
 __all__ = ["Node"]
@@ -42,7 +42,7 @@ class Node:
         rospy.init_node(name, argv=list(arguments))
         self.messages = MessageFactory(find_class, True, genpy.Time)
         self._publishers = {
-            output: rospy.Publisher(_topic(output), find_class(kind), queue_size=10, tcp_nodelay=True)
+            output: rospy.Publisher(topic_of(output, "~"), find_class(kind), queue_size=10, tcp_nodelay=True)
             for output, kind in OUTPUTS.items()
         }
 
@@ -73,7 +73,3 @@ class Node:
         while not self._rospy.is_shutdown() and (end_s is None or time.monotonic() < end_s):
             time.sleep(1.0 if end_s is None else min(1.0, max(end_s - time.monotonic(), 0.0)))
             every_second()
-
-
-def _topic(output: str) -> str:
-    return "/diagnostics" if output == "diagnostics" else f"~{output}"

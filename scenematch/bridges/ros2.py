@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 from engine.errors import BackendError, OptionError
-from scenematch.bridges.ros import OUTPUTS, Handler, find_class
+from scenematch.bridges.ros import OUTPUTS, Handler, find_class, topic_of
 from scenematch.files.ros.messages import MessageFactory
 
 __all__ = ["Node"]
@@ -51,7 +51,7 @@ class Node:
         self._any_type = ParameterDescriptor(dynamic_typing=True)
         self.messages = MessageFactory(find_class, False, octet=lambda value: bytes([value]))
         self._publishers = {
-            output: self._node.create_publisher(find_class(kind), _topic(output), 10)
+            output: self._node.create_publisher(find_class(kind), topic_of(output, "~/"), 10)
             for output, kind in OUTPUTS.items()
         }
 
@@ -111,7 +111,3 @@ class Node:
             return self._node.create_subscription(find_class(msgtype), topic, handler, self._qos)
         except self._name_error:
             raise OptionError(f"topic: expected a name that ROS 2 permits, got {topic!r}") from None
-
-
-def _topic(output: str) -> str:
-    return "/diagnostics" if output == "diagnostics" else f"~/{output}"

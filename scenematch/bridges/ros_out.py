@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.errors import OptionError
 from engine.geo import LocalFrame, enu_turn_covariance_rad2
 from engine.orthomap import OrthoMap
-from engine.values import Fix
+from engine.values import Fix, check_choice
 from scenematch.bridges.vehicle import ANGLE_VARIANCE, MOUNT_VARIANCE, NedOrigin, VehicleState, north_east_m
 from scenematch.files.ros.messages import MessageFactory
 
@@ -41,8 +40,7 @@ class RosOptions:
     origin: NedOrigin | None = None
 
     def __post_init__(self) -> None:
-        if self.firmware not in FIRMWARES:
-            raise OptionError(f"firmware: expected one of {', '.join(FIRMWARES)}, got {self.firmware!r}")
+        check_choice(self, "firmware", FIRMWARES)
 
 
 def pose(

@@ -13,10 +13,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from engine.camera import Camera
 from engine.geo import Array
 from engine.orthomap import OrthoMap
-from scenematch.check.plan import AuditOptions, AuditPlan, MapPart, plan_audit, sample_route
+from scenematch.check.plan import AuditPlan, sample_route
 from scenematch.check.self_match import SelfMatchStatistics, measure_self_match
 
 SUITABLE = 0.5
@@ -133,9 +132,14 @@ class Audit:
         return np.asarray(framed[y, x], np.uint8)
 
 
-def gather(plan: AuditPlan, measured: Iterable[SelfMatchStatistics]) -> Audit:
-    """Combine the statistics of all audited cells, in the plan's order, into an audit."""
-    rows = list(measured)
+def audit_of(plan: AuditPlan, measured: Iterable[SelfMatchStatistics] | None = None) -> Audit:
+    """Audit a map.
+
+    Args:
+        plan: of the audit.
+        measured: statistics of all audited cells in the plan's order; None measures them.
+    """
+    rows = list(measure_self_match(plan) if measured is None else measured)
     found = {one.name: np.full(plan.cells, np.nan) for one in fields(SelfMatchStatistics)}
     for name, grid in found.items():
         grid[plan.audited] = [getattr(row, name) for row in rows]
@@ -145,18 +149,6 @@ def gather(plan: AuditPlan, measured: Iterable[SelfMatchStatistics]) -> Audit:
     inside_map[plan.audited] = [plan.contains(center) for center in plan.centers_px[plan.audited]]
     flags = np.where(plan.audited, _flags(statistics, availability, inside_map), Flag.OUTSIDE).astype(np.uint8)
     return Audit(plan, statistics, availability, flags)
-
-
-def audit_site(
-    site: OrthoMap,
-    camera: Camera,
-    height_agl_m: float,
-    options: AuditOptions | None = None,
-    part: MapPart | None = None,
-) -> Audit:
-    """Plan an audit and run it; arguments and errors are those of :func:`scenematch.check.plan.plan_audit`."""
-    plan = plan_audit(site, camera, height_agl_m, options, part)
-    return gather(plan, measure_self_match(plan))
 
 
 def _flags(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from engine.camera import MOUNTS, mount_rotation
 from engine.geo import Array, enu_from_body, wrap_difference_deg
-from scenematch.check.contradictions import SIGMA_DEG, attitude_deg, contradictions, height_sigma_m, is_alarming
+from scenematch.check.contradictions import ALARM, SIGMA_DEG, attitude_deg, contradictions, height_sigma_m
 from scenematch.check.findings import GAIN, MIN_SEEN, MISFIT, OUTLIER, Finding, TelemetrySeries, capped_cost
 from scenematch.check.ground_motion import optical_centre, velocity
 from scenematch.check.sightings import Sighting
@@ -129,7 +129,7 @@ def _attitude(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | No
 
 def _contradicted(series: TelemetrySeries, seen: Sequence[Sighting], fields: Sequence[str]) -> list[str]:
     """The fields that too many pictures contradict."""
-    return [one.field for one in contradictions(series, seen) if one.field in fields and is_alarming(one)]
+    return [one.field for one in contradictions(series, seen) if one.field in fields and one.pictures >= ALARM]
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -18,7 +18,8 @@ _SIGMAS = 3.0
 # None of gazebo-a1's 160 placed pictures contradicts right telemetry: fewer than 1.9 % do (95 % confidence).
 # Three of sixteen is the smallest number that pictures so rare reach, in any of four fields, in less than 2 % of
 # flights.
-_ALARM = 3
+ALARM = 3
+"""Number of pictures from which a contradiction is more than chance."""
 
 
 def contradictions(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[Contradiction, ...]:
@@ -40,11 +41,6 @@ def contradictions(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[C
         "velocity": leg_differences(series, seen),
     }
     return tuple(_counted(field, column) for field, column in columns.items() if np.isfinite(column).any())
-
-
-def is_alarming(one: Contradiction) -> bool:
-    """Whether that many pictures are more than chance."""
-    return one.pictures >= _ALARM
 
 
 def attitude_deg(seen: Sighting) -> tuple[float, float, float]:

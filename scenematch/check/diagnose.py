@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
@@ -22,17 +22,39 @@ from scenematch.check.sightings import sight
 LOOKED_AT = 16
 _SPEED_MPS = 5.0  # growth of a position's uncertainty with the time to the nearest known one
 _MAX_SIGMA_M = 300.0  # of a prior; beyond it the whole map is searched if possible
-# Nanoseconds per unit that is mistaken for them, and the usual intervals between pictures.
-_UNITS = {"microseconds": 1e3, "milliseconds": 1e6, "seconds": 1e9}
-_USUAL_NS = (5e6, 2e10)
 _FROZEN_SHARE = 0.1
 
 
-Telemetry = Any
-"""What is known about one picture: a :class:`engine.values.Frame` or a row of telemetry.csv.
+class Telemetry(Protocol):
+    """What is read of one picture's telemetry: of a :class:`engine.values.Frame` or a row of telemetry.csv."""
 
-Its timestamp_ns, roll_deg, pitch_deg, heading_deg, height_agl_m and velocities are read.
-"""
+    @property
+    def timestamp_ns(self) -> int | None:
+        """Of its exposure."""
+
+    @property
+    def roll_deg(self) -> float | None:
+        """Right side down."""
+
+    @property
+    def pitch_deg(self) -> float | None:
+        """Nose up."""
+
+    @property
+    def heading_deg(self) -> float | None:
+        """Clockwise from true north."""
+
+    @property
+    def height_agl_m(self) -> float | None:
+        """Above the ground."""
+
+    @property
+    def east_velocity_mps(self) -> float | None:
+        """Over ground."""
+
+    @property
+    def north_velocity_mps(self) -> float | None:
+        """Over ground."""
 
 
 def diagnose(
@@ -64,9 +86,7 @@ def diagnose(
     series = _series(telemetry, priors if reference is None else list(reference), site, camera)
     chosen = np.unique(np.linspace(0, count - 1, min(LOOKED_AT, count)).round().astype(int)).tolist()
     frames = [picture(k) for k in chosen]
-    static = [
-        found for found in (_stamps(telemetry), _frozen(chosen, frames, picture, count)) if found is not None
-    ]
+    static = _frozen(chosen, frames, picture, count)
     if start is not None:
         priors[0] = start
     seen = sight(frames, [_searched(k, priors, series.time_s, site) for k in chosen], site, camera)
@@ -104,10 +124,9 @@ def _series(
         rows = [[getattr(row, name) for name in names] for row in telemetry]
         return np.array([[np.nan if v is None else v for v in row] for row in rows], np.float64)
 
-    factor = _unit(telemetry)[1]
     places = [None if prior is None else position_of(prior, site) for prior in reference]
     return TelemetrySeries(
-        time_s=column("timestamp_ns")[:, 0] * factor * 1e-9,
+        time_s=column("timestamp_ns")[:, 0] * 1e-9,
         angles_deg=column("roll_deg", "pitch_deg", "heading_deg"),
         height_m=column("height_agl_m")[:, 0],
         velocity_mps=column("east_velocity_mps", "north_velocity_mps"),
@@ -118,36 +137,13 @@ def _series(
     )
 
 
-def _unit(telemetry: Sequence[Telemetry]) -> tuple[str, float]:
-    """The unit of the timestamps, and its length in nanoseconds."""
-    stamps = np.array([row.timestamp_ns for row in telemetry if row.timestamp_ns is not None], np.float64)
-    if len(stamps) < 3:
-        return "nanoseconds", 1.0
-    interval = float(np.median(np.diff(stamps)))
-    if not 0.0 <= interval < _USUAL_NS[0]:
-        return "nanoseconds", 1.0
-    interval = float(np.mean(np.diff(stamps)))  # in seconds most are 0
-    for unit, factor in _UNITS.items():
-        if _USUAL_NS[0] <= interval * factor <= _USUAL_NS[1]:
-            return unit, factor
-    return "nanoseconds", 1.0
-
-
-def _stamps(telemetry: Sequence[Telemetry]) -> Finding | None:
-    unit, factor = _unit(telemetry)
-    if factor == 1.0:
-        return None
-    text = f"timestamp_ns seems to be in {unit}: between pictures it grows by less than 5 ms"
-    return Finding("stamps", text, f'--correct "timestamp_ns={factor:.0f}*timestamp_ns"', factor)
-
-
 def _frozen(
     chosen: Sequence[int], frames: Sequence[Frame], picture: Callable[[int], Frame], count: int
-) -> Finding | None:
+) -> list[Finding]:
     """Compare each sampled picture with the flight's next one."""
     followed = [(k, frame) for k, frame in zip(chosen, frames, strict=True) if k + 1 < count]
     repeated = sum(np.array_equal(frame.image, picture(k + 1).image) for k, frame in followed)
     if repeated <= _FROZEN_SHARE * len(followed):
-        return None
+        return []
     text = f"{repeated} of {len(followed)} pictures are repeated by the next"
-    return Finding("frozen", text, "look at the camera, or at how its pictures were saved", float(repeated))
+    return [Finding("frozen", text, "look at the camera, or at how its pictures were saved", float(repeated))]

@@ -29,7 +29,7 @@ class Finding:
 
     Attributes:
         cause: one word: "radians", "degrees", "swapped", "sign", "heading", "heading_convention", "mount",
-            "height", "height_feet", "focal", "clock", "velocity", "stamps", "frozen", "mirrored", "map"; or
+            "height", "height_feet", "focal", "clock", "velocity", "frozen", "mirrored", "map"; or
             "attitude" if none of the changes explains the disagreement.
         text: a sentence with the figures.
         cure: the option to try, or what to look at.

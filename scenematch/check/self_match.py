@@ -127,17 +127,13 @@ def _window(plan: AuditPlan, middle_px: Array) -> Window:
 
 def _templates(gray: Gray, noise: Pictures) -> Pictures:
     """(T, h, w) enhanced: the patch unchanged, shaken, and changed (draws)."""
-
-    def enhanced(picture: Gray) -> Pictures:
-        return enhance(picture)
-
     part = _SHAKE_PX / (max(gray.shape) / 2.0)
     shaken = cv2.GaussianBlur(_perturbed(gray, math.degrees(part), 1.0 + part, 0.0), (0, 0), _SHAKE_BLUR_PX)
-    templates = [enhanced(gray), enhanced(np.asarray(shaken, np.uint8))]
+    templates = [enhance(gray), enhance(np.asarray(shaken, np.uint8))]
     for sign, (sensor, ground) in zip((1.0, -1.0), noise, strict=True):
         turned = _perturbed(gray, sign * _TURN_DEG, _SCALE**sign, sign * _SHIFT_PX)
         seen = np.clip(turned + sensor, 0.0, 255.0).astype(np.uint8)
-        templates.append(enhanced(seen) + _CHANGE * ground)
+        templates.append(enhance(seen) + _CHANGE * ground)
     return np.stack(templates)
 
 

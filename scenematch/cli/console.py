@@ -11,7 +11,9 @@ import shlex
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextvars import ContextVar
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scenematch.cli.argument_names import as_typed
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bars
     from rich.table import Table
 
+AS_JSON: ContextVar[bool] = ContextVar("as_json", default=False)
+"""Of the command that runs: whether its results go to a program."""
 _DRAWN_EVERY_S = 0.1
 _PIPE_WIDTH = 500  # without a terminal nothing is folded
 
@@ -32,15 +36,14 @@ def say(text: str) -> None:
     print(line.strip(), file=sys.stderr, flush=True)
 
 
-def next_step(command: str, *, as_json: bool = False, hint: str = "") -> None:
+def next_step(command: str, *, hint: str = "") -> None:
     """Suggest the next command to a person, on standard error; never to a program.
 
     Args:
         command: without the program's name; what the user must still choose is in capitals.
-        as_json: whether the results went to a program.
-        hint: what to do before it, such as a file to open.
+        hint: what to do before it, such as a file to open, or what to repeat.
     """
-    if not as_json:
+    if not AS_JSON.get():
         say(f"next: {f'{hint}; ' if hint else ''}scenematch {command}")
 
 
@@ -49,10 +52,11 @@ def quoted(value: object) -> str:
     return shlex.quote(str(value))
 
 
-def options(**values: object) -> str:
-    """Options with their values as the user types them, without those that are None: ``log_offset_s=2``."""
-    given = ((name, value) for name, value in values.items() if value is not None)
-    return " ".join(f"--{name.replace('_', '-')} {quoted(value)}" for name, value in given)
+def after_track(out: Path, fixes: float) -> None:
+    """Suggest what follows a track: its export, or a check if it has no fix."""
+    command = f"export {quoted(out)} --format geojson" if fixes else "check"
+    hint = f"open {quoted(out / 'report.html')}" + ("" if fixes else "; with the same files")
+    next_step(command, hint=hint)
 
 
 @cache
@@ -104,6 +108,13 @@ def print_json(value: Any) -> None:
     sys.stdout.write("\n")
 
 
+def answered_as_json(value: Any) -> bool:
+    """Print results as JSON if a program asked for them, and return whether it did."""
+    if AS_JSON.get():
+        print_json(value)
+    return AS_JSON.get()
+
+
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """A titled table for people on standard output; the first column is words, the others are figures."""
     from rich import box
@@ -147,11 +158,9 @@ def _print(title: str, table: Table) -> None:
     print(title, *lines, sep="\n")
 
 
-def facts(values: Mapping[str, Any], as_json: bool, title: str) -> None:
-    """Print names and values, one per line."""
-    if as_json:
-        print_json(values)
-    else:
+def facts(values: Mapping[str, Any], title: str) -> None:
+    """Print results as JSON, or as names and values, one per line."""
+    if not answered_as_json(values):
         print_pairs(title, ((name, _text(value, name)) for name, value in values.items()))
 
 

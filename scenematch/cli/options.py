@@ -1,4 +1,4 @@
-"""Options that several commands share, the objects they build, and how to print them for the next command.
+"""Options that several commands share, and the objects they build.
 
 Options:
     surface: Surface model, a GeoTIFF of heights.
@@ -81,8 +81,7 @@ class MapOptions:
         """The map combined with its settings."""
         from scenematch.runs.map_input import MapInput
 
-        rest = table(settings, "input").of(MapInput)
-        return MapInput(self.map, surface=self.surface, **rest)
+        return MapInput(self.map, surface=self.surface, **table(settings, "input").of(MapInput))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +150,7 @@ class MatchingOptions:
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace a command's parameters of the types above by their fields, one option each.
+    """Replace a command's parameters of the types above by their fields, one option each, and add ``--json``.
 
     The help of an option is its description in a docstring: under "Options" of the command, whose own help leaves
     them out, under "Attributes" of the type, or for shared options under "Options" of this module.
@@ -177,8 +176,13 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
             default = inspect.Parameter.empty if each.default is MISSING else each.default
             parameters.append(inspect.Parameter(each.name, keyword, default=default, annotation=types[each.name]))
 
+    _describe(JsonOption, _SHARED["as_json"])
+    json = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=JsonOption)
+    parameters.append(json)
+
     @wraps(command)
-    def call(**given: Any) -> None:
+    def call(*, as_json: bool, **given: Any) -> None:
+        console.AS_JSON.set(as_json)
         made = {
             name: kind(**{each.name: given.pop(each.name) for each in fields(kind)})
             for name, kind in groups.items()
@@ -239,28 +243,3 @@ def live_view(rerun: Sequence[str] | None) -> LiveViewTarget:
             raise OptionError(f"{kind}: expected one file and one viewer at most, got {given[kind]} and {text}")
         given[kind] = text
     return LiveViewTarget(**given)
-
-
-def flight_options(files: FlightFiles, *, settings: Sequence[str] | None = None, start: str | None = None) -> str:
-    """The files of a flight with their settings, typed as options of `check` and `track`."""
-    from scenematch.runs.settings import InputSettings
-
-    values = files.flat()
-    named = {each.name: values[each.name] for each in fields(FlightOptions)}
-    if settings is None:
-        nothing = InputSettings()
-        rest = {name: values[name] for name in nothing.of(type(files), type(files.map), type(files.camera))}
-        changed = {name: value for name, value in rest.items() if value != getattr(nothing, name)}
-        settings = [f"input.{name}={str(v).lower() if v is True else v}" for name, v in changed.items()]
-    words = [f"--correct {console.quoted(text)}" for text in files.corrections.texts()]
-    words += [f"--settings {console.quoted(text)}" for text in settings]
-    return " ".join([console.options(**named, start=start), *words])
-
-
-def after_track(
-    files: FlightFiles, out: Path, fixes: int, *, settings: Sequence[str] | None = None, start: str | None = None
-) -> str:
-    """The next command after a track: its export, or if it has no fix, a check."""
-    if fixes:
-        return f"export {console.quoted(out)} --format geojson"
-    return f"check {flight_options(files, settings=settings, start=start)}"

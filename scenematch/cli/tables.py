@@ -23,10 +23,9 @@ _RUN = (
 """Columns of a table of runs, after the name: head, figure, form."""
 
 
-def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Path) -> None:
-    """Print the figures of a track, and where its files are."""
-    if as_json:
-        console.print_json(summary)
+def print_summary(summary: Mapping[str, Any], title: str, out: Path) -> None:
+    """Print the figures of a track, where its files are, and what to do next."""
+    if console.answered_as_json(summary):
         return
     from scenematch.report.verdict import key_figures
 
@@ -37,6 +36,7 @@ def print_summary(summary: Mapping[str, Any], as_json: bool, title: str, out: Pa
     pairs += list((summary["settings"].get("diagnosis") or {}).items())
     console.print_pairs(title, pairs)
     console.say(f"written to {out}")
+    console.after_track(out, summary["fixes"])
 
 
 def print_comparison(results: Mapping[str, Mapping[str, Any]], title: str) -> None:

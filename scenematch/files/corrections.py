@@ -85,12 +85,6 @@ class Corrections:
                 columns.append(text)
         return cls(columns=tuple(columns), **values)
 
-    def texts(self) -> list[str]:
-        """What :meth:`from_texts` reads."""
-        nothing = Corrections()
-        names = [name for name in ("angles", *_OFFSETS) if getattr(self, name) != getattr(nothing, name)]
-        return [*(f"{name}={getattr(self, name)}" for name in names), *self.columns]
-
     def applied(self, rows: Sequence[TelemetryRow]) -> list[TelemetryRow]:
         """The corrected rows.
 

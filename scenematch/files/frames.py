@@ -17,6 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -128,8 +129,6 @@ class VideoFile(ForwardFrames):
     """
 
     def __init__(self, path: Path) -> None:
-        import cv2
-
         self.path = path
         self._restart()
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -153,8 +152,6 @@ class VideoFile(ForwardFrames):
         Raises:
             TelemetryError: the video states neither.
         """
-        import cv2
-
         self._restart()
         stamps_ns: list[int] = []
         while len(stamps_ns) < len(self.names) and self._capture.grab():
@@ -168,15 +165,11 @@ class VideoFile(ForwardFrames):
         return [round(i * 1e9 / rate_hz) for i in range(len(stamps_ns))]
 
     def _restart(self) -> None:
-        import cv2
-
         self._capture, self._next = cv2.VideoCapture(str(self.path)), 0
         if not self._capture.isOpened():
             raise TelemetryError(f"{self.path}: expected a picture folder or a video, got a file that is neither")
 
     def _decode(self, index: int) -> NDArray[np.uint8]:
-        import cv2
-
         while self._next < index and self._capture.grab():
             self._next += 1
         success, image = self._capture.read() if self._next == index else (False, None)

@@ -9,6 +9,7 @@ Convention:
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -273,7 +274,7 @@ def write_known(
 
 
 def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Write a header and rows as UTF-8 with line feeds.
+    """Write a header and rows as UTF-8 with line feeds, each at once.
 
     Raises:
         TelemetryError: the file cannot be written.
@@ -281,7 +282,8 @@ def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Sequenc
     try:
         with Path(path).open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(rows)
+            for row in itertools.chain([columns], rows):
+                writer.writerow(row)
+                file.flush()
     except OSError as error:
         raise TelemetryError(f"{path}: cannot be written: {error.strerror or error}") from None

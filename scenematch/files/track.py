@@ -5,14 +5,11 @@ notes.csv has details of the same frames that track.csv lacks, needed to redraw 
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TextIO
 
-from engine.errors import TelemetryError
 from engine.values import Fix, NoFix, Reason
 from scenematch.files.tables import (
     LONGITUDE,
@@ -25,7 +22,7 @@ from scenematch.files.tables import (
     write_table,
 )
 
-__all__ = ["TrackRow", "TrackWriter", "read_track", "track_row", "with_notes", "write_notes", "write_track"]
+__all__ = ["TrackRow", "read_track", "track_row", "with_notes", "write_notes", "write_track"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,57 +189,25 @@ def _with_fix(row: TrackRow, result: Fix) -> TrackRow:
     )
 
 
-class TrackWriter:
-    """Appends rows to track.csv and flushes each, so that an interrupted run keeps its rows.
+def write_track(path: str | Path, rows: Iterable[TrackRow]) -> list[TrackRow]:
+    """Write track.csv: degrees to 9 decimals, metres to 3, sigmas and scores to 4.
 
-    Example:
-        >>> with TrackWriter("out/track.csv") as track:  # doctest: +SKIP
-        ...     track.write(track_row(name, result, latency_ms=12.0, deadline_met=True))
+    Each row is on disk before the next is asked for, so that an interrupted run keeps its rows.
 
-    Raises:
-        TelemetryError: the file cannot be written.
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        try:
-            self._file: TextIO = self.path.open("w", encoding="utf-8", newline="")
-        except OSError as error:
-            raise TelemetryError(f"{path}: cannot be written: {error.strerror or error}") from None
-        self._csv = csv.writer(self._file, lineterminator="\n")
-        self._append(COLUMNS)
-
-    def write(self, row: TrackRow) -> None:
-        """Append one row."""
-        self._append([cell_text(getattr(row, name), _DECIMALS.get(name, 4)) for name in COLUMNS])
-
-    def _append(self, cells: Iterable[str]) -> None:
-        try:
-            self._csv.writerow(cells)
-            self._file.flush()
-        except OSError as error:
-            raise TelemetryError(f"{self.path}: cannot be written: {error.strerror or error}") from None
-
-    def close(self) -> None:
-        """Close the file; safe to call twice."""
-        self._file.close()
-
-    def __enter__(self) -> TrackWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def write_track(path: str | Path, rows: Iterable[TrackRow]) -> None:
-    """Write a complete track.csv: degrees to 9 decimals, metres to 3, sigmas and scores to 4.
+    Returns:
+        The rows.
 
     Raises:
         TelemetryError: the file cannot be written.
     """
-    with TrackWriter(path) as writer:
-        for row in rows:
-            writer.write(row)
+    written: list[TrackRow] = []
+
+    def cells(row: TrackRow) -> list[str]:
+        written.append(row)
+        return [cell_text(getattr(row, name), _DECIMALS.get(name, 4)) for name in COLUMNS]
+
+    write_table(path, COLUMNS, map(cells, rows))
+    return written
 
 
 def read_track(path: str | Path) -> list[TrackRow]:

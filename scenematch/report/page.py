@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import platform
+from collections.abc import Mapping, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
+from engine.values import Reason
 from scenematch.files.track import TrackRow
 from scenematch.report.explain import SliderFrame, run_window
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.page_charts import draw_charts
 from scenematch.report.page_map import TrackMap, draw_map, loop_marks, map_of_tracks, track_marks
 from scenematch.report.page_parts import CROSS, Legend, fill_page
-from scenematch.report.page_tables import inputs, refusals, versions
-from scenematch.report.verdict import key_figures, loop_sentence, metres, verdict_of
+from scenematch.report.verdict import MEANINGS, key_figures, loop_sentence, metres, verdict_of
+
+_FACTS = {
+    "map": "map", "map_sigma_m": "map sigma (m)", "surface": "surface model", "camera": "camera",
+    "frames": "frames", "every": "one frame in", "image_topic": "image topic", "telemetry": "telemetry",
+    "odometry_topic": "velocity from", "frame_stamps": "frame stamps",
+    "log_offset_s": "log offset (s)", "truth": "truth", "method": "method", "profile": "profile",
+    "device": "device", "start": "start", "budget_ms": "budget (ms)",
+}  # fmt: skip
 
 
 def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = (), why_not: str = "") -> None:
@@ -46,12 +57,12 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
         figures=key_figures(track.summary),
         charts=draw_charts(track),
         chart_legend=_chart_legend(track),
-        refusals=refusals(track, shown),
+        refusals=_refusals(track, shown),
         choice=_choice(track, shown) if shown else "",
         why_not=why_not or "No frames are shown.",
-        inputs=inputs(track.settings),
+        inputs=_inputs(track.settings),
         changes=list((track.settings.get("changed") or {}).items()),
-        versions=versions(),
+        versions=_versions(),
     )
 
 
@@ -176,3 +187,39 @@ def _facts(i: int, row: TrackRow, track: FinishedTrack) -> list[tuple[str, str]]
         ("latency", None if row.latency_ms is None else f"{row.latency_ms:.1f} ms"),
     ]
     return [(name, value) for name, value in facts if value is not None]
+
+
+# ------------------------------------------------------------------------------------------------------- tables
+
+
+def _refusals(track: FinishedTrack, shown: Sequence[SliderFrame]) -> list[tuple[Any, ...]]:
+    """For each reason, most frequent first: count, name, meaning, an example, its place among the shown frames."""
+    rows: list[tuple[Any, ...]] = []
+    for name, count in track.summary["reasons"].items():
+        indices = [i for i, row in enumerate(track.rows) if row.reason == name]
+        known = set(indices)
+        position = next((k for k, item in enumerate(shown) if item.index in known), None)
+        row = track.rows[indices[0] if position is None else shown[position].index]
+        example = f"{row.frame}: {row.detail or '-'}"
+        rows.append((count, name.replace("_", " "), MEANINGS[Reason(name)], example, position))
+    return rows
+
+
+def _inputs(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Inputs and settings of a run, in words."""
+    pairs = [(name, "-" if settings.get(key) is None else str(settings[key])) for key, name in _FACTS.items()]
+    if settings.get("heights"):
+        counts = ", ".join(f"{source} ({count})" for source, count in settings["heights"].items())
+        pairs.append(("heights from", counts))
+    return pairs
+
+
+def _versions() -> list[tuple[str, str]]:
+    """Versions of what computed the page."""
+    return [
+        ("scenematch", metadata.version("scenematch-engine")),
+        ("torch", metadata.version("torch")),
+        ("OpenCV", cv2.__version__),
+        ("numpy", np.__version__),
+        ("Python", platform.python_version()),
+    ]

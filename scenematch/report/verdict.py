@@ -81,8 +81,8 @@ def _judged(summary: Mapping[str, Any], budget_ms: float | None) -> Verdict:
     if not frames:
         return Verdict("bad", "The track has no frames.", late)
     if not fixes:
-        text = f"None of {frames} frames fixed; most were refused as {_main_reason(summary)}."
-        return Verdict("bad", text, late)
+        reason = next(iter(summary["reasons"]), "unknown").replace("_", " ")
+        return Verdict("bad", f"None of {frames} frames fixed; most were refused as {reason}.", late)
     if not summary.get("scored_fixes"):
         sigma_m = summary["stated_sigma_median_m"]
         stated = "" if sigma_m is None else f"; half of them state a sigma below {metres(sigma_m)}"
@@ -127,10 +127,6 @@ def _latency(summary: Mapping[str, Any], budget_ms: float | None) -> str:
     if missed:
         return f"{_count(missed, 'answer', 'answers')} came after the budget of {budget_ms:g} ms; {latency}."
     return f"{latency}, all of them within the budget of {budget_ms:g} ms."
-
-
-def _main_reason(summary: Mapping[str, Any]) -> str:
-    return next(iter(summary["reasons"]), "unknown").replace("_", " ")
 
 
 def _count(count: int, one: str, many: str) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError, require
 from engine.orthomap import SEARCH_LIMIT_PX, OrthoMap
-from scenematch.check.availability import Audit, RouteAvailability, gather, predict_route
+from scenematch.check.availability import Audit, RouteAvailability, audit_of, predict_route
 from scenematch.check.plan import AuditOptions, AuditPlan, MapPart, plan_audit
 from scenematch.check.self_match import SelfMatchStatistics, measure_self_match
 from scenematch.files.geotiff import write_geotiff
@@ -91,7 +91,7 @@ def audit_map(
     check_folder(out, force)
     plan, waypoints = _plan(files, options or AuditOptions(), progress)
     prepare_folder(out, force, OWNED)
-    audit = gather(plan, progress.track(measure_self_match(plan), len(plan), "auditing"))
+    audit = audit_of(plan, progress.track(measure_self_match(plan), len(plan), "auditing"))
     route = None if waypoints is None else predict_route(audit, *waypoints.T)
     _write(out, audit, route, Path(files.map.map).name)
     facts = _summary(audit, route, files)

@@ -5,19 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from engine.camera import Camera
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError, require
-from engine.matching import METHODS
 from engine.matching.matcher import SceneMatcher
 from engine.navigation.live import Answer, LiveOptions
 from engine.navigation.motion import position_of
 from engine.navigation.navigator import Navigator
-from engine.options import MatcherOptions, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.garbage import no_collection
 from engine.runtime.realtime import Realtime, check_realtime, set_realtime
@@ -26,13 +24,14 @@ from scenematch.bridges.links import Connection, parse_connection
 from scenematch.bridges.parameters import MAX_DELAY_MS, MavlinkOptions
 from scenematch.bridges.pictures import CapturedImage
 from scenematch.bridges.vehicle import NedOrigin
-from scenematch.runs.arguments import check_between, check_choice, check_device, check_unused, parse_position
+from scenematch.runs.arguments import check_between, check_unused, parse_position
 from scenematch.runs.bridge_files import BridgeFiles
 from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_bridge_view
 from scenematch.runs.map_input import check_position
 from scenematch.runs.output import SILENT, Progress
 from scenematch.runs.service import running_service, status_reporter
+from scenematch.runs.settings import TrackSettings
 from scenematch.runs.supervisor import become_worker, check_supervision, end_on_sigterm
 
 if TYPE_CHECKING:
@@ -99,15 +98,10 @@ class MavlinkSettings(MavlinkOptions):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BridgeSettings:
-    """How a bridge matches frames.
+class BridgeSettings(TrackSettings):
+    """Settings of a bridge: those of matching and navigation, and its own.
 
     Attributes:
-        method: "auto", "ncc", "sift" or "learned".
-        device: to compute on.
-        matcher: settings of the methods.
-        navigator: how the position is propagated between frames.
-        start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M".
         deadline_ms: largest age of an answer; None uses the limit of the fixes' receiver.
         seconds: stop after this time; None stops when the pictures end.
         realtime: match with real-time priority and locked memory (Linux).
@@ -115,16 +109,11 @@ class BridgeSettings:
         cores: with realtime, cores for matching; none uses all cores of the process.
 
     Raises:
-        OptionError: a word or a number is invalid, or this system has no real-time scheduling.
-        DeviceError: the device is missing.
+        OptionError, DeviceError: see :class:`scenematch.runs.settings.TrackSettings`; or this system has no
+            real-time scheduling.
         BackendError: real time is not permitted.
     """
 
-    method: str = "auto"
-    device: str = "auto"
-    start: str | None = None
-    matcher: MatcherOptions = field(default_factory=MatcherOptions)
-    navigator: NavigatorOptions = field(default_factory=NavigatorOptions)
     deadline_ms: float | None = None
     seconds: float | None = None
     realtime: bool = False
@@ -132,13 +121,11 @@ class BridgeSettings:
     cores: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        check_choice("method", self.method, METHODS)
-        check_device(self.device)
-        parse_position("start", self.start)
+        TrackSettings.__post_init__(self)  # super() would be the class before its slots
         self.live_options()
         check_realtime(self.scheduling())
-        if self.matcher.profile != "engine":
-            raise OptionError(f"profile: expected engine in a bridge, got {self.matcher.profile!r}")
+        if self.profile != "engine":
+            raise OptionError(f"profile: expected engine in a bridge, got {self.profile!r}")
 
     def scheduling(self) -> Realtime | None:
         """Scheduling of the matching threads; None is the default.
@@ -280,7 +267,7 @@ def _loaded(
         site = files.map.open(progress)
         camera = files.load_camera(progress)
         check_position("start", start, site, OptionError)
-        matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher)
+        matcher = SceneMatcher(site, camera, settings.method, settings.device, settings)
         with progress.task("compiling") as report_compiled:
             matcher.warmup(report_compiled, brief=brief)
     return matcher

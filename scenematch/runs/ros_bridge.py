@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 from engine.camera import Camera
@@ -104,7 +105,7 @@ def run_ros_bridge(
     camera = None if ros.camera.camera is None else ros.camera.load(None)
     node = node or _node(ros.version, ros.arguments)
     camera = camera or _heard_camera(node, ros, progress)
-    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings.matcher)
+    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
 
@@ -128,15 +129,10 @@ def run_ros_bridge(
 
 
 def _node(version: int, arguments: tuple[str, ...]) -> RosNode:
-    if version == 1:
-        from scenematch.bridges import ros1
-
-        return ros1.Node("scenematch", arguments)
-    if version == 2:
-        from scenematch.bridges import ros2
-
-        return ros2.Node("scenematch", arguments)
-    raise OptionError(f"version: expected 1 or 2, got {version}")
+    if version not in (1, 2):
+        raise OptionError(f"version: expected 1 or 2, got {version}")
+    node: RosNode = import_module(f"scenematch.bridges.ros{version}").Node("scenematch", arguments)
+    return node
 
 
 def _heard_camera(node: RosNode, ros: RosSettings, progress: Progress) -> Camera:

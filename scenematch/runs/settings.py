@@ -114,11 +114,10 @@ class InputSettings:
         return {each.name: getattr(self, each.name) for each in fields(self) if each.name in names}
 
 
+_OF_FRAMES = tuple(each.name for each in fields(TrackSettings))
 TABLES = {
     "input": ("scenematch.runs.settings", "InputSettings", ()),
-    "bridge": (
-        "scenematch.runs.mavlink_bridge", "BridgeSettings", ("method", "device", "start", "matcher", "navigator")
-    ),
+    "bridge": ("scenematch.runs.mavlink_bridge", "BridgeSettings", _OF_FRAMES),
     "mavlink": ("scenematch.runs.mavlink_bridge", "MavlinkSettings", ("connect",)),
     "parameters": ("scenematch.runs.mavlink_parameters", "ParameterSettings", ()),
     "ros": ("scenematch.runs.ros_bridge", "RosSettings", ("map", "camera", "version", "arguments")),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from engine.values import Fix, NoFix, Prior, Reason
 from scenematch.files.flight import FlightFrame
 from scenematch.files.settings import changed
 from scenematch.files.telemetry import ground_amsl_m
-from scenematch.files.track import TrackRow, TrackWriter, read_track, track_row, write_notes
+from scenematch.files.track import TrackRow, read_track, track_row, write_notes, write_track
 from scenematch.runs.arguments import parse_budget, parse_position
 from scenematch.runs.checking import as_rows, diagnose_flight
 from scenematch.runs.inputs import FlightFiles, FlightInputs, open_inputs
@@ -82,7 +82,8 @@ def track(
     description = f"{settings.method}, {settings.profile} profile"
     frames = progress.track(flight, len(flight), description)
     with open_view(matcher, live_view) as view:
-        _follow(frames, navigator, out, budget, use_priors=start is None, view=view)
+        answered = _answered(frames, navigator, budget, use_priors=start is None, view=view)
+        write_notes(out / NOTES, write_track(out / TRACK, answered))
     # From the rows in the file, so that evaluate gives the same figures.
     rows, shown = read_track(out / TRACK), ReportFrames(flight, matcher)
     record = _record(files, settings, inputs, str(matcher.device))
@@ -137,40 +138,33 @@ def _record(files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, d
     )
 
 
-def _follow(
+def _answered(
     frames: Iterable[FlightFrame],
     navigator: Navigator,
-    out: Path,
     budget: Budget | None,
     *,
     use_priors: bool,
     view: LiveView | None = None,
-) -> None:
-    """Pass every frame through the navigator, and write each row to disk at once.
+) -> Iterator[TrackRow]:
+    """Pass every frame through the navigator.
 
     Args:
         frames: in their order.
         navigator: fresh.
-        out: the folder of track.csv and notes.csv.
         budget: of each frame.
         use_priors: whether to use the telemetry's own positions; a given start replaces them.
-        view: receives each frame once it is answered.
+        view: receives each frame once it is answered and its row is taken.
     """
-    rows = []
-    with TrackWriter(out / TRACK) as writer:
-        for index, item in enumerate(frames):
-            prior = item.prior if use_priors else None
-            begin = time.perf_counter()
-            result = _update(navigator, item, prior)
-            latency_ms = (time.perf_counter() - begin) * 1e3
-            met = None if budget is None else latency_ms <= budget.total_ms
-            state = navigator.state
-            row = track_row(item.name, result, latency_ms=latency_ms, deadline_met=met, state=state.value)
-            writer.write(row)
-            rows.append(row)
-            if view is not None:
-                view.show(index, item.name, item.frame, result, state, latency_ms)
-    write_notes(out / NOTES, rows)
+    for index, item in enumerate(frames):
+        prior = item.prior if use_priors else None
+        begin = time.perf_counter()
+        result = _update(navigator, item, prior)
+        latency_ms = (time.perf_counter() - begin) * 1e3
+        met = None if budget is None else latency_ms <= budget.total_ms
+        state = navigator.state
+        yield track_row(item.name, result, latency_ms=latency_ms, deadline_met=met, state=state.value)
+        if view is not None:
+            view.show(index, item.name, item.frame, result, state, latency_ms)
 
 
 def _update(navigator: Navigator, item: FlightFrame, prior: Prior | None) -> Fix | NoFix:

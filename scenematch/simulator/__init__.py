@@ -3,7 +3,6 @@
 from scenematch.simulator.conditions import CONDITIONS, Condition
 from scenematch.simulator.flight import FlightPlan, picture_at, plan_flight
 from scenematch.simulator.light import LIGHTS, Light
-from scenematch.simulator.optics import ExposureMotion, Optics, take_picture
 from scenematch.simulator.raster_world import world_from_map
 from scenematch.simulator.render import World, render_frame
 from scenematch.simulator.town import Town, build_town
@@ -13,12 +12,10 @@ __all__ = [
     "CONDITIONS",
     "LIGHTS",
     "Condition",
-    "ExposureMotion",
     "FlightPlan",
     "FlightStyle",
     "Light",
     "Motion",
-    "Optics",
     "SensorNoise",
     "Town",
     "World",
@@ -26,6 +23,5 @@ __all__ = [
     "picture_at",
     "plan_flight",
     "render_frame",
-    "take_picture",
     "world_from_map",
 ]

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from engine.errors import OptionError
+from engine.values import check
 from scenematch.simulator.canvas import CANOPY, CROP, GRASS
 from scenematch.simulator.light import LIGHTS, Array, Float32, Image, Light
 from scenematch.simulator.optics import Sensor
@@ -56,12 +57,9 @@ class Condition:
 
     def __post_init__(self) -> None:
         for name in ("shade", "snow", "leaves", "turned", "dry", "lamps"):
-            value = getattr(self, name)
-            if not 0.0 <= value <= 1.0:
-                raise OptionError(f"{name}: expected 0 to 1, got {value}")
+            check(self, name, "0 to 1", lambda share: 0.0 <= share <= 1.0)
         for name in ("visibility_m", "noise"):
-            if not getattr(self, name) > 0.0:
-                raise OptionError(f"{name}: expected above 0, got {getattr(self, name)}")
+            check(self, name, "above 0", lambda value: value > 0.0)
 
     @property
     def air(self) -> Atmosphere | None:

@@ -20,8 +20,7 @@ import numpy as np
 from engine.errors import StateError
 from engine.geo import Array, chi_square, enu_from_body, larger_variance
 from engine.values import Attitude, Fix
-from scenematch.simulator.quadrotor import GRAVITY, STEP_S, IdealImu, next_time_s
-from scenematch.simulator.rotations import cross_matrix, rotation
+from scenematch.simulator.quadrotor import GRAVITY, STEP_S, IdealImu, next_time_s, rotation
 from scenematch.simulator.sensors import SensorSuite
 
 POSITION, VELOCITY, TURN, ACCEL, GYRO = (slice(k, k + 3) for k in range(0, 15, 3))
@@ -131,13 +130,26 @@ def _transition(half: Array, force: Array, keep_accel: float, keep_gyro: float, 
     """Transition matrix (17, 17) of the errors over one step."""
     dt, F = STEP_S, np.eye(STATES)
     F[POSITION, VELOCITY] = dt * np.eye(3)
-    F[VELOCITY, TURN] = -dt * cross_matrix(force)
+    F[VELOCITY, TURN] = -dt * _cross_matrix(force)
     F[VELOCITY, ACCEL] = -dt * half
     F[POSITION, TURN], F[POSITION, ACCEL] = 0.5 * dt * F[VELOCITY, TURN], 0.5 * dt * F[VELOCITY, ACCEL]
     F[TURN, GYRO] = -dt * half
     F[VELOCITY, GYRO] = 0.5 * F[VELOCITY, TURN] @ F[TURN, GYRO]
     F[ACCEL, ACCEL], F[GYRO, GYRO], F[BARO, BARO] = keep_accel * np.eye(3), keep_gyro * np.eye(3), keep_baro
     return F
+
+
+def _cross_matrix(v: Array) -> Array:
+    """The matrix of the cross product, [v]x.
+
+    Args:
+        v: (3,).
+
+    Returns:
+        (3, 3) with ``_cross_matrix(v) @ w == np.cross(v, w)``.
+    """
+    x, y, z = v.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _process_noise(suite: SensorSuite) -> Array:

@@ -6,7 +6,7 @@ Everything comes from one seed; nothing is read or written.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from engine.camera import NADIR_PITCH_DEG, Camera
 from engine.errors import OptionError
-from engine.geo import Array, LocalFrame, wrap_difference_deg
+from engine.geo import Array, LocalFrame
 from engine.values import Attitude, Frame, Truth
-from scenematch.simulator.light import Image
-from scenematch.simulator.optics import ExposureMotion, Optics, Sensor, take_picture
+from scenematch.simulator.light import Float32, Image
+from scenematch.simulator.optics import Sensor, take_picture
 from scenematch.simulator.render import transformer
 from scenematch.simulator.town import Town, build_town, generator
 from scenematch.simulator.vehicle import (
-    COURSE_STEP_S,
     START_NS,
     FlightStyle,
     Motion,
@@ -69,8 +68,7 @@ def picture_at(
     attitude: Attitude,
     rng: np.random.Generator,
     *,
-    optics: Optics | None = None,
-    sway: ExposureMotion | None = None,
+    moments: Sequence[Float32] = (),
 ) -> Image:
     """The picture from a camera at a position.
 
@@ -81,8 +79,7 @@ def picture_at(
         east_north_up_m: (3,) the camera's position in it, up above the world's height 0.
         attitude: of the body, about true north.
         rng: of the sensor's noise and exposure.
-        optics: exposure time and shutter; None is an ideal camera.
-        sway: motion while the picture is taken.
+        moments: of the exposure, see :func:`scenematch.simulator.optics.take_picture`.
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -92,7 +89,7 @@ def picture_at(
     """
     grid, up = grid_at(town, origin, east_north_up_m), float(east_north_up_m[2])
     sensor = town.condition.sensor(DRONE_SENSOR)
-    return take_picture(town.world, camera, grid, up, attitude, rng, sensor=sensor, optics=optics, sway=sway)
+    return take_picture(town.world, camera, grid, up, attitude, rng, sensor=sensor, moments=moments)
 
 
 def truth_at(town: Town, origin: LocalFrame, timestamp_ns: int, position_m: Array, attitude: Attitude) -> Truth:
@@ -130,23 +127,21 @@ class FlightPlan:
         town: the ground flown over.
         camera: of the drone.
         origin: of the local east-north-up frame of its motions: the map's centre; up from the world's height 0.
-        truth: the exact motion, one entry per frame.
+        motion: the exact motion from take-off to landing.
+        truth: the same, one entry per frame.
         telemetry: the motion as the sensors measure it.
         timestamps_ns: capture times.
         seed: of the camera's noise.
-        optics: exposure and shutter; None is an ideal camera.
-        sways: motion during each exposure, if the optics show it.
     """
 
     town: Town
     camera: Camera
     origin: LocalFrame
+    motion: Motion
     truth: Motion
     telemetry: Motion
     timestamps_ns: tuple[int, ...]
     seed: int
-    optics: Optics | None = None
-    sways: tuple[ExposureMotion, ...] = ()
 
     def __len__(self) -> int:
         return len(self.timestamps_ns)
@@ -157,12 +152,23 @@ class FlightPlan:
         for k in range(len(self)):
             yield self._frame(k, rng)
 
+    def moments(self, k: int) -> Sequence[Float32]:
+        """Moments of a picture's exposure; none freezes motion.
+
+        Args:
+            k: index of the frame.
+
+        Returns:
+            (H, W, 2) each, see :func:`scenematch.simulator.optics.take_picture`.
+        """
+        return ()
+
     def _frame(self, k: int, rng: np.random.Generator) -> Frame:
         telemetry, position_m = self.telemetry, self.truth.position_m[k]
         ground_m = self.town.world.ground_at(grid_at(self.town, self.origin, position_m))
-        where = self.town, self.camera, self.origin, position_m, self._attitude(k), rng
+        where = self.town, self.camera, self.origin, position_m, self.attitude(k), rng
         return Frame(
-            picture_at(*where, optics=self.optics, sway=self.sways[k] if self.sways else None),
+            picture_at(*where, moments=self.moments(k)),
             timestamp_ns=self.timestamps_ns[k],
             height_agl_m=float(telemetry.position_m[k, 2]) - ground_m,
             heading_deg=float(telemetry.heading_deg[k]),
@@ -172,14 +178,15 @@ class FlightPlan:
             north_velocity_mps=float(telemetry.velocity_mps[k, 1]),
         )
 
-    def _attitude(self, k: int) -> Attitude:
+    def attitude(self, k: int) -> Attitude:
+        """The true one at a frame."""
         truth = self.truth
         return Attitude(float(truth.roll_deg[k]), float(truth.pitch_deg[k]), float(truth.heading_deg[k]))
 
     def truth_rows(self) -> list[Truth]:
         """True poses of the camera, one row per frame."""
         return [
-            truth_at(self.town, self.origin, stamp, self.truth.position_m[k], self._attitude(k))
+            truth_at(self.town, self.origin, stamp, self.truth.position_m[k], self.attitude(k))
             for k, stamp in enumerate(self.timestamps_ns)
         ]
 
@@ -225,21 +232,6 @@ def _waypoints(town: Town, camera: Camera, height_m: float, rng: np.random.Gener
     return np.asarray(square - np.sign(square) * rng.uniform(0.0, 6.0, square.shape))
 
 
-def _sways(motion: Motion, time_s: Array) -> tuple[ExposureMotion, ...]:
-    """Velocity and turn rate at each time, by central differences over one step of the motion."""
-    before, now, after = (motion.at(time_s + step) for step in (-COURSE_STEP_S, 0.0, COURSE_STEP_S))
-
-    def rate(ends: tuple[Array, Array]) -> Array:
-        return wrap_difference_deg(ends[1] - ends[0]) / (2.0 * COURSE_STEP_S)
-
-    angles = ("roll_deg", "pitch_deg", "heading_deg")
-    turns = np.column_stack([rate((getattr(before, name), getattr(after, name))) for name in angles])
-    return tuple(
-        ExposureMotion((float(v[0]), float(v[1]), float(v[2])), (float(w[0]), float(w[1]), float(w[2])))
-        for v, w in zip(now.velocity_mps, turns, strict=True)
-    )
-
-
 def plan_flight(
     seed: int = 1,
     *,
@@ -249,7 +241,6 @@ def plan_flight(
     style: FlightStyle | None = None,
     town: Town | None = None,
     camera: Camera | None = None,
-    optics: Optics | None = None,
     **town_options: Any,
 ) -> FlightPlan:
     """Plan the paper's flight: 150 m up, 7 m/s, four legs round the map with a stop at every corner.
@@ -262,7 +253,6 @@ def plan_flight(
         style: of flying.
         town: to fly over; None builds the seed's by ``town_options``.
         camera: None uses the paper's, 300 x 300 px with 60 degrees.
-        optics: exposure time and shutter of the camera; None is an ideal one.
         **town_options: of the town, see :func:`scenematch.simulator.build_town`; ignored if a town is given. Over
             hills the flight keeps its height above the ground at its start.
 
@@ -280,9 +270,8 @@ def plan_flight(
     time_s = np.asarray(stamps_ns * 1e-9, np.float64)
     truth = motion.at(time_s)
     telemetry = simulate_telemetry(truth, noise or SensorNoise(), generator(seed, 0x5E))
-    sways = () if optics is None else _sways(motion, time_s)
     stamps = tuple((START_NS + stamps_ns).tolist())
-    return FlightPlan(town, camera, origin, truth, telemetry, stamps, seed, optics=optics, sways=sways)
+    return FlightPlan(town, camera, origin, motion, truth, telemetry, stamps, seed)
 
 
 def _fly_over(

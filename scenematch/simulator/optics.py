@@ -1,14 +1,9 @@
-"""The camera's image formation: exposure, noise, motion while the shutter is open, and the lens.
-
-Convention:
-    A picture's timestamp is the middle of the exposure of its middle row. During these milliseconds the vehicle
-    moves and turns uniformly.
-"""
+"""The camera's image formation: response, noise and the lens."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -17,9 +12,8 @@ import numpy as np
 
 from engine.camera import Camera
 from engine.errors import OptionError
-from engine.geo import enu_from_body
 from engine.values import Attitude
-from scenematch.simulator.light import Array, Float32, Image
+from scenematch.simulator.light import Float32, Image
 from scenematch.simulator.render import World, render_frame
 
 MAX_VIEW = 4.0
@@ -71,49 +65,6 @@ class Sensor:
         return np.asarray(np.clip(np.rint(picture), 0, 255), dtype=np.uint8)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Optics:
-    """Exposure time and shutter of a camera; the defaults are an ideal one.
-
-    Attributes:
-        exposure_ms: exposure of each row; motion during it blurs the row. 0 freezes motion.
-        readout_ms: from the first row to the last; each row sees another pose (rolling shutter). 0 is a global
-            shutter.
-        exposure_samples: number of poses averaged for motion blur.
-
-    Raises:
-        OptionError: a value is out of range.
-    """
-
-    exposure_ms: float = 0.0
-    readout_ms: float = 0.0
-    exposure_samples: int = 5
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value, minimum = getattr(self, item.name), 0.0 if item.name.endswith("_ms") else 1e-3
-            if not minimum <= value < math.inf:
-                raise OptionError(f"{item.name}: expected {minimum:g} or more, got {value}")
-
-    @property
-    def moves(self) -> bool:
-        """Whether motion shows in the picture."""
-        return self.exposure_ms > 0.0 or self.readout_ms > 0.0
-
-
-@dataclass(frozen=True)
-class ExposureMotion:
-    """Motion and rotation of the vehicle during a picture.
-
-    Attributes:
-        velocity_mps: east, north, up.
-        turn_dps: change of roll, pitch and heading in degrees a second.
-    """
-
-    velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn_dps: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
 def take_picture(
     world: World,
     camera: Camera,
@@ -123,8 +74,7 @@ def take_picture(
     rng: np.random.Generator,
     *,
     sensor: Sensor,
-    optics: Optics | None = None,
-    sway: ExposureMotion | None = None,
+    moments: Sequence[Float32] = (),
 ) -> Image:
     """The picture that a real camera delivers.
 
@@ -139,8 +89,8 @@ def take_picture(
         attitude: of the body, about true north.
         rng: of noise and exposure.
         sensor: how light becomes grey levels.
-        optics: exposure and shutter; None is an ideal camera.
-        sway: motion during the picture; None for none.
+        moments: of the exposure, each as the rays (H, W, 2), x / z and y / z in the pose at the stamp, that the
+            pixels then see; the picture is their mean. None freezes motion.
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -148,12 +98,10 @@ def take_picture(
     Raises:
         OptionError: the camera looks above the horizon, is too low, or its lens is too wide for a pinhole picture.
     """
-    optics, sway, view = optics or Optics(), sway or ExposureMotion(), (world, camera, grid_m, up_m, attitude)
-    if camera.distorts or (optics.moves and sway != ExposureMotion()):
-        seen = _resampled(*view, _row_rays(camera, attitude, up_m - world.ground_at(grid_m), optics, sway))
-    else:
-        seen = render_frame(*view)
-    return sensor.develop(seen, rng)
+    view = world, camera, grid_m, up_m, attitude
+    if camera.distorts and not moments:
+        moments = [lens_rays(camera)[..., :2]]
+    return sensor.develop(_resampled(*view, moments) if moments else render_frame(*view), rng)
 
 
 @lru_cache(maxsize=4)
@@ -176,37 +124,13 @@ def lens_rays(camera: Camera) -> Float32:
     return np.dstack([flat.reshape(camera.height_px, camera.width_px, 2), np.ones(x.shape)]).astype(np.float32)
 
 
-def _row_rays(
-    camera: Camera, attitude: Attitude, height_m: float, optics: Optics, sway: ExposureMotion
-) -> list[Float32]:
-    """For each time of the exposure, the rays (H, W, 2), x / z and y / z, in the pose at the timestamp.
-
-    A ray d of a camera displaced by s meets the ground where d - s d_z / h of the undisplaced one does.
-    """
-    start = np.array([attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg])
-    cam_from_enu = (enu_from_body(*start) @ camera.mount).T
-
-    def seen_after(time_s: float) -> Array:
-        shear = np.eye(3)
-        shear[:, 2] -= time_s * np.array(sway.velocity_mps) / height_m
-        return cam_from_enu @ shear @ enu_from_body(*(start + time_s * np.array(sway.turn_dps))) @ camera.mount
-
-    rays, half_s = lens_rays(camera), 0.5e-3 * optics.readout_ms
-    share = np.linspace(0.0, 1.0, camera.height_px)[:, None, None]
-    count = optics.exposure_samples if optics.exposure_ms > 0.0 and sway != ExposureMotion() else 1
-    times_s = ((np.arange(count) + 0.5) / count - 0.5) * optics.exposure_ms * 1e-3
-    found = []
-    for time_s in times_s.tolist():
-        # A readout lasts tens of milliseconds, so matrices change linearly from its first to its last row.
-        first, last = (seen_after(time_s + end_s) for end_s in (-half_s, half_s))
-        rows = (first + share * (last - first)).astype(np.float32)
-        seen = rays @ rows.transpose(0, 2, 1)
-        found.append(seen[..., :2] / seen[..., 2:])
-    return found
-
-
 def _resampled(
-    world: World, camera: Camera, grid_m: tuple[float, float], up_m: float, attitude: Attitude, rays: list[Float32]
+    world: World,
+    camera: Camera,
+    grid_m: tuple[float, float],
+    up_m: float,
+    attitude: Attitude,
+    rays: Sequence[Float32],
 ) -> Image:
     """The mean of the pictures along all rays, resampled from one sharp pinhole picture that contains them all."""
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]

@@ -10,7 +10,7 @@ Convention:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -75,7 +75,6 @@ class World:
         ground_m: (H, W) of the bare ground if it is not flat at 0.
         air: between camera and ground; None if perfectly clear.
         glint: the sun on water; None for none.
-        gsd_m_per_px: a pixel in grid metres.
     """
 
     rgb: Image
@@ -86,11 +85,11 @@ class World:
     ground_m: Float32 | None = None
     air: Atmosphere | None = None
     glint: Glint | None = None
-    gsd_m_per_px: float = field(init=False)
 
-    def __post_init__(self) -> None:
-        area = abs(float(np.linalg.det(self.pixel_to_crs[:, :2])))
-        object.__setattr__(self, "gsd_m_per_px", math.sqrt(area))
+    @cached_property
+    def gsd_m_per_px(self) -> float:
+        """A pixel in grid metres."""
+        return math.sqrt(abs(float(np.linalg.det(self.pixel_to_crs[:, :2]))))
 
     def ground_at(self, grid_m: tuple[float, float]) -> float:
         """Height of the bare ground at (easting, northing), from the nearest pixel."""

@@ -8,7 +8,8 @@ Convention:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from engine.errors import OptionError
 from engine.orthomap import OrthoMap
 from scenematch.simulator.blocks import fill_blocks
-from scenematch.simulator.canvas import ASPHALT, CANOPY, CROP, PAVING, ROOF, WATER, Canvas, Colour
+from scenematch.simulator.canvas import ASPHALT, CANOPY, PAVING, WATER, Canvas, Colour
 from scenematch.simulator.conditions import CONDITIONS, Condition, apply_season, condition_by_name
 from scenematch.simulator.light import Array, Float32, Image, illuminate
 from scenematch.simulator.optics import Sensor
@@ -41,7 +42,6 @@ MAP_SENSOR = Sensor(
 LAMP_M = 6.0
 """Height of street lamps: they do not light anything higher."""
 MAX_RELIEF_M = 80.0
-_EARTH: Colour = (146, 126, 98)
 _CARS: tuple[Colour, ...] = (
     (236, 236, 236), (40, 42, 46), (150, 154, 158), (132, 44, 44), (58, 72, 104), (206, 206, 200), (90, 92, 96),
 )  # fmt: skip
@@ -202,7 +202,7 @@ def _lamp_light(canvas: Canvas, roads: list[tuple[Array, float]]) -> Float32:
 
 
 @dataclass(frozen=True)
-class _Day:
+class Day:
     """Drawn colours (H, W, 3), heights and materials (H, W) of a town on one day."""
 
     rgb: Image
@@ -211,40 +211,27 @@ class _Day:
 
 
 @dataclass(frozen=True)
-class _Drawn:
-    """A finished canvas, on the day of the map and on that of the flight."""
+class Drawn:
+    """A finished canvas, on the day of the map and on that of the flight.
+
+    Attributes:
+        canvas: all that was drawn.
+        then: on the day of the map.
+        today: on the day of the flight.
+        ground_m: (H, W) of the bare ground if it is not flat at 0.
+        lamps: (H, W) light of the street lamps.
+    """
 
     canvas: Canvas
-    then: _Day
-    today: _Day
+    then: Day
+    today: Day
     ground_m: Float32 | None
     lamps: Float32
 
 
-def _without(day: _Day, gone: NDArray[np.bool_], ground_m: Float32 | None, rng: np.random.Generator) -> _Day:
-    """The day with bare earth where (H, W) something was removed."""
-    rgb, height, material = day.rgb.copy(), day.height_m.copy(), day.material.copy()
-    count = int(gone.sum())
-    rgb[gone] = np.clip(np.array(_EARTH) * (1.0 + 0.07 * rng.standard_normal((count, 1))), 0, 255)
-    height[gone] = 0.0 if ground_m is None else ground_m[gone]
-    material[gone] = CROP
-    return _Day(rgb, height, material)
-
-
-def _rebuilt(drawn: _Drawn, changed: float, rng: np.random.Generator) -> _Drawn:
-    """The town with a share of its houses built or demolished, half each, between the map and the flight."""
-    roofs = (drawn.canvas.material == ROOF).astype(np.uint8)
-    count, labels = cv2.connectedComponents(roofs, connectivity=4)
-    fate = rng.random(count)
-    fate[0] = 1.0  # not a house
-    new, gone = (fate < changed / 2)[labels], ((fate >= changed / 2) & (fate < changed))[labels]
-    then, today = _without(drawn.then, new, drawn.ground_m, rng), _without(drawn.today, gone, drawn.ground_m, rng)
-    return replace(drawn, then=then, today=today)
-
-
 def _draw(
     canvas: Canvas, relief_m: float, river_rng: np.random.Generator | None, hill_rng: np.random.Generator
-) -> _Drawn:
+) -> Drawn:
     """Streets, blocks and cars on a canvas, and the hills below them."""
     river = None if river_rng is None else draw_river(canvas, river_rng)
     edges_u, edges_v, roads = _streets(canvas)
@@ -256,10 +243,10 @@ def _draw(
     if relief_m:
         ground = raise_by_ground(canvas, hills(canvas.shape, canvas.gsd, relief_m, hill_rng), river)
     height, material = canvas.height, canvas.material
-    return _Drawn(canvas, _Day(then, height, material), _Day(today, height, material), ground, lamps)
+    return Drawn(canvas, Day(then, height, material), Day(today, height, material), ground, lamps)
 
 
-def _lit(drawn: _Drawn, day: _Day, condition: Condition, rng: np.random.Generator) -> tuple[Image, Float32]:
+def _lit(drawn: Drawn, day: Day, condition: Condition, rng: np.random.Generator) -> tuple[Image, Float32]:
     """Colours and heights of a town on one day."""
     gsd = drawn.canvas.gsd
     dressed, height = apply_season(day.rgb, day.height_m, day.material, drawn.ground_m, condition, gsd, rng)
@@ -267,7 +254,7 @@ def _lit(drawn: _Drawn, day: _Day, condition: Condition, rng: np.random.Generato
     return illuminate(dressed, height, gsd, condition.light, shade=condition.shade, lamps=lamps), height
 
 
-def _world(drawn: _Drawn, condition: Condition, pixel_to_crs: Array, rng: np.random.Generator) -> World:
+def _world(drawn: Drawn, condition: Condition, pixel_to_crs: Array, rng: np.random.Generator) -> World:
     """The world that a camera sees on one day."""
     seen, height = _lit(drawn, drawn.today, condition, rng)
     sides, material = drawn.canvas.sides, drawn.today.material
@@ -290,7 +277,7 @@ def build_town(
     map_condition: str | Condition = "noon",
     relief_m: float = 0.0,
     river: bool = False,
-    changed: float = 0.0,
+    rebuild: Callable[[Drawn], Drawn] | None = None,
 ) -> Town:
     """A town from a seed; the same seed gives the same bytes.
 
@@ -303,7 +290,7 @@ def build_town(
         map_condition: day of the map, an independent photograph even for the same condition.
         relief_m: height of the hills under the town, from the lowest ground to the highest; 0 is flat.
         river: whether a river crosses the town.
-        changed: share of the houses, 0 to 1, that were built or demolished between the map and the flight.
+        rebuild: what happened to the town between the map and the flight; None is nothing.
 
     Raises:
         OptionError: an argument is out of range.
@@ -313,8 +300,6 @@ def build_town(
         raise OptionError(f"town: expected 16 px or more at 0.1 to 5 m/px, got {got}")
     if not 0.0 <= relief_m <= MAX_RELIEF_M:
         raise OptionError(f"relief_m: expected 0 to {MAX_RELIEF_M:g}, got {relief_m}")
-    if not 0.0 <= changed <= 1.0:
-        raise OptionError(f"changed: expected 0 to 1, got {changed}")
     today, surveyed = condition_by_name(condition), condition_by_name(map_condition)
     fine = max(1, round(gsd_m_per_px / 0.265))
     margin = math.ceil(MARGIN_M / gsd_m_per_px)
@@ -322,8 +307,8 @@ def build_town(
     rng, water_rng = generator(seed, 0x70), generator(seed, 0x71) if river else None
     canvas = Canvas(rng, size, gsd_m_per_px / fine, today.light)
     drawn = _draw(canvas, relief_m, water_rng, generator(seed, 0x72))
-    if changed:
-        drawn = _rebuilt(drawn, changed, generator(seed, 0x75))
+    if rebuild is not None:
+        drawn = rebuild(drawn)
     inner = (slice(margin * fine, -margin * fine),) * 2
     then, heights = _lit(drawn, drawn.then, surveyed, generator(seed, 0x73))
     ortho, surface = MAP_SENSOR.develop(_shrink(then[inner], fine), rng), _shrink(heights[inner], fine)

@@ -40,6 +40,7 @@ from scenematch.files.ros.messages import (
 from tests.support.fixes import a_fix
 from tests.support.ground import body_axes
 from tests.support.odometries import odometry_message
+from tests.support.refusals import refusal
 from tests.support.ros import NOW_NS, STORES, StandInNode, maker_of
 
 
@@ -156,12 +157,10 @@ def test_an_ideal_camera_may_state_no_distortion(ros, maker):
 def test_calibrations_that_are_none_are_named(ros, maker):
     blank = maker.camera_info(NOW_NS, "", Camera.from_fov(64, 48, 60.0))
     setattr(blank, "K" if ros == "ros1" else "k", np.zeros(9))
-    with pytest.raises(CalibrationError, match="camera_info"):
-        camera_from_message(blank)
+    assert "camera_info" in refusal(camera_from_message, blank, error=CalibrationError)
     binned = maker.camera_info(NOW_NS, "", Camera.from_fov(64, 48, 60.0))
     binned.binning_x = 2
-    with pytest.raises(CalibrationError, match="binning"):
-        camera_from_message(binned)
+    assert "binning" in refusal(camera_from_message, binned, error=CalibrationError)
 
 
 # ------------------------------------------------------------------------------------------ REP-103, by hand
@@ -803,8 +802,7 @@ def test_the_ros1_node_hears_and_publishes(monkeypatch, sim_site):
     assert stamp_ns(rospy.published["~pose"][0]) == NOW_NS
     # By rospy's own buffer pictures would grow old in the socket.
     assert rospy.subscribed[RosTopics().image] == {"queue_size": 1, "buff_size": 2**24}
-    with pytest.raises(BackendError, match="expected a ROS master at http://here"):
-        ros1.Node("again")
+    assert "expected a ROS master at http://here" in refusal(ros1.Node, "again", error=BackendError)
 
 
 def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, node, flight, monkeypatch):

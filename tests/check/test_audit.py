@@ -13,7 +13,7 @@ from pyproj import Transformer
 from rasterio.enums import Resampling
 
 from engine import Camera, OptionError, OrthoMap, TelemetryError
-from scenematch.check.availability import Flag, audit_site, fix_probability, predict_route
+from scenematch.check.availability import Flag, audit_of, fix_probability, predict_route
 from scenematch.check.plan import AuditOptions, MapPart, plan_audit
 from scenematch.check.self_match import measure_self_match
 from scenematch.cli.app import run
@@ -64,7 +64,7 @@ def site(patchwork):
 
 @pytest.fixture(scope="module")
 def found(site):
-    return audit_site(site, CAMERA, HEIGHT_M)
+    return audit_of(plan_audit(site, CAMERA, HEIGHT_M))
 
 
 def well_inside(found, x0, y0):
@@ -122,7 +122,7 @@ def test_fine_random_texture_is_less_stable_than_a_town():
 
 @pytest.mark.slow
 def test_the_same_map_gives_the_same_audit(site, found):
-    again = audit_site(site, CAMERA, HEIGHT_M)
+    again = audit_of(plan_audit(site, CAMERA, HEIGHT_M))
     assert np.array_equal(again.availability, found.availability, equal_nan=True)
 
 
@@ -173,7 +173,7 @@ def test_where_a_forward_camera_looks_counts_not_where_it_is(site):
     """A camera that is mounted 20 degrees ahead sees the water before it is over it, whichever way it flies."""
     turn = cv2.Rodrigues(np.array([0.0, np.radians(20.0), 0.0]))[0]
     ahead = Camera(300, 300, CAMERA.matrix, mount=turn @ CAMERA.mount)
-    found = audit_site(site, ahead, HEIGHT_M)
+    found = audit_of(plan_audit(site, ahead, HEIGHT_M))
     east = predict_route(found, *lat_lon(site, [[HALF, 250], [HALF + 20, 250]]).T)
     west = predict_route(found, *lat_lon(site, [[HALF + 20, 250], [HALF, 250]]).T)
     assert abs(east.availability - west.availability) > 0.1
@@ -290,8 +290,8 @@ def test_a_part_at_the_edge_ends_with_the_map(town):
 @pytest.mark.slow
 def test_a_route_is_predicted_from_its_corridor_as_from_the_whole_map(town):
     route = lat_lon(town, [[200, 250], [640, 300], [700, 650]])
-    whole = audit_site(town, CAMERA, HEIGHT_M)
-    part = audit_site(town, CAMERA, HEIGHT_M, part=MapPart(route=route, corridor_m=10.0))
+    whole = audit_of(plan_audit(town, CAMERA, HEIGHT_M))
+    part = audit_of(plan_audit(town, CAMERA, HEIGHT_M, part=MapPart(route=route, corridor_m=10.0)))
     assert len(part.plan) < 0.5 * len(whole.plan)
     stated, expected = (predict_route(one, *route.T) for one in (part, whole))
     assert stated.length_m == expected.length_m

@@ -417,6 +417,6 @@ def test_the_console_script_under_ctrl_c(tmp_path):
 
 def test_counts_of_a_result_are_words_for_people(capsys):
     """As a bridge's, of what it did not send."""
-    console.facts({"withheld": {"no height": 1, "late": 16}, "refused": {}}, False, "bridge")
+    console.facts({"withheld": {"no height": 1, "late": 16}, "refused": {}}, "bridge")
     lines = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[-1].strip() for line in lines[1:]] == ["no height 1, late 16", "none"]

@@ -4,7 +4,7 @@ import pytest
 
 from engine.errors import OptionError
 from scenematch.cli.app import run
-from scenematch.cli.options import FlightOptions, flight_options, live_view
+from scenematch.cli.options import FlightOptions, live_view
 from scenematch.runs.settings import Settings
 from tests.support.commands import LEAVES
 
@@ -73,18 +73,11 @@ def test_a_file_is_named_with_its_setting(tmp_path):
         Settings.read([file, "input.log_offset_s=1"]).table("input")
 
 
-def test_files_are_typed_again_as_they_were_given():
+def test_files_are_those_of_options_and_settings():
     settings = Settings.read(["input.every=5", "input.map_sigma_m=2.0"])
     flight = FlightOptions(map="m.tif", frames="f", hfov_deg=60.0)
     files = flight.files(settings, ["heading_offset_deg=3", "roll_deg=-pitch_deg"])
     assert (files.every, files.map.map_sigma_m, files.corrections.heading_offset_deg) == (5, 2.0, 3.0)
-    typed = flight_options(files)
-    for words in (
-        "--map m.tif", "--hfov-deg 60.0", "--correct heading_offset_deg=3.0", "--correct roll_deg=-pitch_deg",
-        "--settings input.every=5", "--settings input.map_sigma_m=2.0",
-    ):  # fmt: skip
-        assert words in typed
-    assert flight_options(files, settings=["mine.toml"]).endswith("--settings mine.toml")
 
 
 def test_a_live_view_goes_to_a_file_and_to_a_viewer():

@@ -148,8 +148,7 @@ def test_several_topics_with_pictures_ask_for_one(tmp_path, maker):
     with pytest.raises(TelemetryError, match=r"one topic.*/down/image_raw, /front/image_raw; .*`image_topic`"):
         BagFrames(path)
     assert (BagFrames(path, "/down/image_raw").read("0") == 20).all()
-    with pytest.raises(TelemetryError, match="pictures on /up"):
-        BagFrames(path, "/up")
+    assert "pictures on /up" in refusal(BagFrames, path, "/up")
 
 
 def test_compressed_pictures_and_unset_stamps(tmp_path, maker):
@@ -168,8 +167,7 @@ def test_compressed_pictures_and_unset_stamps(tmp_path, maker):
 def test_frames_out_of_order_are_refused(tmp_path, maker):
     image = np.zeros((4, 6), np.uint8)
     messages = [(k, maker.image(time_ns, "", image)) for k, time_ns in enumerate((10**9, 3 * 10**9, 2 * 10**9))]
-    with pytest.raises(TelemetryError, match=r"frame 2 after 3\.0"):
-        BagFrames(written(tmp_path / "x.bag", {IMAGE: messages})).stamps_ns()
+    assert "frame 2 after 3.0" in refusal(BagFrames(written(tmp_path / "x.bag", {IMAGE: messages})).stamps_ns)
 
 
 def test_a_picture_that_is_published_again_counts_once(tmp_path, maker):
@@ -242,10 +240,8 @@ def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker, options, topi
 
 def test_a_bag_without_telemetry_or_calibration_says_so(tmp_path, maker):
     path = written(tmp_path / "x.bag", {IMAGE: [(10**9, maker.image(10**9, "", np.zeros((4, 6), np.uint8)))]})
-    with pytest.raises(TelemetryError, match="attitude, height, velocity or position"):
-        read_bag(path)
-    with pytest.raises(TelemetryError, match="CameraInfo"):
-        read_bag_camera(path)
+    assert "attitude, height, velocity or position" in refusal(read_bag, path)
+    assert "CameraInfo" in refusal(read_bag_camera, path)
 
 
 def test_what_counts_as_a_bag_and_one_that_is_missing_is_named(tmp_path):
@@ -256,8 +252,7 @@ def test_what_counts_as_a_bag_and_one_that_is_missing_is_named(tmp_path):
     assert not is_bag(tmp_path)
     assert not is_bag("flight.mp4")
     assert len(BagFrames(next(path.glob("*.mcap"))).names) == 5
-    with pytest.raises(TelemetryError, match="no such bag"):
-        BagFrames(tmp_path / "missing.bag")
+    assert "no such bag" in refusal(BagFrames, tmp_path / "missing.bag")
 
 
 # -------------------------------------------------------------------------------------------------- damage

@@ -22,7 +22,7 @@ from scenematch.files.telemetry import (
     read_telemetry,
     write_telemetry,
 )
-from scenematch.files.track import COLUMNS, NOTE_COLUMNS, TrackRow, TrackWriter, read_track, track_row, write_track
+from scenematch.files.track import COLUMNS, NOTE_COLUMNS, TrackRow, read_track, track_row, write_track
 from scenematch.files.truth import interpolate_truth, read_truth, write_truth
 from scenematch.runs.simulation import write_folder
 from tests.support.fixes import a_fix
@@ -479,14 +479,16 @@ def test_a_track_reads_back(tmp_path):
 
 def test_an_interrupted_run_keeps_its_rows(tmp_path):
     path = tmp_path / "track.csv"
-    writer = TrackWriter(path)
-    assert read_track(path) == []
-    with writer:
-        for name in ("a", "b"):
-            writer.write(track_row(name, REFUSAL, latency_ms=1.0, deadline_met=None))
-            assert [row.frame for row in read_track(path)][-1] == name  # before it is closed
+
+    def answered():
+        for count, name in enumerate("ab"):
+            assert [row.frame for row in read_track(path)] == list("ab"[:count])
+            yield track_row(name, REFUSAL, latency_ms=1.0, deadline_met=None)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_track(path, answered())
     assert [row.frame for row in read_track(path)] == ["a", "b"]
-    writer.close()
 
 
 @pytest.mark.parametrize(
@@ -510,4 +512,4 @@ def test_a_bad_track_is_refused_with_its_place(tmp_path, change, expected):
 
 
 def test_a_track_cannot_be_written_where_there_is_no_folder(tmp_path):
-    assert "cannot be written" in refusal(TrackWriter, tmp_path / "none" / "track.csv")
+    assert "cannot be written" in refusal(write_track, tmp_path / "none" / "track.csv", [])

@@ -222,8 +222,7 @@ def test_an_interrupted_fetch_goes_on_where_it_was(server, settings, tmp_path):
     first_asked = list(server.asked)
     server.asked.clear()
     server.trouble[:] = [(first_asked[4], (403, {}))]
-    with pytest.raises(MapError, match="answers 403: access denied"):
-        fetch_map(wanted, out)
+    assert "answers 403: access denied" in refusal(fetch_map, wanted, out, error=MapError)
     assert len(server.asked) == 5
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith("map.tif")] == ["map.tif.tiles"]
     (tmp_path / "map.tif.tiles" / "mine.txt").write_text("the user's own", encoding="utf-8")
@@ -273,8 +272,7 @@ def test_where_nothing_is(server, settings, tmp_path):
         (f"http://no-such-host.invalid/{tile}", "Could not resolve host: no-such-host"),
         (f"http://127.0.0.1:9/{tile}", "Failed to connect to 127"),
     ):
-        with pytest.raises(MapError, match=re.escape(words)):
-            fetch_map(settings(source), tmp_path / "map.tif")
+        assert words in refusal(fetch_map, settings(source), tmp_path / "map.tif", error=MapError)
     with pytest.raises(MapError, match="source: the server has no data there on level 'EPSG:3857'"):
         fetch_map(replace(settings(f"{server.url}/wms", gsd_m_per_px=None), around="10,10"), tmp_path / "map.tif")
 

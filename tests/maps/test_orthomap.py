@@ -273,14 +273,12 @@ def test_window_is_a_copy_of_the_pixels(site):
 
 @pytest.mark.parametrize("window", [(-1, 0, 5, 5), (0, 0, 121, 5), (0, 86, 5, 5), (0, 0, 0, 5), (0, 0, 5, -1)])
 def test_window_outside_is_refused(site, window):
-    with pytest.raises(OptionError, match="window"):
-        site.gray(Window(*window))
+    assert "window" in refusal(site.gray, Window(*window), error=OptionError)
 
 
 def test_level_that_does_not_exist_is_refused(site):
     for level in (-1, site.levels):
-        with pytest.raises(OptionError, match="level"):
-            site.level_shape(level)
+        assert "level" in refusal(site.level_shape, level, error=OptionError)
 
 
 def test_pyramid_averages_areas_and_keeps_its_pixel_convention(site):
@@ -378,8 +376,7 @@ def test_surface_that_lies_elsewhere_or_knows_nothing_is_refused(tmp_path):
     far = write(tmp_path / "far.tif", np.ones((9, 9), np.float32), transform=beside)
     empty = write(tmp_path / "empty.tif", np.full((60, 60), np.nan, np.float32))
     for surface in (far, empty):
-        with pytest.raises(MapError, match="surface"):
-            OrthoMap.open(path, surface)
+        assert "surface" in refusal(OrthoMap.open, path, surface, error=MapError)
     with pytest.raises(MapError, match=r"surface: .*does not exist"):
         OrthoMap.open(path, tmp_path / "none.tif")
 
@@ -412,8 +409,7 @@ def test_world_file_counts_from_the_centre_of_the_first_pixel(tmp_path, ending, 
     path = tmp_path / {"PNG": "p.png", "JPEG": "p.jpg", "GTiff": "p.tif"}[driver]
     write(path, noise(60, 70), driver=driver, crs=None, transform=None)
     path.with_suffix(f".{ending}").write_text(f"0.5\n0\n0\n-0.5\n{WEST + 0.25}\n{NORTH - 0.25}\n")
-    with pytest.raises(MapError, match="give `crs`"):
-        OrthoMap.open(path)
+    assert "give `crs`" in refusal(OrthoMap.open, path, error=MapError)
     site = OrthoMap.open(path, crs=UTM)
     lon, lat = Transformer.from_crs(UTM, 4326, always_xy=True).transform(WEST + 0.25, NORTH - 0.25)
     assert np.allclose(site.pixel_from_geodetic(lat, lon), [0, 0], atol=1e-6)
@@ -457,12 +453,10 @@ def test_what_is_no_local_raster_is_refused(tmp_path):
     good = write(tmp_path / "good.tif", noise(20, 20))
     for name, content in (("text.tif", "hello"), ("empty.tif", "")):
         (tmp_path / name).write_text(content)
-        with pytest.raises(MapError, match="expected a raster"):
-            OrthoMap.open(tmp_path / name)
+        assert "expected a raster" in refusal(OrthoMap.open, tmp_path / name, error=MapError)
     elsewhere = ("https://example.org/a.tif", f"/vsizip/{good}", f"GTIFF_DIR:1:{good}", "none.tif", "", "a\0b")
     for path in elsewhere:
-        with pytest.raises(MapError, match="local file"):
-            OrthoMap.open(path)
+        assert "local file" in refusal(OrthoMap.open, path, error=MapError)
 
 
 @pytest.mark.parametrize("share", [0.001, 0.01, 0.3, 0.9, 0.999])

@@ -6,7 +6,7 @@ from rasterio import Affine
 
 from engine import OrthoMap
 from engine.values import Window
-from scenematch.report.map_colours import map_colours
+from scenematch.report.page_map import map_colours
 from tests.support.rasters import write_raster
 
 

@@ -11,8 +11,17 @@ from engine import Attitude, StateError
 from engine.geo import enu_from_body
 from scenematch.simulator import ekf
 from scenematch.simulator.ekf import STATES, FilterState, History, fuse_fix, fuse_heading, fuse_height
-from scenematch.simulator.quadrotor import STEP_S, IdealImu, Wind, WindField, advance, hovering, shaken
-from scenematch.simulator.rotations import rotation, rotation_vector
+from scenematch.simulator.quadrotor import (
+    STEP_S,
+    IdealImu,
+    Wind,
+    WindField,
+    advance,
+    hovering,
+    rotation,
+    rotation_vector,
+    shaken,
+)
 from scenematch.simulator.sensors import Instruments, SensorSuite
 from tests.support.fixes import a_fix
 

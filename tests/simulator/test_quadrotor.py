@@ -17,9 +17,10 @@ from scenematch.simulator.quadrotor import (
     advance,
     aim,
     hovering,
+    rotation,
+    rotation_vector,
     shaken,
 )
-from scenematch.simulator.rotations import rotation, rotation_vector
 from scenematch.simulator.sensors import Barometer, Compass, Imu, Instruments, SensorSuite
 from scenematch.simulator.vehicle import GRAVITY_MPS2, FlightStyle
 

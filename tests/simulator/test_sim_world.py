@@ -63,18 +63,6 @@ def test_every_condition_can_be_seen_and_differs_from_the_others():
         assert 15.0 < one.mean() < 190.0
 
 
-@pytest.mark.slow
-def test_houses_come_and_go_between_the_map_and_the_flight():
-    same, other = build_town(5, **SMALL), build_town(5, **SMALL, changed=0.4)
-    lost = (same.surface_m > 3.0) & (other.surface_m == 0.0)
-    assert 0.05 < np.mean(lost) / np.mean(same.surface_m > 3.0) < 0.4  # not yet built when the map was made
-    gone = (same.world.height_m > 3.0) & (other.world.height_m == 0.0)
-    assert 0.05 < np.mean(gone) / np.mean(same.world.height_m > 3.0) < 0.4
-    gone_on_map = under_map(same, gone).all(axis=(1, 3))
-    assert not (lost & gone_on_map).any()  # what was pulled down is on the map
-    assert (other.surface_m[gone_on_map] == same.surface_m[gone_on_map]).all()
-
-
 def test_snow_lies_on_lawns_and_bare_trees_are_as_thin_as_told():
     kind = np.full((400, 600), GRASS, np.uint8)
     kind[:, 200:400], kind[:, 400:] = ASPHALT, CANOPY

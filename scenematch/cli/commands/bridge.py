@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +13,7 @@ from scenematch.cli import console, options
 from scenematch.cli.options import EXPERT, INPUT, MAP, OUTPUT, flag, option, table, with_options
 
 if TYPE_CHECKING:
-    from scenematch.runs.live_viewing import LiveViewTarget
+    from scenematch.runs.bridge_files import BridgeFiles
     from scenematch.runs.map_input import MapInput
     from scenematch.runs.mavlink_bridge import BridgeSettings, MavlinkSettings
     from scenematch.runs.settings import Settings
@@ -38,21 +38,6 @@ class LinkOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureOptions(options.CameraOptions):
-    """The camera, or recorded pictures.
-
-    Attributes:
-        frames: Recorded pictures, replayed in real time.
-        telemetry: telemetry.csv that times the replay (default: the video's own timestamps).
-        camera_source: A camera, a stream, or a command that writes JPEGs.
-    """
-
-    frames: Annotated[Path | None, option("--frames", "DIR|VIDEO", INPUT)] = None
-    telemetry: Annotated[Path | None, option("--telemetry", "FILE", INPUT)] = None
-    camera_source: Annotated[str | None, option("--camera-source", "N|URL|exec:CMD", INPUT)] = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class OptionalMapOptions:
     """The map, needed only to send fixes.
 
@@ -70,11 +55,39 @@ class OptionalMapOptions:
         return options.MapOptions(map=self.map, surface=self.surface).map_input(settings)
 
 
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions(options.CameraOptions):
+    """The camera, or recorded pictures.
+
+    Attributes:
+        frames: Recorded pictures, replayed in real time.
+        telemetry: telemetry.csv that times the replay (default: the video's own timestamps).
+        camera_source: A camera, a stream, or a command that writes JPEGs.
+    """
+
+    frames: Annotated[Path | None, option("--frames", "DIR|VIDEO", INPUT)] = None
+    telemetry: Annotated[Path | None, option("--telemetry", "FILE", INPUT)] = None
+    camera_source: Annotated[str | None, option("--camera-source", "N|URL|exec:CMD", INPUT)] = None
+
+    def files(self, site: OptionalMapOptions, settings: Settings) -> BridgeFiles:
+        """The map and the pictures combined with their settings."""
+        from scenematch.runs.bridge_files import BridgeFiles
+
+        return BridgeFiles(
+            map=site.map_input(settings),
+            camera=self.camera_input(settings),
+            frames=self.frames,
+            telemetry=self.telemetry,
+            camera_source=self.camera_source,
+            **table(settings, "input").of(BridgeFiles),
+        )
+
+
 def _bridge_settings(matching: options.MatchingOptions, settings: Settings) -> BridgeSettings:
     """How a bridge matches frames: the options combined with the settings."""
     how = matching.track_settings(settings)
-    same = {name: getattr(how, name) for name in ("method", "device", "start", "navigator")}
-    made: BridgeSettings = table(settings, "bridge", **same, matcher=how)
+    same = {each.name: getattr(how, each.name) for each in fields(how)}
+    made: BridgeSettings = table(settings, "bridge", **same)
     return made
 
 
@@ -90,7 +103,6 @@ def mavlink(
     settings: options.SettingsOption = None,
     rerun: options.RerunOption = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Send fixes to an autopilot by MAVLink.
 
@@ -104,55 +116,27 @@ def mavlink(
         measure_delay: Measure the camera's latency, then exit.
         supervise: Keep a loaded standby process that takes over if the worker dies.
     """
-    given, hint = options.read_settings(settings), ""
+    given = options.read_settings(settings)
     if out is not None:
-        following = _write_parameters(autopilot, given, out, force, as_json)
-        hint = f"load {out} into the autopilot"
+        _write_parameters(autopilot, given, out, force)
     elif autopilot.connect is None:
         raise OptionError("connect: expected a link to the autopilot, got none")
     elif measure_delay:
-        following = _measure_delay(autopilot, pictures, given, as_json)
+        _measure_delay(autopilot, pictures, given)
     else:
+        from scenematch.runs.mavlink_bridge import run_mavlink_bridge
+
+        files, link, how = pictures.files(site, given), autopilot.link(given), _bridge_settings(matching, given)
         shown = options.live_view(rerun)
-        following = _bridge(autopilot, pictures, matching, site, given, supervise, shown, as_json)
-    console.next_step(following, as_json=as_json, hint=hint)
+        status = run_mavlink_bridge(
+            files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS
+        )
+        console.facts(asdict(status), title=f"{link.kind} to {link.connect}")
+        console.next_step("track --map MAP --frames VIDEO --telemetry LOG --out out")
 
 
-def _bridge(
-    autopilot: LinkOptions,
-    pictures: PictureOptions,
-    matching: options.MatchingOptions,
-    site: OptionalMapOptions,
-    given: Settings,
-    supervise: bool,
-    shown: LiveViewTarget,
-    as_json: bool,
-) -> str:
-    """Run the bridge to its end; returns the next command."""
-    from scenematch.runs.bridge_files import BridgeFiles
-    from scenematch.runs.mavlink_bridge import run_mavlink_bridge
-
-    files = BridgeFiles(
-        map=site.map_input(given),
-        camera=pictures.camera_input(given),
-        frames=pictures.frames,
-        telemetry=pictures.telemetry,
-        camera_source=pictures.camera_source,
-        **table(given, "input").of(BridgeFiles),
-    )
-    link, how = autopilot.link(given), _bridge_settings(matching, given)
-    status = run_mavlink_bridge(files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS)
-    console.facts(asdict(status), as_json, title=f"{link.kind} to {link.connect}")
-    flown = console.options(
-        map=site.map, surface=site.surface, camera=pictures.camera, hfov_deg=pictures.hfov_deg,
-        frames=pictures.frames, telemetry=pictures.telemetry,
-    )  # fmt: skip
-    recorded = "" if pictures.frames else " --frames VIDEO --telemetry LOG"
-    return f"track {flown}{recorded} --out out"
-
-
-def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings, as_json: bool) -> str:
-    """Measure and print; returns the next command."""
+def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings) -> None:
+    """Measure and print."""
     from scenematch.runs.camera_delay import measure_camera_delay
 
     source = pictures.camera_source
@@ -164,25 +148,21 @@ def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: S
     found = measure_camera_delay(link, camera, source, seconds=seconds, progress=console.PROGRESS)
     delay_ms = round(1e3 * found.delay_s)
     values = {"exposure_to_grab_ms": delay_ms, "correlation": found.correlation}
-    console.facts(values, as_json, title=f"camera {source}")
-    same = console.options(
-        connect=link.connect, camera=pictures.camera, hfov_deg=pictures.hfov_deg, camera_source=source,
-        settings=f"input.exposure_to_grab_ms={delay_ms}",
-    )  # fmt: skip
-    return f"bridge mavlink --map MAP {same}"
+    console.facts(values, title=f"camera {source}")
+    measured = f"--settings input.exposure_to_grab_ms={delay_ms}"
+    console.next_step(f"bridge mavlink --map MAP {measured}", hint="with the same options")
 
 
-def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, force: bool, as_json: bool) -> str:
-    """Write the file and say so; returns the next command."""
+def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, force: bool) -> None:
+    """Write the file and say so."""
     from scenematch.runs.mavlink_parameters import write_parameter_file
 
     wanted = table(settings, "parameters")
     write_parameter_file(file, autopilot.link(settings), wanted, force=force)
-    if as_json:
-        console.print_json({"parameters": str(file), "delay_ms": wanted.delay_ms})
-    else:
+    if not console.answered_as_json({"parameters": str(file), "delay_ms": wanted.delay_ms}):
         console.say(f"written to {file}, for a delay of {wanted.delay_ms} ms")
-    return "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE"
+    following = "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE"
+    console.next_step(following, hint=f"load {file} into the autopilot")
 
 
 @with_options
@@ -196,7 +176,6 @@ def ros(
     firmware: Annotated[str | None, option("--firmware", "none|ardupilot|px4", INPUT)] = None,
     settings: options.SettingsOption = None,
     rerun: options.RerunOption = None,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Run as a node of ROS 1 or ROS 2.
 
@@ -227,6 +206,5 @@ def ros(
         node = replace(node, topics=replace(node.topics, image=image))
     how = _bridge_settings(matching, given)
     status = run_ros_bridge(node, how, live_view=options.live_view(rerun), progress=console.PROGRESS)
-    console.facts(asdict(status), as_json, title=f"ROS {version} on {node.topics.image}")
-    flown = console.options(map=site.map, surface=site.surface)
-    console.next_step(f"track {flown} --frames BAG --out out", as_json=as_json)
+    console.facts(asdict(status), title=f"ROS {version} on {node.topics.image}")
+    console.next_step("track --map MAP --frames BAG --out out")

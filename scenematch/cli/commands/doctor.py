@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from scenematch.cli import console
-from scenematch.cli.options import OUTPUT, JsonOption, flag, with_options
+from scenematch.cli.options import OUTPUT, flag, with_options
 
 _DISTRIBUTION = "scenematch-engine"  # "scenematch" on PyPI is another project
 _DEVELOPERS = ("test", "bench", "docs", "dev")
@@ -29,7 +29,7 @@ _HEAD = """\
 
 
 @with_options
-def doctor(settings: Annotated[bool, flag("--settings", OUTPUT)] = False, as_json: JsonOption = False) -> None:
+def doctor(settings: Annotated[bool, flag("--settings", OUTPUT)] = False) -> None:
     """Show versions, devices and missing packages.
 
     --settings prints the file that other commands take as --settings FILE: every setting with unit and default.
@@ -41,15 +41,13 @@ def doctor(settings: Annotated[bool, flag("--settings", OUTPUT)] = False, as_jso
         from scenematch.runs.settings import documented_settings
 
         text = _HEAD + documented_settings()
-        if as_json:
-            console.print_json({"settings": text})
-        else:
+        if not console.answered_as_json({"settings": text}):
             print(text, end="")
-        console.next_step("track --settings FILE --map MAP --frames FRAMES --out out", as_json=as_json)
+        console.next_step("track --settings FILE --map MAP --frames FRAMES --out out")
         return
     facts, healthy = examine()
-    console.facts(facts, as_json, title="scenematch doctor")
-    console.next_step("demo" if healthy else "doctor", as_json=as_json, hint="" if healthy else _INSTALL)
+    console.facts(facts, title="scenematch doctor")
+    console.next_step("demo" if healthy else "doctor", hint="" if healthy else _INSTALL)
     raise typer.Exit(0 if healthy else 1)
 
 

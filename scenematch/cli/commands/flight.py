@@ -19,7 +19,6 @@ def check(
     correct: options.CorrectOption = None,
     start: options.StartOption = None,
     settings: options.SettingsOption = None,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Find errors in a flight's inputs.
 
@@ -32,13 +31,10 @@ def check(
     files = flight.files(given, correct)
     names = given.track().telemetry_columns
     found = diagnose_flight(files, start, columns=names, progress=console.PROGRESS)
-    if as_json:
-        console.print_json(asdict(found))
-    else:
+    if not console.answered_as_json(asdict(found)):
         rows = as_rows(found, corrected=not files.corrections.changes_nothing)
         console.print_pairs(f"check of {flight.frames}", rows)
-    following = options.flight_options(files, settings=settings, start=start)
-    console.next_step(f"track {following} --out out", as_json=as_json)
+    console.next_step("track --out out", hint="with the same files")
 
 
 @with_options
@@ -54,7 +50,6 @@ def track(
     settings: options.SettingsOption = None,
     rerun: options.RerunOption = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Track a flight; write track.csv and a report.
 
@@ -73,9 +68,7 @@ def track(
     shown = options.live_view(rerun)
     summary = track_flight(files, out, how, force=force, live_view=shown, progress=console.PROGRESS)
     title = f"{how.method} ({how.profile} profile) on {flight.frames}"
-    tables.print_summary(summary, as_json, title=title, out=out)
-    following = options.after_track(files, out, summary["fixes"], settings=settings, start=start)
-    console.next_step(following, as_json=as_json, hint=f"open {out / 'report.html'}")
+    tables.print_summary(summary, title=title, out=out)
 
 
 @with_options
@@ -86,7 +79,6 @@ def compare(
     start: options.StartOption = None,
     settings: options.SettingsOption = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Compare methods or settings on one flight.
 
@@ -102,16 +94,13 @@ def compare(
 
     given = options.read_settings(settings)
     parsed = parse_runs(runs or [], settings=settings or (), start=start)
-    files = flight.files(given)
-    results = compare_runs(files, out, parsed, force=force, progress=console.PROGRESS)
-    if as_json:
-        console.print_json(results)
-    else:
+    results = compare_runs(flight.files(given), out, parsed, force=force, progress=console.PROGRESS)
+    if not console.answered_as_json(results):
         tables.print_comparison(results, str(flight.frames))
         console.say(f"written to {out}")
     drawn = out / COMPARISON if (out / COMPARISON).is_file() else out
-    following = f"track {options.flight_options(files, settings=settings, start=start)} --out out"
-    console.next_step(following, as_json=as_json, hint=f"open {console.quoted(drawn)}")
+    hint = f"open {console.quoted(drawn)}; with the same files"
+    console.next_step("track --out out", hint=hint)
 
 
 @with_options
@@ -120,7 +109,6 @@ def evaluate(
     truth: Annotated[Path | None, option("--truth", "FILE")] = None,
     out: Annotated[Path | None, option("--out", "FILE", OUTPUT)] = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Score finished tracks and redraw their reports.
 
@@ -133,25 +121,18 @@ def evaluate(
         out: Page that compares several runs (default: comparison.html).
     """
     from scenematch.runs.evaluation import evaluate as evaluate_track
-    from scenematch.runs.evaluation import recorded_files, report
-    from scenematch.runs.record import read_record
-    from scenematch.runs.results import PAGE, SUMMARY
+    from scenematch.runs.evaluation import report
 
     if len(runs) == 1 and out is None:
         summary = evaluate_track(runs[0], truth, force=force, progress=console.PROGRESS)
-        tables.print_summary(summary, as_json, title=f"track in {runs[0]}", out=runs[0])
-        record = read_record(runs[0] / SUMMARY)
-        following = options.after_track(recorded_files(record), runs[0], summary["fixes"], start=record.start)
-        console.next_step(following, as_json=as_json, hint=f"open {runs[0] / PAGE}")
+        tables.print_summary(summary, title=f"track in {runs[0]}", out=runs[0])
         return
     if truth is not None:
         raise OptionError("truth: expected with one run only")
     page = report(runs, out, force=force, progress=console.PROGRESS)
-    if as_json:
-        console.print_json({"report": str(page.resolve()), "runs": [str(run) for run in runs]})
-    else:
+    if not console.answered_as_json({"report": str(page.resolve()), "runs": [str(run) for run in runs]}):
         console.say(f"written to {page}")
-    console.next_step(f"export {console.quoted(runs[0])} --format geojson", as_json=as_json, hint=f"open {page}")
+    console.next_step(f"export {console.quoted(runs[0])} --format geojson", hint=f"open {page}")
 
 
 @with_options
@@ -161,7 +142,6 @@ def export(
     out: Annotated[Path | None, option("--out", "FILE", OUTPUT)] = None,
     truth: Annotated[Path | None, option("--truth", "FILE")] = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Export a finished track as GPX, GeoJSON or TUM.
 
@@ -176,8 +156,5 @@ def export(
     from scenematch.runs.track_export import export_track
 
     facts = export_track(directory, kind, out, truth=truth, force=force)
-    console.facts(facts, as_json, title=f"track in {directory}")
-    if kind == "tum" and truth is None:
-        console.next_step(f"export {console.quoted(directory)} --format tum --truth TRUTH", as_json=as_json)
-    else:
-        console.next_step(f"evaluate {console.quoted(directory)} OTHER_RUN", as_json=as_json)
+    console.facts(facts, title=f"track in {directory}")
+    console.next_step(f"evaluate {console.quoted(directory)} OTHER_RUN")

@@ -27,7 +27,6 @@ def locate(
     pitch_deg: Annotated[float | None, option("--pitch", "DEG")] = None,
     matching: options.MatchingOptions,
     settings: options.SettingsOption = None,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Find one picture on the map.
 
@@ -59,21 +58,20 @@ def locate(
         options=how,
         progress=console.PROGRESS,
     )
-    facts = _fix_facts(result, as_json) if isinstance(result, Fix) else _no_fix_facts(result)
+    facts = _fix_facts(result) if isinstance(result, Fix) else _no_fix_facts(result)
     facts["latency_ms"] = result.timings.total_ms
-    console.facts(facts, as_json, title=str(image))
-    if isinstance(result, Fix):
-        console.next_step(f"track {console.options(map=site.map)} --frames FRAMES --out out", as_json=as_json)
-    else:
-        console.next_step(f"map info {console.quoted(site.map)}", as_json=as_json)
-    raise typer.Exit(0 if isinstance(result, Fix) else 1)
+    console.facts(facts, title=str(image))
+    found, place = isinstance(result, Fix), console.quoted(site.map)
+    following = f"track --map {place} --frames FRAMES --out out" if found else f"map info {place}"
+    console.next_step(following)
+    raise typer.Exit(0 if found else 1)
 
 
-def _fix_facts(fix: Fix, as_json: bool) -> dict[str, Any]:
+def _fix_facts(fix: Fix) -> dict[str, Any]:
     places = ("lat_deg", "lon_deg", "east_m", "north_m", "up_m", "sigma_m")
     names = (*places, "score", "method", "map_xy_px")
     facts = {"status": "fix"} | {name: getattr(fix, name) for name in names}
-    if as_json:
+    if console.AS_JSON.get():
         facts["covariance_m2"] = fix.covariance_m2.tolist()
         facts["attitude"] = None if fix.attitude is None else asdict(fix.attitude)
         facts["attitude_sigma_deg"] = fix.attitude_sigma_deg

@@ -20,7 +20,6 @@ def info(
     surface: options.SurfaceOption = None,
     map_bounds: Annotated[str | None, option("--map-bounds", "W,S,E,N", MAP)] = None,
     map_crs: Annotated[str | None, option("--map-crs", "EPSG:N", MAP)] = None,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Show size, ground sample distance, CRS and bounds.
 
@@ -34,9 +33,9 @@ def info(
     from scenematch.runs.map_input import MapInput
 
     source = MapInput(map_path, surface=surface, map_bounds=map_bounds, map_crs=map_crs)
-    console.facts(source.open(console.PROGRESS).info(), as_json, title=str(map_path))
+    console.facts(source.open(console.PROGRESS).info(), title=str(map_path))
     place = f"{console.quoted(map_path)} --camera CAMERA --height-agl METRES"
-    console.next_step(f"map audit {place} --out audit", as_json=as_json)
+    console.next_step(f"map audit {place} --out audit")
 
 
 @with_options
@@ -51,7 +50,6 @@ def audit(
     corridor_m: Annotated[float | None, option("--corridor-m", "M")] = None,
     settings: options.SettingsOption = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Predict where frames can be matched.
 
@@ -75,13 +73,10 @@ def audit(
         map=site, camera=camera, route=route, height_agl_m=height_agl_m, around=around, corridor_m=corridor_m
     )
     result = audit_map(files, out, options.table(given, "audit"), force=force, progress=console.PROGRESS)
-    if as_json:
-        console.print_json(result.summary)
-    else:
+    if not console.answered_as_json(result.summary):
         tables.print_audit(result, str(map_path))
         console.say(f"written to {out}")
-    files_given = console.options(map=map_path, surface=surface, camera=camera)
-    console.next_step(f"track {files_given} --frames FRAMES --out out", as_json=as_json)
+    console.next_step(f"track --map {console.quoted(map_path)} --frames FRAMES --out out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +107,6 @@ def fetch(
     settings: options.SettingsOption = None,
     dry_run: Annotated[bool, flag("--dry-run", EXPERT)] = False,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Fetch a map from a server that you name.
 
@@ -128,11 +122,8 @@ def fetch(
     given = asdict(what) | {"dry_run": dry_run, "force": force}
     wanted = options.table(options.read_settings(settings), "fetch", **given)
     facts = fetch_map(wanted, out, console.PROGRESS)
-    console.facts(facts, as_json, title=f"map around {what.around}")
+    console.facts(facts, title=f"map around {what.around}")
     if dry_run:
-        place = console.options(around=what.around, radius_m=what.radius_m)
-        console.next_step(
-            f"map fetch {place} --source URL --out FILE", as_json=as_json, hint="leave out --dry-run"
-        )
+        console.next_step("map fetch", hint="with the same options, without --dry-run")
     else:
-        console.next_step(f"map info {console.quoted(out)}", as_json=as_json)
+        console.next_step(f"map info {console.quoted(out)}")

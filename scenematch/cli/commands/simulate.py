@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from engine.errors import OptionError
 from scenematch.cli import console, options, tables
 from scenematch.cli.options import MAP, OUTPUT, flag, option, with_options
-
-if TYPE_CHECKING:
-    from scenematch.runs.simulation import WorldSettings
 
 
 @with_options
@@ -20,7 +17,6 @@ def demo(
     frames: Annotated[int | None, option("--frames", "N", min=2)] = None,
     seed: Annotated[int, option("--seed", "N", min=0)] = 1,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Track a built-in flight with both methods.
 
@@ -36,14 +32,10 @@ def demo(
 
     options.use_threads()
     results = run_demo(out, frames=frames, seed=seed, force=force, progress=console.PROGRESS)
-    if as_json:
-        console.print_json(results)
-    else:
+    if not console.answered_as_json(results):
         tables.print_paper_table(results, seed)
     console.say(f"report: {out.resolve()}")
-    console.next_step(
-        "check --map MAP --frames FRAMES", as_json=as_json, hint=f"open {out}/ncc-engine/report.html"
-    )
+    console.next_step("check --map MAP --frames FRAMES", hint=f"open {out}/ncc-engine/report.html")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,12 +56,6 @@ class WorldOptions:
     map: Annotated[Path | None, option("--map", "FILE", MAP)] = None
     surface: options.SurfaceOption = None
     camera_pitch_deg: Annotated[float, option("--camera-pitch-deg", "P")] = -90.0
-
-    def world(self) -> WorldSettings:
-        """The options in the form that the run takes."""
-        from scenematch.runs.simulation import WorldSettings
-
-        return WorldSettings(**asdict(self))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +83,6 @@ def simulate(
     frames: Annotated[int | None, option("--frames", "N", min=1)] = None,
     rerun: options.RerunOption = None,
     force: options.ForceOption = False,
-    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate a flight, with ground truth.
 
@@ -109,9 +94,10 @@ def simulate(
         frames: Fly only the first N frames.
     """
     from scenematch.runs.inputs import FOLDER_LAYOUT
+    from scenematch.runs.simulation import WorldSettings
 
     options.use_threads()
-    world = town.world()
+    world = WorldSettings(**asdict(town))
     given: dict[str, Any] = {"minutes": loop.minutes, "method": loop.method, "fault": loop.fault}
     if loop.closed_loop:
         from scenematch.runs.closed_loop import ClosedLoopSettings, fly_closed_loop
@@ -127,11 +113,10 @@ def simulate(
 
         check_unused(given | {"rerun": rerun}, "closed_loop")
         facts = simulate_flight(out, world, frames=frames, force=force, progress=console.PROGRESS)
-    console.facts(facts, as_json, title=f"simulated flight {town.seed}")
-    flight = {name: out / file for name, file in FOLDER_LAYOUT.items() if name != "truth"}
-    if not loop.closed_loop:
-        console.next_step(f"track {console.options(**flight, out=f'{out}-track')}", as_json=as_json)
+    console.facts(facts, title=f"simulated flight {town.seed}")
+    if loop.closed_loop:
+        console.after_track(out, facts["availability"])
         return
-    export = f"export {console.quoted(out)} --format geojson"
-    following = export if facts["availability"] else f"check {console.options(**flight)}"
-    console.next_step(following, as_json=as_json, hint=f"open {out / 'report.html'}")
+    paths = {name: out / file for name, file in FOLDER_LAYOUT.items() if name != "truth"} | {"out": f"{out}-track"}
+    given_again = " ".join(f"--{name} {console.quoted(path)}" for name, path in paths.items())
+    console.next_step(f"track {given_again}")
