@@ -85,7 +85,7 @@ def _nearest(
 
 
 def _described(features: Features, scale: float, is_limited: bool) -> tuple[Floats, Floats]:
-    """Descriptors (B, N, 128), and (B, N) the logarithm of scale if that is limited, else 0; NaN without keypoint."""
+    """Descriptors (B, N, 128), and logarithm of scale (B, N) if limited, else 0; NaN without keypoint."""
     valid = on_host(features.valid)
     sizes = on_host(as_float(features.scale_px, "float32")) if is_limited else np.ones(valid.shape, np.float32)
     log = np.log(np.where(valid, np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
