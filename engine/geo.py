@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from statistics import NormalDist
 from typing import TYPE_CHECKING, TypeVar
 
@@ -112,11 +112,6 @@ def enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Arra
     Returns:
         (3, 3), ``v_enu = enu_from_body(...) @ v_body``.
     """
-    return _enu_from_body(roll_deg, pitch_deg, heading_deg).copy()
-
-
-@lru_cache(maxsize=16)  # the steps of one frame share it
-def _enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Array:
     sr, sp, sh = (math.sin(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
     cr, cp, ch = (math.cos(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
     # Rz(heading) Ry(pitch) Rx(roll) takes the body to north-east-down; its rows as east, north and -down.

@@ -85,7 +85,7 @@ class LandmarkMap:
     def __init__(self, site: OrthoMap, device: Device, backend: str = "auto") -> None:
         self._site, self.device = site, device
         self._backend = chosen_backend(backend, device)
-        self.tiles = RecentlyUsed(self._described, lambda _, tile: _count(tile), MAX_LANDMARKS)
+        self.tiles = RecentlyUsed(self._describe, lambda _, tile: _count(tile), MAX_LANDMARKS)
 
     def find(self, window: Window, level: int, *, upright: bool, per_px: float = math.inf) -> Landmarks:
         """The landmarks of a window.
@@ -148,17 +148,15 @@ class LandmarkMap:
     def _keys(self, window: Window, level: int, upright: bool) -> list[_Key]:
         return [(level, upright, tile) for tile in tiles_under(window, TILE_PX, self._site.level_shape(level))]
 
-    def _described(self, level: int, upright: bool, own: Window) -> NamedArrays:
-        return self._with_points(self._detect(level, upright, own), level)
-
-    def _detect(self, level: int, upright: bool, own: Window) -> NamedArrays:
+    def _describe(self, level: int, upright: bool, own: Window) -> NamedArrays:
         """Every keypoint on a tile, as detected in the whole level."""
         wide = widened(own, HALO_PX, self._site.level_shape(level))
         inner = within(own, wide)
         mask = np.zeros((wide.height_px, wide.width_px), np.bool_)
         mask[inner] = self._site.valid(wide, level)[inner]
         if not mask.any():
-            return {field: np.zeros((0, *shape), dtype) for field, (dtype, shape) in _STORED.items()}
+            none = {field: np.zeros((0, *shape), dtype) for field, (dtype, shape) in _STORED.items()}
+            return self._with_points(none, level)
         found = sift(
             as_picture(self._site.gray(wide, level), self.device),
             max_keypoints=_SLOTS,
@@ -175,7 +173,8 @@ class LandmarkMap:
         rank = _rank_in_cells(xy)
         kept = np.flatnonzero(rank < MAX_PER_CELL)
         arrays = (xy, scale, angle, rank, descriptors)
-        return {name: a[kept].astype(kind[0]) for (name, kind), a in zip(_STORED.items(), arrays, strict=True)}
+        named = zip(_STORED.items(), arrays, strict=True)
+        return self._with_points({name: a[kept].astype(kind) for (name, (kind, _)), a in named}, level)
 
     def _with_points(self, tile: NamedArrays, level: int) -> NamedArrays:
         map_px = self._site.full_from_level(tile["xy_px"], level)

@@ -80,7 +80,7 @@ def find_features(pictures: Floats, allowed: NDArray[np.bool_] | None, choice: S
 
 def _of_picture(image: Floats, mask: NDArray[np.bool_] | None, choice: SiftChoice) -> tuple[Floats, ...]:
     """Positions, scales, angles in degrees and descriptors of the keypoints of one picture (H, W)."""
-    octaves = octaves_of(*image.shape, choice.upsample)
+    octaves = octaves_of(*image.shape, int(choice.upsample))
     gaussians, keypoints = detect(image, octaves, choice.contrast_threshold)
     keypoints = strongest(keypoints, octaves, mask, choice.max_keypoints, choice.spread)
     if choice.up_rad is None:

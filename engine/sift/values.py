@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from engine.runtime.device import Picture
+from engine.values import check
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +25,12 @@ class SiftChoice:
     upsample: int
     contrast_threshold: float
     spread: int
+
+    def __post_init__(self) -> None:
+        check(self, "max_keypoints", "at least 1", lambda count: count >= 1)
+        check(self, "upsample", "1 or 2", lambda factor: factor in (1, 2))
+        check(self, "contrast_threshold", "a number from 0 up", lambda contrast: contrast >= 0)
+        check(self, "spread", "1 or more", lambda cells: cells >= 1)
 
 
 @dataclass(frozen=True, slots=True)
