@@ -85,7 +85,7 @@ class PreparedMap:
         """The most recently used region that contains a window, or a new one."""
         held = (key for key in reversed(list(self.regions)) if key[1] == level and _contains(key[0], window))
         key = next(held, None) or (self._to_prepare(window, self._site.level_shape(level)), level)
-        return self.regions.get(key)[0]
+        return self.regions.obtain(key)[0]
 
     @staticmethod
     def _to_prepare(window: Window, shape: tuple[int, int]) -> Window:

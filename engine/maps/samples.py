@@ -53,7 +53,7 @@ class SampleMap:
         """
         step, parts = math.ceil(window.area_px / BLOCK_PX**2 / max_samples), []
         cells = self._cells_under(window, level)
-        found = self.cells.get(*((cell, level) for cell in cells))
+        found = self.cells.obtain(*((cell, level) for cell in cells))
         for cell, (samples, blocks) in zip(cells, found, strict=True):
             x, y = window.x0 - cell.x0, window.y0 - cell.y0
             rows = slice(max(0, y // BLOCK_PX), -(-(y + window.height_px) // BLOCK_PX))
@@ -61,8 +61,6 @@ class SampleMap:
             at = blocks[rows, columns].ravel()[::step]
             fields = (samples.points_m, samples.values, samples.gradients, samples.weights)
             parts.append([field.take(at, axis=0) for field in fields])
-        if len(parts) == 1:
-            return Samples(*parts[0])
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _cells_under(self, window: Window, level: int) -> list[Window]:
