@@ -63,7 +63,7 @@ class KeypointMap:
         size = np.array([window.width_px, window.height_px], np.float32)
         windows = tiles_under(window, TILE_PX, self._site.level_shape(level))
         parts = []
-        for tile in self.tiles.obtain(*((own, level) for own in windows)):
+        for tile in self.tiles.get(*((own, level) for own in windows)):
             xy = tile.xy_px - tile.xy_px.new_tensor(corner)
             inside = ((xy >= 0.0) & (xy <= xy.new_tensor(size) - 1.0)).all(dim=1)
             parts.append(Keypoints(xy, tile.descriptors).only(inside))

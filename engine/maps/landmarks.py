@@ -99,7 +99,7 @@ class LandmarkMap:
         Returns:
             Landmarks: those whose keypoint is inside the window.
         """
-        tiles = self.tiles.obtain(*self._keys(window, level, upright))
+        tiles = self.tiles.get(*self._keys(window, level, upright))
         max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
         parts = [(tile, _inside(tile, window, max_rank)) for tile in tiles]
         found = {name: np.concatenate([part[name][i] for part, i in parts]) for name in tiles[0]}
@@ -131,13 +131,13 @@ class LandmarkMap:
         if all(key in self.tiles for key in keys):
             return
         if not self._site.from_file:
-            self.tiles.obtain(*keys)
+            self.tiles.get(*keys)
             return
         settings = (self._backend, DETECTOR_VERSION, TILE_PX, HALO_PX, CELL_PX, MAX_PER_CELL, upright)
         path = cache_path(settings, (self._site.gray(whole, level), self._site.valid(whole, level)))
         stored = load_arrays(path)
         if stored is None:
-            tiles = self.tiles.obtain(*keys)
+            tiles = self.tiles.get(*keys)
             save_arrays(path, {field: np.concatenate([tile[field] for tile in tiles]) for field in _STORED})
             return
         corner = np.rint(stored["xy_px"]).astype(np.int64) // TILE_PX * TILE_PX  # of each one's tile

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, TypeVar
 
 V = TypeVar("V")
 Key = tuple[Any, ...]
 
 
-class RecentlyUsed(OrderedDict[Key, V]):
+class RecentlyUsed(Generic[V]):
     """Entries by key, the most recently used last. The lock guards them, not how they are made.
 
     Args:
@@ -25,22 +25,34 @@ class RecentlyUsed(OrderedDict[Key, V]):
     """
 
     def __init__(self, make: Callable[..., V], size: Callable[[Key, V], int], limit: float) -> None:
-        super().__init__()
         self._make, self._size, self.limit = make, size, limit
+        self._entries: OrderedDict[Key, V] = OrderedDict()
         self._lock = threading.Lock()
         self.created = 0
 
-    def __setitem__(self, key: Key, entry: V) -> None:
-        """Add an existing entry, or replace one; it becomes the most recently used."""
-        with self._lock:
-            super().__setitem__(key, entry)
-            self.move_to_end(key)
+    def __contains__(self, key: Key) -> bool:
+        return key in self._entries
 
-    def obtain(self, *keys: Key) -> list[V]:
+    def __iter__(self) -> Iterator[Key]:
+        """The keys, that of the least recently used entry first."""
+        with self._lock:
+            return iter(list(self._entries))
+
+    def __setitem__(self, key: Key, entry: V) -> None:
+        """Add an existing entry, or replace one."""
+        with self._lock:
+            self._entries[key] = entry
+            self._entries.move_to_end(key)
+
+    def values(self) -> list[V]:
+        """The entries, the least recently used first."""
+        return list(self._entries.values())
+
+    def get(self, *keys: Key) -> list[V]:
         """Get entries, which become the most recently used; make those that are missing, and evict others."""
         found = []
         for key in keys:
-            entry = self.get(key)
+            entry = self._entries.get(key)
             if entry is None:
                 entry = self._make(*key)
                 with self._lock:
@@ -48,10 +60,10 @@ class RecentlyUsed(OrderedDict[Key, V]):
             self[key] = entry
             found.append(entry)
         with self._lock:
-            sizes = {key: self._size(key, entry) for key, entry in self.items()}
+            sizes = {key: self._size(key, entry) for key, entry in self._entries.items()}
             used = sum(sizes.values())
             for key, size in list(sizes.items())[: len(sizes) - len(keys)]:  # not what was just asked for
                 if used > self.limit and size:
                     used -= size
-                    del self[key]
+                    del self._entries[key]
         return found
