@@ -26,6 +26,7 @@ _Block = tuple[tuple[slice, slice], NDArray[np.floating]]  # where its scores li
 _FLOAT32_NORM_RATIO = 16.0
 # Transforms of longer sides leave the cache, and cost twice as much per pixel.
 _CACHED_SIDE = 1152
+_MAX_BLOCKS = 16  # into which a surface is divided along one axis
 _USES_IPP = hasattr(cv2, "ipp") and bool(cv2.ipp.useIPP())
 
 
@@ -132,8 +133,7 @@ def correlate(
 @lru_cache(maxsize=1024)
 def _division(count: int, model: int) -> tuple[int, int]:
     """Number and side of the blocks along an axis that give ``count`` scores at the least cost."""
-    # A block with fewer scores than the template's side would be more overlap than anything else.
-    sides = [fast_side(-(-count // n) + model - 1) for n in range(1, count // model + 2)]
+    sides = [fast_side(-(-count // n) + model - 1) for n in range(1, _MAX_BLOCKS + 1)]
     costs = [n * side * (1 if side <= _CACHED_SIDE else 2) for n, side in enumerate(sides, 1)]
     best = costs.index(min(costs))
     return -(-count // (sides[best] - model + 1)), sides[best]
