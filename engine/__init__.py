@@ -1,11 +1,11 @@
 """scenematch: position fixes without GNSS, from a downward camera and a georeferenced map."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from engine.runtime.lazy_names import imported_on_use
 
 _NAMES = {
+    "engine": "features ncc_fft",
     "engine.assumed_errors": "AssumedErrors",
     "engine.budget": "Budget",
     "engine.camera": "Camera",
@@ -23,9 +23,7 @@ _NAMES = {
 }
 """The public names by module. A module is imported when one of its names is used: torch alone takes seconds."""
 
-_MODULES = ("features", "ncc_fft")
-__all__ = sorted([*" ".join(_NAMES.values()).split(), *_MODULES])
-_imported = imported_on_use(__name__, _NAMES)
+__all__ = sorted(" ".join(_NAMES.values()).split())
 
 if TYPE_CHECKING:  # the same names for type checkers; `as` makes them public
     from engine import features as features
@@ -69,11 +67,7 @@ if TYPE_CHECKING:  # the same names for type checkers; `as` makes them public
     from engine.values import Timings as Timings
     from engine.values import Window as Window
 else:  # type checkers see the names above and reject others
-
-    def __getattr__(name: str) -> Any:
-        if name in _MODULES:
-            return import_module(f"engine.{name}")
-        return _imported(name)
+    __getattr__ = imported_on_use(__name__, _NAMES)
 
 
 def __dir__() -> list[str]:

@@ -9,64 +9,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from statistics import NormalDist
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+if TYPE_CHECKING:
+    from pyproj import Transformer
+
 Array = NDArray[np.float64]
 Angles = TypeVar("Angles", float, Array)
 
-WGS84_A_M = 6378137.0
-"""Semi-major axis of the WGS84 ellipsoid (NIMA TR8350.2)."""
-WGS84_E2 = 6.69437999014e-3
-"""First eccentricity squared of the WGS84 ellipsoid."""
 _SINGULAR = 1e-12  # determinant over that of the diagonal; below it rounding dominates
-
-
-def ecef_from_geodetic(lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLike = 0.0) -> Array:
-    """Earth-centred, Earth-fixed coordinates from geodetic ones.
-
-    Args:
-        lat_deg: (...,) WGS84 latitude.
-        lon_deg: (...,) WGS84 longitude.
-        height_m: (...,) above the ellipsoid.
-
-    Returns:
-        (..., 3) metres.
-    """
-    lat, lon = np.radians(np.asarray(lat_deg, float)), np.radians(np.asarray(lon_deg, float))
-    height = np.asarray(height_m, float)
-    normal = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
-    x = (normal + height) * np.cos(lat) * np.cos(lon)
-    y = (normal + height) * np.cos(lat) * np.sin(lon)
-    z = (normal * (1.0 - WGS84_E2) + height) * np.sin(lat)
-    return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
-
-
-def geodetic_from_ecef(ecef_m: Array) -> tuple[Array, Array, Array]:
-    """Geodetic coordinates from Earth-centred, Earth-fixed ones.
-
-    Fixed-point iteration on the latitude; after five rounds the error near the ground is below a nanometre.
-
-    Args:
-        ecef_m: (..., 3) metres.
-
-    Returns:
-        WGS84 latitude and longitude in degrees and height above the ellipsoid in metres, (...,) each.
-    """
-    x, y, z = np.moveaxis(np.asarray(ecef_m, float), -1, 0)
-    radius = np.hypot(x, y)
-    lat = np.arctan2(z, radius * (1.0 - WGS84_E2))
-    for _ in range(5):
-        normal = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
-        lat = np.arctan2(z + WGS84_E2 * normal * np.sin(lat), radius)
-    normal = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
-    # This form of the height is well conditioned at the equator and at the poles.
-    height = radius * np.cos(lat) + z * np.sin(lat) - WGS84_A_M**2 / normal
-    return np.degrees(lat), np.degrees(np.arctan2(y, x)), height
 
 
 @dataclass(frozen=True)
@@ -82,21 +38,14 @@ class LocalFrame:
     lon_deg: float
 
     @cached_property
-    def enu_from_ecef(self) -> Array:
-        """(3, 3) rotation from the Earth's axes to east, north and up."""
-        lat, lon = math.radians(self.lat_deg), math.radians(self.lon_deg)
-        sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
-        return np.array(
-            [
-                [-sin_lon, cos_lon, 0.0],
-                [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
-                [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
-            ]
-        )
+    def _topocentric(self) -> Transformer:
+        """PROJ's transform of longitude, latitude and height above the ellipsoid to east, north and up."""
+        from pyproj import Transformer  # takes a while to import
 
-    @cached_property
-    def _origin_ecef_m(self) -> Array:
-        return ecef_from_geodetic(self.lat_deg, self.lon_deg)
+        return Transformer.from_pipeline(
+            "+proj=pipeline +ellps=WGS84 +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart "
+            f"+step +proj=topocentric +lat_0={float(self.lat_deg)!r} +lon_0={float(self.lon_deg)!r}"
+        )
 
     def enu_from_geodetic(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
         """Local coordinates of points on the ellipsoid.
@@ -108,8 +57,8 @@ class LocalFrame:
         Returns:
             (..., 2) east and north in metres.
         """
-        offset = ecef_from_geodetic(lat_deg, lon_deg) - self._origin_ecef_m
-        return (offset @ self.enu_from_ecef.T)[..., :2]
+        lat, lon = np.broadcast_arrays(np.asarray(lat_deg, float), np.asarray(lon_deg, float))
+        return np.stack(self._topocentric.transform(lon, lat, np.zeros_like(lat))[:2], axis=-1)
 
     def convergence_deg(self, lat_deg: float, lon_deg: float) -> float:
         """Direction of true north at a position, clockwise from this frame's north, in [-180, 180].
@@ -144,10 +93,9 @@ class LocalFrame:
         # The ellipsoid is below the tangent plane by d^2 / 2R; two rounds find that drop.
         drop = np.zeros_like(east)
         for _ in range(3):
-            enu = np.stack([east, north, -drop], axis=-1)
-            lat, lon, height = geodetic_from_ecef(enu @ self.enu_from_ecef + self._origin_ecef_m)
+            lon, lat, height = self._topocentric.transform(east, north, -drop, direction="INVERSE")
             drop = drop + height
-        return lat, lon
+        return np.asarray(lat), np.asarray(lon)
 
 
 def enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Array:
@@ -164,11 +112,6 @@ def enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Arra
     Returns:
         (3, 3), ``v_enu = enu_from_body(...) @ v_body``.
     """
-    return _enu_from_body(roll_deg, pitch_deg, heading_deg).copy()
-
-
-@lru_cache(maxsize=16)  # the steps of one frame share it
-def _enu_from_body(roll_deg: float, pitch_deg: float, heading_deg: float) -> Array:
     sr, sp, sh = (math.sin(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
     cr, cp, ch = (math.cos(math.radians(v)) for v in (roll_deg, pitch_deg, heading_deg))
     # Rz(heading) Ry(pitch) Rx(roll) takes the body to north-east-down; its rows as east, north and -down.

@@ -204,15 +204,11 @@ class Prior:
             raise OptionError("prior: expected either lat_deg and lon_deg or east_m and north_m")
         if not all(map(math.isfinite, given)):
             raise OptionError(f"prior: expected a finite position, got {tuple(given)}")
-        if self.lat_deg is not None and self.lon_deg is not None:
-            if abs(self.lat_deg) > 90:
-                raise OptionError(f"lat_deg: expected -90 to 90, got {self.lat_deg}")
-            if abs(self.lon_deg) > 360:
-                raise OptionError(f"lon_deg: expected -360 to 360, got {self.lon_deg}")
+        check(self, "lat_deg", "-90 to 90", lambda lat: lat is None or abs(lat) <= 90)
+        check(self, "lon_deg", "-360 to 360", lambda lon: lon is None or abs(lon) <= 360)
         if not (math.isfinite(self.moved_east_m) and math.isfinite(self.moved_north_m)):
             raise OptionError(f"moved: expected finite metres, got {self.moved_east_m}, {self.moved_north_m}")
-        if not (math.isfinite(self.sigma_m) and self.sigma_m >= 0):
-            raise OptionError(f"sigma_m: expected 0 m or more, got {self.sigma_m}")
+        check(self, "sigma_m", "0 m or more", lambda sigma: math.isfinite(sigma) and sigma >= 0)
 
 
 @dataclass(frozen=True, slots=True)

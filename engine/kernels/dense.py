@@ -22,6 +22,7 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -95,31 +96,17 @@ class DenseFit:
 
     Attributes:
         pose: at which picture and map agree best.
-        first_correlation: of picture and map at the samples, at the pose to begin with.
         converged: whether the last step was small.
-        offsets_m: (3, N) of the samples from the slope's pivot.
-        rotation: (3, 3) of the pose before the last step.
-        correlation: of picture and map at the samples that are visible from it.
-        differences: (N,) of picture and map.
-        points: (3, N) samples in the camera's axes.
-        shown: (3, N) derivatives of the differences by the points, from the picture's gradients.
-        expected: (3, N) the same, from the map's gradients.
-        weights: (N,) robust weights, 0 where a sample is not visible.
-        cells: (N,) cell of the picture.
+        first_correlation: of picture and map at the samples, at the pose to begin with.
+        correlation: the same, at those that are visible from the pose before the last step.
+        projected: what :func:`engine.kernels.gauss_newton.information` takes.
     """
 
     pose: Pose
-    first_correlation: float
     converged: bool
-    offsets_m: Array
-    rotation: Array
+    first_correlation: float
     correlation: float
-    differences: Array
-    points: Array
-    shown: Array
-    expected: Array
-    weights: Array
-    cells: NDArray[np.intp]
+    projected: tuple[NDArray[Any], ...]
 
 
 def correlation_at(picture: EnhancedFrame, samples: Samples, pose: Pose) -> float:
@@ -162,13 +149,11 @@ def refine(picture: EnhancedFrame, samples: Samples, start: Pose, prior: Gaussia
     offset_m = np.ascontiguousarray((samples.points_m - prior.pose.center_m).T)
     # The loops are compiled for one memory layout of the matrices.
     first, mean = ((np.ascontiguousarray(p.rotation), p.center_m, p.slope) for p in (start, prior.pose))
-    found, converged, first_correlation, rotation, center_m, slope, *seen = gauss_newton(
+    found, converged, at_first, correlation, *pose, projected = gauss_newton(
         picture.levels, picture.matrix, first, mean, prior.precision,
         offset_m, samples.values, samples.gradients, samples.weights,
     )  # fmt: skip
-    if not found:
-        return None
-    return DenseFit(Pose(rotation, center_m, slope), first_correlation, converged, offset_m, *seen)
+    return DenseFit(Pose(*pose), converged, at_first, correlation, projected) if found else None
 
 
 def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
@@ -187,10 +172,9 @@ def covariance_of(fit: DenseFit, prior: GaussianPrior) -> Array | None:
     """
     from engine.kernels import gauss_newton
 
-    own, common, of_map, by_cell = gauss_newton.information(
-        fit.shown, fit.expected, fit.points, fit.offsets_m, fit.rotation, fit.weights, fit.differences, fit.cells,
-    )  # fmt: skip
-    variance = max(float(fit.weights @ fit.differences**2 / fit.weights.sum()), 1e-12)
+    own, common, of_map, by_cell = gauss_newton.information(*fit.projected)
+    *_, weights, differences, _ = fit.projected
+    variance = max(float(weights @ differences**2 / weights.sum()), 1e-12)
     reference = _inverse(own / variance + prior.precision)
     if reference is None:
         return None

@@ -37,9 +37,9 @@ def gauss_newton(picture, matrix, start, prior, precision, offset_m, values, gra
         known: (N,) weights.
 
     Returns:
-        Whether a pose was found, and whether the last step was small; the correlation to begin with; rotation,
-        center and slope; of the projection before the last step: rotation, correlation, differences (N,), points
-        (3, N), derivatives (3, N) by the picture and by the map, weights (N,) and cells (N,).
+        Whether a pose was found, and whether the last step was small; the correlation to begin with, and before
+        the last step; rotation, center and slope; and what :func:`information` takes, of the projection before the
+        last step.
     """
     rotation, center_m, slope = start[0].copy(), start[1].copy(), start[2].copy()
     step, found, converged, at_first = np.zeros(_PARAMETERS), True, False, np.nan
@@ -72,10 +72,8 @@ def gauss_newton(picture, matrix, start, prior, precision, offset_m, values, gra
             converged = size < _LAST_STEP**2
         if not found or converged:
             break
-    return (
-        found, converged, at_first, rotation, center_m, slope, seen, correlation, differences, points, shown,
-        expected, weights, cell,
-    )  # fmt: skip
+    projected = (shown, expected, points, offset_m, seen, weights, differences, cell)
+    return found, converged, at_first, correlation, rotation, center_m, slope, projected
 
 
 @compiled()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from engine.kernels.small_matrices import add_equation, solve
 from engine.runtime.jit import compiled
 
 
@@ -24,36 +25,21 @@ def lower_plane(offsets, heights_m, share, on_plane_m, rounds):
         (3,) level at offset 0, and rise per unit of both offsets; and how many heights are known.
     """
     plane, weights, known = np.zeros(3), np.ones(len(heights_m)), 0
+    normal, right, row = np.empty((3, 3)), np.empty(3), np.ones(3)
     for n in range(len(heights_m)):
         if np.isnan(heights_m[n]):
             weights[n] = 0.0
         else:
             known += 1
     for _ in range(rounds):
-        one = x = y = xx = xy = yy = z = xz = yz = 0.0
+        normal[:], right[:] = 0.0, 0.0
         for n in range(len(heights_m)):
-            weight = weights[n]
-            if weight == 0.0:
-                continue
-            east, north, up = weight * offsets[n, 0], weight * offsets[n, 1], weight * heights_m[n]
-            one += weight
-            x += east
-            y += north
-            z += up
-            xx += east * offsets[n, 0]
-            xy += east * offsets[n, 1]
-            yy += north * offsets[n, 1]
-            xz += east * heights_m[n]
-            yz += north * heights_m[n]
-        # About the means, which leaves two equations; numba's own solver asks for SciPy.
-        xx, xy, yy = xx - x * x / one, xy - x * y / one, yy - y * y / one
-        xz, yz = xz - x * z / one, yz - y * z / one
-        size = xx * yy - xy * xy
-        plane[1], plane[2] = (yy * xz - xy * yz) / size, (xx * yz - xy * xz) / size
-        plane[0] = (z - plane[1] * x - plane[2] * y) / one
+            if weights[n] > 0.0:
+                row[1], row[2] = offsets[n, 0], offsets[n, 1]
+                add_equation(normal, right, row, weights[n], heights_m[n])
+        solve(normal, right, plane)
         for n in range(len(heights_m)):
-            if weights[n] == 0.0:
-                continue
-            above = heights_m[n] - plane[0] - plane[1] * offsets[n, 0] - plane[2] * offsets[n, 1]
-            weights[n] = (share if above > 0.0 else 1.0 - share) / max(abs(above), on_plane_m)
+            if weights[n] > 0.0:
+                above = heights_m[n] - plane[0] - plane[1] * offsets[n, 0] - plane[2] * offsets[n, 1]
+                weights[n] = (share if above > 0.0 else 1.0 - share) / max(abs(above), on_plane_m)
     return plane, known

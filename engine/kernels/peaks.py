@@ -68,14 +68,13 @@ def find_peak(scores: Picture, *, exclusion_px: float) -> Peak:
 
 
 def _second_score(scores: NDArray[np.float32], x: int, y: int, exclusion_px: float) -> float:
-    """The best of (H, W) outside a disc about the peak: the strips around the disc's box, then its corners."""
-    height, width = scores.shape
-    r = int(exclusion_px)
-    x0, x1, y0, y1 = max(0, x - r), min(width, x + r + 1), max(0, y - r), min(height, y + r + 1)
-    rows, columns = np.ogrid[y0 - y : y1 - y, x0 - x : x1 - x]
-    outside = [scores[:y0], scores[y1:], scores[y0:y1, :x0], scores[y0:y1, x1:]]
-    outside.append(scores[y0:y1, x0:x1][rows * rows + columns * columns > exclusion_px * exclusion_px])
-    return max((float(part.max()) for part in outside if part.size), default=-1.0)
+    """The best of (H, W) outside a disc about the peak."""
+    rest, r = scores.copy(), int(exclusion_px)
+    top, left = max(0, y - r), max(0, x - r)
+    near = rest[top : y + r + 1, left : x + r + 1]
+    rows, columns = np.ogrid[top - y : top - y + near.shape[0], left - x : left - x + near.shape[1]]
+    near[rows * rows + columns * columns <= exclusion_px * exclusion_px] = -1.0
+    return float(rest.max())
 
 
 # The neighbourhood of a peak as rows and columns (dy, dx): 3 x 3 positions, and the four two pixels away.
@@ -83,7 +82,7 @@ NEAR = np.array([[-1, -1, -1, 0, 0, 0, 1, 1, 1], [-1, 0, 1, -1, 0, 1, -1, 0, 1]]
 FAR = np.array([[-2, 2, 0, 0], [0, 0, -2, 2]])
 # Powers (i, j) of the polynomials c[i, j] x^i y^j that follow it: a quadratic by least squares over the 3 x 3;
 # and, since a peak is sharper than a parabola, one of degree 4 through all 13.
-_QUADRATIC = [(0, 0), (1, 0), (2, 0), (0, 1), (0, 2), (1, 1)]
+_QUADRATIC = [(i, j) for i in range(3) for j in range(3 - i)]
 _QUARTIC = [*_QUADRATIC, (3, 0), (4, 0), (0, 3), (0, 4), (2, 1), (1, 2), (2, 2)]
 
 

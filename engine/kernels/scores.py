@@ -51,9 +51,7 @@ def enhance(
     return _normalised(gray, valid.astype(np.float32), radius_px)
 
 
-def orientation(
-    gray: NDArray[np.uint8], *, radius_px: int = RADIUS_PX, valid: NDArray[np.bool_] | None = None
-) -> FloatImage:
+def orientation(gray: NDArray[np.uint8], *, valid: NDArray[np.bool_] | None = None) -> FloatImage:
     """Which way edges run, and how clearly, as two channels: cosine and sine of the doubled angle.
 
     The structure tensor's deviation from isotropy, smoothed, over its mean strength in the neighbourhood. An edge
@@ -61,7 +59,6 @@ def orientation(
 
     Args:
         gray: (H, W).
-        radius_px: neighbourhoods of the normalisation are boxes of 2 radius_px + 1 pixels.
         valid: (H, W) bool; the result is 0 where it is False.
 
     Returns:
@@ -80,7 +77,7 @@ def orientation(
     if weight is not None:
         parts = [part * weight for part in parts]
     cosine, sine, strength = (cv2.GaussianBlur(part, (7, 7), _STRUCTURE_SCALE_PX) for part in parts)
-    box = (2 * radius_px + 1, 2 * radius_px + 1)
+    box = (2 * RADIUS_PX + 1, 2 * RADIUS_PX + 1)
     size = cv2.sqrt(cv2.multiply(strength, cv2.blur(strength, box)))
     size += _STRUCTURE_NOISE
     found = np.stack([cv2.divide(part, size) for part in (cosine, sine)])

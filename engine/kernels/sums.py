@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,24 +11,26 @@ from numpy.typing import NDArray
 from engine.errors import OptionError
 from engine.runtime.device import Picture, as_float
 
+Number = TypeVar("Number", np.float32, np.uint8)
+
 # Sums of squares about a mean below this share of the whole picture's are rounding: there a patch is flat.
 FLAT_SHARE = 1e-12
 MIDDLE_GREY = 128
 """Of uint8; levels are counted from it, so that sums of squares lose fewer digits."""
 
 
-def halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def halved(image: NDArray[Number]) -> NDArray[Number]:
     """Means of 2 x 2 pixels.
 
     Args:
-        image: (H, W) float32; an odd last row or column is left out.
+        image: (H, W) float32 or uint8; an odd last row or column is left out.
 
     Returns:
-        (H // 2, W // 2) float32.
+        (H // 2, W // 2) of the same type.
     """
     height, width = image.shape[0] & ~1, image.shape[1] & ~1
     size = (width // 2, height // 2)
-    return np.asarray(cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA), np.float32)
+    return np.asarray(cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA), image.dtype)
 
 
 def check_finite(name: str, is_finite: bool) -> None:

@@ -51,12 +51,8 @@ def ncc_surface(search: Tensor, templates: Tensor, *, zero_mean: bool) -> Tensor
         templates = templates - templates.mean(dim=(-2, -1), keepdim=True, dtype=torch.float64)
         templates = templates - templates.mean(dim=(-2, -1), keepdim=True)  # the rounding residue of a flat one
     h, w = templates.shape[-2:]
-    sums = integrals(search)
-    energy = box_energy(sums, h, w) if zero_mean else box_sum(sums[1], h, w)
-    energy.masked_fill_(energy <= FLAT_SHARE * sums[1, :, -1:, -1:], torch.inf)
-    norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True, dtype=torch.float64)
-    normal = templates.double() / norm.clamp_min(_tiny(norm))  # a flat template is all zeros, and scores 0
-    scores = correlate(search.double(), normal).mul_(energy.rsqrt_()[:, None]).clamp_(-1.0, 1.0)
+    inverse_norms = _inverse_norms(integrals(search), h, w, zero_mean=zero_mean)
+    scores = _scores(search.double(), inverse_norms, templates.double())
     check_all_finite(**given)  # last: the host waits for it
     return scores.to(search.dtype)
 
@@ -72,14 +68,14 @@ def prepared_surface(image: Tensor, inverse_norms: Tensor, templates: Tensor) ->
     Returns:
         (T, H-h+1, W-w+1) float32 in [-1, 1].
     """
+    return _scores(image[None], inverse_norms[None], templates[None])[0]
+
+
+def _scores(search: Tensor, inverse_norms: Tensor, templates: Tensor) -> Tensor:
+    """Scores (B, T, H', W') by inverse norms (B, H', W'); a flat template is all zeros, and scores 0."""
     norm = torch.linalg.vector_norm(templates, dim=(-2, -1), keepdim=True)
-    normal = templates / norm.clamp_min_(_tiny(norm))
-    return correlate(image[None], normal[None])[0].mul_(inverse_norms).clamp_(-1.0, 1.0)
-
-
-def _tiny(values: Tensor) -> float:
-    """The least normal number of their type, which keeps a quotient of zeros zero."""
-    return torch.finfo(values.dtype).tiny
+    normal = templates / norm.clamp_min(torch.finfo(norm.dtype).tiny)
+    return correlate(search, normal).mul_(inverse_norms[:, None]).clamp_(-1.0, 1.0)
 
 
 def peak_numbers(scores: Tensor, exclusion_px: float) -> list[float]:
@@ -118,9 +114,14 @@ def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
     Returns:
         (H-h+1, W-w+1) float32; 0 where a patch is flat.
     """
-    energy, squares = box_energy(sums, h, w), sums[1]
-    floor = FLAT_SHARE * (squares[-1, -1] - squares[0, 0])  # no less than the window's own energy
-    return energy.masked_fill_(energy <= floor, torch.inf).float().rsqrt_()
+    return _inverse_norms(sums, h, w, zero_mean=True).float()
+
+
+def _inverse_norms(sums: Tensor, h: int, w: int, *, zero_mean: bool) -> Tensor:
+    """The same in float64 of one picture or many, on request of the squares themselves."""
+    energy, squares = box_energy(sums, h, w) if zero_mean else box_sum(sums[1], h, w), sums[1]
+    floor = FLAT_SHARE * (squares[..., -1:, -1:] - squares[..., :1, :1])  # no less than the window's own energy
+    return energy.masked_fill_(energy <= floor, torch.inf).rsqrt_()
 
 
 def correlate(search: Tensor, templates: Tensor) -> Tensor:

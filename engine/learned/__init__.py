@@ -9,31 +9,13 @@ from typing import TYPE_CHECKING
 from engine.runtime.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
-    from engine.learned.keypoints import Extractor, Keypoints
     from engine.learned.loading import load_matcher
-    from engine.learned.matchers import KeypointMatcher, Loftr
     from engine.learned.pairs import PairMatcher
 
-__all__ = [
-    "Extractor",
-    "KeypointMatcher",
-    "Keypoints",
-    "Loftr",
-    "PairMatcher",
-    "load_matcher",
-]
+__all__ = ["PairMatcher", "load_matcher"]
 
-_NAMES = {
-    "engine.learned.keypoints": "Extractor Keypoints",
-    "engine.learned.loading": "load_matcher",
-    "engine.learned.matchers": "KeypointMatcher Loftr",
-    "engine.learned.pairs": "PairMatcher",
-}
+_NAMES = {"engine.learned.loading": "load_matcher", "engine.learned.pairs": "PairMatcher"}
 """The public names by module. A module is imported when one of its names is used: networks need torch."""
 
 if not TYPE_CHECKING:  # type checkers see the names above and reject others
     __getattr__ = imported_on_use(__name__, _NAMES)
-
-
-def __dir__() -> list[str]:
-    return __all__

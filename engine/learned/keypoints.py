@@ -25,12 +25,10 @@ class Keypoints:
 
     Attributes:
         xy_px: (N, 2).
-        strength: (N,) larger if the keypoint is likelier to be found again; comparable within one network.
         descriptors: (N, D).
     """
 
     xy_px: Tensor
-    strength: Tensor
     descriptors: Tensor
 
     def __len__(self) -> int:
@@ -38,7 +36,7 @@ class Keypoints:
 
     def only(self, chosen: Tensor) -> Keypoints:
         """The keypoints selected by a mask (N,) or by indices."""
-        return Keypoints(self.xy_px[chosen], self.strength[chosen], self.descriptors[chosen])
+        return Keypoints(self.xy_px[chosen], self.descriptors[chosen])
 
 
 Extractor: TypeAlias = Callable[[Tensor, int], Keypoints]
@@ -59,4 +57,4 @@ def by_aliked(network: nn.Module, picture: Tensor, count: int) -> Keypoints:
 
 def _ranked(xy_px: Tensor, strength: Tensor, descriptors: Tensor, count: int) -> Keypoints:
     order = torch.argsort(strength, descending=True, stable=True)[:count]
-    return Keypoints(xy_px, strength, descriptors).only(order)
+    return Keypoints(xy_px, descriptors).only(order)

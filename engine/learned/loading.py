@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+
+import kornia.feature as kornia
 
 from engine.errors import OptionError
 from engine.learned.keypoints import Extractor, by_aliked, by_disk
@@ -49,7 +49,7 @@ def load_matcher(
     files = sorted(map(read_weights, paths), key=lambda weights: weights.kind)
     kinds = [weights.kind for weights in files]
     if kinds == ["LoFTR"]:
-        return Loftr(fill(_kornia().LoFTR(pretrained=None), files[0], target), min_confidence)
+        return Loftr(fill(kornia.LoFTR(pretrained=None), files[0], target), min_confidence)
     if kinds not in (["ALIKED", "LightGlue"], ["DISK", "LightGlue"]):
         raise OptionError(f"weights: expected the files of {_EXPECTED}, got {' and '.join(kinds)}")
     extractor, numbers = _extractor(files[0], target)
@@ -59,13 +59,8 @@ def load_matcher(
 def _extractor(weights: Weights, device: torch.device) -> tuple[Extractor, int]:
     """The extractor of a file, and how many numbers its descriptors have."""
     if weights.kind == "DISK":
-        return partial(by_disk, fill(_kornia().DISK(), weights, device)), 128
+        return partial(by_disk, fill(kornia.DISK(), weights, device)), 128
     return partial(by_aliked, _aliked(weights, device)), len(weights.tensors["desc_head.sf_conv.weight"])
-
-
-def _kornia() -> Any:
-    """Kornia's networks, which take a second to import."""
-    return importlib.import_module("kornia.feature")
 
 
 def _aliked(weights: Weights, device: torch.device) -> nn.Module:
@@ -76,7 +71,7 @@ def _aliked(weights: Weights, device: torch.device) -> nn.Module:
         offsets = weights.tensors.get("desc_head.agg_weights")
         name = "aliked-n32" if offsets is not None and len(offsets) == 32 else "aliked-n16"
     # Without a threshold every local maximum is a keypoint; each call limits their number.
-    return fill(_kornia().ALIKED(name, max_num_keypoints=1 << 16, detection_threshold=0.0), weights, device)
+    return fill(kornia.ALIKED(name, max_num_keypoints=1 << 16, detection_threshold=0.0), weights, device)
 
 
 def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Module:
@@ -96,5 +91,5 @@ def _lightglue(weights: Weights, numbers: int, device: torch.device) -> nn.Modul
         raise OptionError(f"weights: {weights.path}: {what}")
     layers = 1 + max(int(n.split(".")[1]) for n in tensors if n.startswith("log_assignment."))
     # For named features kornia would fetch weights.
-    network = _kornia().LightGlue(features=None, input_dim=numbers, n_layers=layers)
+    network = kornia.LightGlue(features=None, input_dim=numbers, n_layers=layers)  # type: ignore[arg-type]
     return fill(network, weights, device)

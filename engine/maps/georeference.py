@@ -52,12 +52,10 @@ class Georeference:
 
     def _exact_enu(self, xy_px: Array) -> Array:
         lonlat = self._to_geodetic(xy_px)
-        with np.errstate(invalid="ignore"):  # far outside its CRS a pixel has no coordinates
-            return self.frame.enu_from_geodetic(lonlat[..., 1], lonlat[..., 0])
+        return self.frame.enu_from_geodetic(lonlat[..., 1], lonlat[..., 0])
 
     def _exact_pixel(self, en_m: Array) -> Array:
-        with np.errstate(invalid="ignore"):
-            lat, lon = self.frame.geodetic_from_enu(en_m[..., 0], en_m[..., 1])
+        lat, lon = self.frame.geodetic_from_enu(en_m[..., 0], en_m[..., 1])
         return self._from_geodetic(np.stack([lon, lat], axis=-1))
 
     def enu_from_pixel(self, xy_px: ArrayLike) -> Array:

@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.polynomial.polynomial import polyvander, polyvander2d
+from numpy.polynomial.polynomial import polyvander2d
 from numpy.typing import NDArray
 
 from engine.errors import MapError
@@ -47,16 +47,14 @@ class Warp:
         self._exact = exact
         self._centre, self._half = (box[0] + box[1]) / 2.0, (box[1] - box[0]) / 2.0
         chebyshev = np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0)  # nodes that spread the error evenly
-        nodes = square_lattice(chebyshev)
-        terms = polyvander2d(nodes[:, 0], nodes[:, 1], [5, 5])
+        nodes, between = square_lattice(chebyshev), square_lattice(np.linspace(-1.0, 1.0, 17))
         values = exact(self._centre + self._half * nodes)
         self._coefficients: Array = np.zeros((6, 6, 2))
         self.fitted = bool(np.isfinite(values).all())
         if self.fitted:
-            self._coefficients[:] = np.linalg.lstsq(terms, values, rcond=None)[0].reshape(6, 6, 2)
-            step = np.linspace(-1.0, 1.0, 17)
-            x, y = (middle + half * step for middle, half in zip(self._centre, self._half, strict=True))
-            error = self.on_grid(x, y) - exact(np.stack(np.meshgrid(x, y), axis=-1))
+            coefficients = np.linalg.lstsq(_powers(nodes), values, rcond=None)[0]
+            self._coefficients[:] = coefficients.reshape(6, 6, 2)
+            error = _powers(between) @ coefficients - exact(self._centre + self._half * between)
             self.fitted = bool(np.abs(error).max() <= tolerance)  # NaN compares as not fitted
 
     def __call__(self, points: Array) -> Array:
@@ -77,20 +75,10 @@ class Warp:
                 return out.reshape(points.shape)
         return self._exact(points)
 
-    def on_grid(self, x: Array, y: Array) -> Array:
-        """Transform all pairs of columns and rows.
 
-        Args:
-            x: (W,) columns, inside the box.
-            y: (H,) rows, inside the box.
-
-        Returns:
-            (H, W, 2).
-        """
-        if not self.fitted:
-            return self._exact(np.stack(np.meshgrid(x, y), axis=-1))
-        in_x, in_y = (polyvander((v - c) / h, 5) for v, c, h in zip((x, y), self._centre, self._half, strict=True))
-        return np.stack([in_y @ self._coefficients[..., k].T @ in_x.T for k in (0, 1)], axis=-1)
+def _powers(points: Array) -> Array:
+    """(N, 36) products of powers of x and of y up to the fifth."""
+    return np.asarray(polyvander2d(points[:, 0], points[:, 1], [5, 5]), np.float64)
 
 
 def square_lattice(x: Array) -> Array:
@@ -251,8 +239,7 @@ class Grid:
         lon, lat = np.moveaxis(
             self.pixels_of(wgs84())[0](self.centre_px + np.array([[0, 0], [1, 0], [0, 1]])), -1, 0
         )
-        with np.errstate(invalid="ignore"):
-            steps_m = np.linalg.norm(LocalFrame(lat[0], lon[0]).enu_from_geodetic(lat[1:], lon[1:]), axis=1)
+        steps_m = np.linalg.norm(LocalFrame(lat[0], lon[0]).enu_from_geodetic(lat[1:], lon[1:]), axis=1)
         return bool(steps_m.max() <= 1.01 * steps_m.min())
 
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from engine.learned import KeypointMatcher, Keypoints
+from engine.learned.keypoints import Keypoints
+from engine.learned.matchers import KeypointMatcher
 from engine.maps.landmarks import MAX_LANDMARKS, as_picture
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import HALO_PX, tiles_under, widened
@@ -65,10 +66,10 @@ class KeypointMap:
         for tile in self.tiles.get(*((own, level) for own in windows)):
             xy = tile.xy_px - tile.xy_px.new_tensor(corner)
             inside = ((xy >= 0.0) & (xy <= xy.new_tensor(size) - 1.0)).all(dim=1)
-            parts.append(Keypoints(xy, tile.strength, tile.descriptors).only(inside))
+            parts.append(Keypoints(xy, tile.descriptors).only(inside))
         share = min(1.0, count / max(1, sum(map(len, parts))))
         parts = [part.only(torch.arange(int(share * len(part)), device=part.xy_px.device)) for part in parts]
-        return Keypoints(*(torch.cat(v) for v in zip(*map(_fields, parts), strict=True)))
+        return Keypoints(torch.cat([p.xy_px for p in parts]), torch.cat([p.descriptors for p in parts]))
 
     def _describe(self, tile: Window, level: int) -> Keypoints:
         """The keypoints of a tile, in pixels of the level."""
@@ -78,7 +79,7 @@ class KeypointMap:
         xy = found.xy_px + found.xy_px.new_tensor([wide.x0, wide.y0])
         low, size = xy.new_tensor([tile.x0, tile.y0]), xy.new_tensor([tile.width_px, tile.height_px])
         own = ((xy >= low - 0.5) & (xy < low + size - 0.5)).all(dim=1) & self._on_data(found, wide, level)
-        return Keypoints(xy, found.strength, found.descriptors).only(own)
+        return Keypoints(xy, found.descriptors).only(own)
 
     def _on_data(self, found: Keypoints, wide: Window, level: int) -> torch.Tensor:
         """Which keypoints (N,) of a window lie on the map's data and not at its edge."""
@@ -86,7 +87,3 @@ class KeypointMap:
         solid = cv2.erode(self._site.valid(wide, level).astype(np.uint8), near) > 0
         x, y = np.clip(on_host(found.xy_px.round().long()), 0, [wide.width_px - 1, wide.height_px - 1]).T
         return torch.from_numpy(solid[y, x]).to(found.xy_px.device)
-
-
-def _fields(points: Keypoints) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    return points.xy_px, points.strength, points.descriptors

@@ -57,8 +57,8 @@ class Landmarks:
     """Features of a part of the map.
 
     Attributes:
-        features: batch of one, N slots, in pixels of the level, on the device.
-        xy_px: (N, 2) a copy of their positions in host memory.
+        features: batch of one, N slots, in pixels of the level, as arrays.
+        xy_px: (N, 2) their positions.
         points_m: (N, 3) east, north and height of the surface.
     """
 
@@ -75,7 +75,7 @@ class LandmarkMap:
 
     Args:
         site: the map.
-        device: of detection and of the returned features, the frame's too; the cache is in host memory.
+        device: of detection, of the frame's features too.
         backend: of :func:`engine.features.sift`.
 
     Attributes:
@@ -85,7 +85,7 @@ class LandmarkMap:
     def __init__(self, site: OrthoMap, device: Device, backend: str = "auto") -> None:
         self._site, self.device = site, device
         self._backend = chosen_backend(backend, device)
-        self.tiles = RecentlyUsed(self._described, lambda _, tile: _count(tile), MAX_LANDMARKS)
+        self.tiles = RecentlyUsed(self._describe, lambda _, tile: _count(tile), MAX_LANDMARKS)
 
     def find(self, window: Window, level: int, *, upright: bool, per_px: float = math.inf) -> Landmarks:
         """The landmarks of a window.
@@ -102,9 +102,10 @@ class LandmarkMap:
         tiles = self.tiles.get(*self._keys(window, level, upright))
         max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
         parts = [(tile, _inside(tile, window, max_rank)) for tile in tiles]
-        return self._to_landmarks(
-            {name: np.concatenate([part[name][i] for part, i in parts]) for name in tiles[0]}
-        )
+        found = {name: np.concatenate([part[name][i] for part, i in parts]) for name in tiles[0]}
+        xy, scale, angle, descriptors = (found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors"))
+        of_one = (each[None] for each in (xy, scale, angle, descriptors, scale > 0.0))  # of every landmark
+        return Landmarks(Features(*of_one), xy, found["points_m"])
 
     def prepare(self, levels: Iterable[int] | None = None) -> None:
         """Describe whole levels, upright and not, and cache them in a file if the map comes from one.
@@ -147,17 +148,15 @@ class LandmarkMap:
     def _keys(self, window: Window, level: int, upright: bool) -> list[_Key]:
         return [(level, upright, tile) for tile in tiles_under(window, TILE_PX, self._site.level_shape(level))]
 
-    def _described(self, level: int, upright: bool, own: Window) -> NamedArrays:
-        return self._with_points(self._detect(level, upright, own), level)
-
-    def _detect(self, level: int, upright: bool, own: Window) -> NamedArrays:
+    def _describe(self, level: int, upright: bool, own: Window) -> NamedArrays:
         """Every keypoint on a tile, as detected in the whole level."""
         wide = widened(own, HALO_PX, self._site.level_shape(level))
         inner = within(own, wide)
         mask = np.zeros((wide.height_px, wide.width_px), np.bool_)
         mask[inner] = self._site.valid(wide, level)[inner]
         if not mask.any():
-            return {field: np.zeros((0, *shape), dtype) for field, (dtype, shape) in _STORED.items()}
+            none = {field: np.zeros((0, *shape), dtype) for field, (dtype, shape) in _STORED.items()}
+            return self._with_points(none, level)
         found = sift(
             as_picture(self._site.gray(wide, level), self.device),
             max_keypoints=_SLOTS,
@@ -174,20 +173,14 @@ class LandmarkMap:
         rank = _rank_in_cells(xy)
         kept = np.flatnonzero(rank < MAX_PER_CELL)
         arrays = (xy, scale, angle, rank, descriptors)
-        return {name: a[kept].astype(kind[0]) for (name, kind), a in zip(_STORED.items(), arrays, strict=True)}
+        named = zip(_STORED.items(), arrays, strict=True)
+        return self._with_points({name: a[kept].astype(kind) for (name, (kind, _)), a in named}, level)
 
     def _with_points(self, tile: NamedArrays, level: int) -> NamedArrays:
         map_px = self._site.full_from_level(tile["xy_px"], level)
         return tile | {
             "points_m": np.column_stack([self._site.enu_from_pixel(map_px), self._site.surface_at(map_px)])
         }
-
-    def _to_landmarks(self, found: NamedArrays) -> Landmarks:
-        columns = [found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors")]
-        xy, scale, angle, descriptors = (to_device(column[None], self.device) for column in columns)
-        valid = scale > 0.0  # of every landmark
-        features = Features(xy, scale, angle, as_float(descriptors, "float32"), valid)
-        return Landmarks(features, found["xy_px"], found["points_m"])
 
 
 def _count(tile: NamedArrays) -> int:

@@ -86,7 +86,7 @@ def _resampled(reader: GrayReader, source: Grid, grid: Grid, windows: Iterable[W
     for window in windows:
         columns = np.arange(window.x0, window.x1, dtype=np.float64)
         rows = np.arange(window.y0, window.y1, dtype=np.float64)
-        at = np.nan_to_num(warp.on_grid(columns, rows), nan=-9.0, posinf=-9.0, neginf=-9.0)
+        at = np.nan_to_num(warp(np.stack(np.meshgrid(columns, rows), axis=-1)), nan=-9.0, posinf=-9.0, neginf=-9.0)
         seen = window_about(at.reshape(-1, 2), (source.height_px, source.width_px), margin_px=3)
         block = np.zeros((2, window.height_px, window.width_px), np.uint8)
         if seen is not None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from engine.kernels.scores import RADIUS_PX, enhance
 from engine.kernels.search_levels import MAX_HALVINGS
 from engine.maps.recently_used import RecentlyUsed
-from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, tiles_under, widened, within
+from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, cells_under, widened, within
 from engine.ncc_fft import MapRegion, prepare
 from engine.runtime.device import Device, to_device
 from engine.values import Window
@@ -90,12 +90,9 @@ class PreparedMap:
     @staticmethod
     def _to_prepare(window: Window, shape: tuple[int, int]) -> Window:
         """What to prepare for a window: all of a small level, else whole tiles with half a tile to each side."""
-        rows, columns = shape
-        if rows * columns <= WHOLE_LEVEL_PX:
-            return Window(0, 0, columns, rows)
         ahead_px = TILE_PX // 2  # the next windows of a flight fall in the same region
-        tiles = tiles_under(widened(window, ahead_px, shape), TILE_PX, shape)
-        first, last = tiles[0], tiles[-1]
+        cells = cells_under(widened(window, ahead_px, shape), shape)
+        first, last = cells[0], cells[-1]
         return Window(first.x0, first.y0, last.x1 - first.x0, last.y1 - first.y0)
 
     def _evictable_px(self, key: tuple[Window, int], _: Region) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import DtypeError, OptionError, ShapeError
+from engine.kernels.sums import halved
 from engine.maps.grids import Array
 from engine.maps.rasters import BLOCK_PX, COARSE_LIMIT_PX, Gray, GrayReader, Mask, is_large
 from engine.values import Window
@@ -143,10 +144,6 @@ class Pyramid:
 
 def _halved(gray: Gray, valid: Mask) -> tuple[Gray, Mask]:
     """2 x 2 area averages, valid if all four are. An odd last row or column is left out."""
-    import cv2
-
-    height, width = gray.shape[0] // 2, gray.shape[1] // 2
-    even = slice(0, 2 * height), slice(0, 2 * width)
-    small = cv2.resize(gray[even], (width, height), interpolation=cv2.INTER_AREA)
-    all_four = np.asarray(valid[even].reshape(height, 2, width, 2).all(axis=(1, 3)))
-    return np.asarray(small, np.uint8), all_four
+    small = halved(gray)
+    height, width = small.shape
+    return small, np.asarray(valid[: 2 * height, : 2 * width].reshape(height, 2, width, 2).all(axis=(1, 3)))

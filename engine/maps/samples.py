@@ -13,7 +13,7 @@ from engine.kernels.dense import Samples
 from engine.maps.prepared import enhanced_part
 from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
-from engine.maps.tiles import TILE_PX, WHOLE_LEVEL_PX, tiles_under
+from engine.maps.tiles import cells_under
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -52,7 +52,9 @@ class SampleMap:
             Samples: in metres east, north and up.
         """
         step, parts = math.ceil(window.area_px / BLOCK_PX**2 / max_samples), []
-        cells = self._cells_under(window, level)
+        under = cells_under(window, self._site.level_shape(level))
+        # The remainder beyond a level's last whole cell may be narrower than a block: it gives no sample.
+        cells = [cell for cell in under if min(cell.width_px, cell.height_px) >= BLOCK_PX]
         found = self.cells.get(*((cell, level) for cell in cells))
         for cell, (samples, blocks) in zip(cells, found, strict=True):
             x, y = window.x0 - cell.x0, window.y0 - cell.y0
@@ -61,17 +63,7 @@ class SampleMap:
             at = blocks[rows, columns].ravel()[::step]
             fields = (samples.points_m, samples.values, samples.gradients, samples.weights)
             parts.append([field.take(at, axis=0) for field in fields])
-        if len(parts) == 1:
-            return Samples(*parts[0])
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-    def _cells_under(self, window: Window, level: int) -> list[Window]:
-        height, width = shape = self._site.level_shape(level)
-        if width * height <= WHOLE_LEVEL_PX:
-            return [Window(0, 0, width, height)]
-        cells = tiles_under(window, TILE_PX, shape)
-        # The remainder beyond a level's last whole cell may be narrower than a block: it gives no sample.
-        return [cell for cell in cells if min(cell.width_px, cell.height_px) >= BLOCK_PX]
 
     def _sampled(self, cell: Window, level: int) -> tuple[Samples, NDArray[np.intp]]:
         """Samples of a cell, and their indices by row and column of their block; a remainder beyond has none."""

@@ -17,8 +17,8 @@ from engine.values import Window
 
 Heights = NDArray[np.float32]
 
-SURFACE_LIMIT_PX = MEMORY_LIMIT_PX // 4
-"""Surfaces of up to this many pixels are held in memory; heights take four times the memory of grey values."""
+SURFACE_LIMIT_PX = MEMORY_LIMIT_PX // np.dtype(np.float32).itemsize
+"""Surfaces of up to this many pixels are held in memory; a height takes the memory of so many grey values."""
 HEIGHT_RANGE_M = (-1000.0, 20000.0)
 """Surface heights outside are nodata, whether tagged or not (-9999, -32768, 3e38)."""
 GROUND_PERCENT = 20.0

@@ -24,6 +24,13 @@ def tiles_under(window: Window, side_px: int, shape: tuple[int, int]) -> list[Wi
     return [Window(x, y, min(side_px, shape[1] - x), min(side_px, shape[0] - y)) for y in rows for x in columns]
 
 
+def cells_under(window: Window, shape: tuple[int, int]) -> list[Window]:
+    """The parts in which a level is prepared and sampled that a window touches: all of a small level, or tiles."""
+    if shape[0] * shape[1] <= WHOLE_LEVEL_PX:
+        return [Window(0, 0, shape[1], shape[0])]
+    return tiles_under(window, TILE_PX, shape)
+
+
 def widened(window: Window, margin_px: int, shape: tuple[int, int]) -> Window:
     """A window with a margin around it, inside a level with this shape."""
     x0, y0 = max(0, window.x0 - margin_px), max(0, window.y0 - margin_px)

@@ -7,7 +7,8 @@ from collections.abc import Hashable
 from dataclasses import replace
 from functools import partial
 
-from engine.learned import KeypointMatcher, load_matcher
+from engine.learned.loading import load_matcher
+from engine.learned.matchers import KeypointMatcher
 from engine.maps.keypoints import KeypointMap
 from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.for_reports import Explanation, explain_features

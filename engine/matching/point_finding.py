@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.learned import KeypointMatcher, PairMatcher
+from engine.learned.matchers import KeypointMatcher
+from engine.learned.pairs import PairMatcher
 from engine.maps.keypoints import KeypointMap
 from engine.maps.landmarks import as_picture
 from engine.matching.align import RIM_PX

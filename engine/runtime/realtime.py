@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from engine.errors import BackendError, OptionError
+from engine.values import check
 
 _log = logging.getLogger("scenematch")
 
@@ -50,10 +51,8 @@ class Realtime:
     lock_memory: bool = True
 
     def __post_init__(self) -> None:
-        if not 1 <= self.priority <= 98:
-            raise OptionError(f"priority: expected 1 to 98, got {self.priority}")
-        if self.nice is not None and not -20 <= self.nice <= -1:
-            raise OptionError(f"nice: expected -20 to -1, got {self.nice}")
+        check(self, "priority", "1 to 98", lambda priority: 1 <= priority <= 98)
+        check(self, "nice", "-20 to -1", lambda nice: nice is None or -20 <= nice <= -1)
         last = (os.cpu_count() or 1) - 1
         if any(not 0 <= core <= last for core in self.cores):
             raise OptionError(f"cores: expected numbers from 0 to {last}, got {_listed(self.cores)}")

@@ -4,9 +4,7 @@ Keypoints are rows (K, 6) float32 in the pixels of their octave: x, y, sigma ove
 contrast, level, octave.
 """
 
-from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +18,6 @@ from engine.sift.descriptors import ORIENT_STEP, orientation_weights, tents
 from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, TRUNCATE, Octave, octaves_of
 from engine.sift.values import Features, SiftChoice
 
-AnyArray = NDArray[Any]
 Floats = NDArray[np.float32]
 Filters = tuple[Floats, NDArray[np.int64]]
 Octaves = tuple[Octave, ...]
@@ -80,14 +77,10 @@ def find_features(pictures: Floats, allowed: NDArray[np.bool_] | None, choice: S
 
 def _of_picture(image: Floats, mask: NDArray[np.bool_] | None, choice: SiftChoice) -> tuple[Floats, ...]:
     """Positions, scales, angles in degrees and descriptors of the keypoints of one picture (H, W)."""
-    octaves = octaves_of(*image.shape, choice.upsample)
+    octaves = octaves_of(*image.shape, int(choice.upsample))
     gaussians, keypoints = detect(image, octaves, choice.contrast_threshold)
     keypoints = strongest(keypoints, octaves, mask, choice.max_keypoints, choice.spread)
-    if choice.up_rad is None:
-        angle_rad = dominant_angle(gaussians, keypoints, octaves)
-    else:
-        angle_rad = np.full(len(keypoints), choice.up_rad, np.float32)
-    descriptors = describe(gaussians, keypoints, angle_rad, octaves)
+    angle_rad, descriptors = describe(gaussians, keypoints, choice.up_rad, octaves)
     angle_deg = np.remainder(np.rad2deg(angle_rad), np.float32(360))
     return xy_px(keypoints, octaves), scale_px(keypoints), angle_deg, descriptors
 
@@ -112,11 +105,11 @@ def detect(image: Floats, octaves: Octaves, contrast_threshold: float) -> tuple[
         early, margin = np.float32(_EARLY * threshold), int(of_octave[1].max()) + TAPS
         padded = cv2.copyMakeBorder(source, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
         # Each part filters again what its neighbours' filters reach, and has at least as many rows of its own.
-        voxels = _in_parts(
+        voxels = threads.in_parallel(
             lambda part: find_extrema(padded, of_octave, buffer, layout, part, _BORDER, early),  # noqa: B023
             threads.parts(octave.height, octave.height // (2 * octave.up * margin)),
         )
-        found.append(refine_extrema(buffer, layout, voxels, limits, number))
+        found.append(refine_extrema(buffer, layout, np.concatenate(voxels), limits, number))
         start = octave.offset + SCALES * octave.per_level
         level = buffer[start : start + octave.per_level].reshape(octave.height, octave.width)
         source = level[::2, ::2]
@@ -165,49 +158,37 @@ def _rank(group: NDArray[np.int64]) -> NDArray[np.int64]:
     return rank
 
 
-def dominant_angle(gaussians: Floats, keypoints: Floats, octaves: Octaves) -> Floats:
-    """Direction of the highest peak in the histogram of gradient directions.
+def describe(
+    gaussians: Floats, keypoints: Floats, up_rad: float | None, octaves: Octaves
+) -> tuple[Floats, Floats]:
+    """Angles, and 4 x 4 cells of 8 orientations in the keypoints' frames as RootSIFT.
 
     Args:
         gaussians: (N,) levels.
         keypoints: (K, 6).
+        up_rad: every angle, from +x towards +y; None is the direction of the highest peak in the histogram of
+            gradient directions.
         octaves: of their picture.
 
     Returns:
-        (K,) radians from +x towards +y.
+        (K,) radians, and (K, 128) of unit L2 norm.
     """
-    (window, smooth), (table, sigma) = orientation_weights(), _table(octaves)
-    step = np.float32(ORIENT_STEP) * sigma
-    return _in_parts(
-        lambda part: sift_descriptors.angles(gaussians, table, keypoints[slice(*part)], step, window, smooth),
-        threads.parts(len(keypoints), len(keypoints)),
-    )
+    table = np.array([octave.layout for octave in octaves])
+    sigma = np.float32(FIRST_SIGMA_PX * octaves[0].up)  # of each octave's first level, in its pixels
+    window, smooth = orientation_weights()
 
+    def described(part: tuple[int, int]) -> tuple[Floats, Floats]:
+        own = keypoints[slice(*part)]
+        if up_rad is None:
+            step = np.float32(ORIENT_STEP) * sigma
+            angles = sift_descriptors.angles(gaussians, table, own, step, window, smooth)
+        else:
+            angles = np.full(len(own), up_rad, np.float32)
+        return angles, sift_descriptors.descriptors(gaussians, table, own, angles, sigma, tents())
 
-def describe(gaussians: Floats, keypoints: Floats, angle_rad: Floats, octaves: Octaves) -> Floats:
-    """4 x 4 cells of 8 orientations in the keypoints' frames, as RootSIFT.
-
-    Args:
-        gaussians: (N,) levels.
-        keypoints: (K, 6).
-        angle_rad: (K,) from +x towards +y.
-        octaves: of their picture.
-
-    Returns:
-        (K, 128) of unit L2 norm.
-    """
-    table, sigma = _table(octaves)
-    return _in_parts(
-        lambda part: sift_descriptors.descriptors(
-            gaussians, table, keypoints[slice(*part)], angle_rad[slice(*part)], sigma, tents()
-        ),
-        threads.parts(len(keypoints), len(keypoints)),
-    )
-
-
-def _table(octaves: Octaves) -> tuple[NDArray[np.int64], np.float32]:
-    """The octaves' layouts (octaves, 5), and the sigma of each one's first level in pixels of the octave."""
-    return np.array([octave.layout for octave in octaves]), np.float32(FIRST_SIGMA_PX * octaves[0].up)
+    parts = threads.in_parallel(described, threads.parts(len(keypoints), len(keypoints)))
+    angle_rad, descriptors = map(np.concatenate, zip(*parts, strict=True))
+    return angle_rad, descriptors
 
 
 def xy_px(keypoints: Floats, octaves: Octaves) -> Floats:
@@ -223,8 +204,3 @@ def scale_px(keypoints: Floats) -> Floats:
 def _pixel_px(keypoints: Floats, octaves: Octaves) -> Floats:
     """(K,) pixels of the picture per octave pixel."""
     return np.asarray(np.exp2(keypoints[:, _OCTAVE]) / np.float32(octaves[0].up))
-
-
-def _in_parts(work: Callable[[tuple[int, int]], AnyArray], parts: list[tuple[int, int]]) -> AnyArray:
-    done = threads.in_parallel(work, parts)
-    return done[0] if len(done) == 1 else np.concatenate(done)

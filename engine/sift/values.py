@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from engine.runtime.device import Picture
-
-Limits = tuple[float, float | None]
-"""Ratio of the scales of matched keypoints, and the factor that it may be off by; None allows all."""
-TRAIN_CHUNK = 4096  # train slots compared at a time, to bound memory for a whole map
-ROUNDING = math.sqrt(128 * np.finfo(np.float32).eps)  # most between a descriptor and itself, by rounding
+from engine.values import check
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +25,12 @@ class SiftChoice:
     upsample: int
     contrast_threshold: float
     spread: int
+
+    def __post_init__(self) -> None:
+        check(self, "max_keypoints", "at least 1", lambda count: count >= 1)
+        check(self, "upsample", "1 or 2", lambda factor: factor in (1, 2))
+        check(self, "contrast_threshold", "a number from 0 up", lambda contrast: contrast >= 0)
+        check(self, "spread", "1 or more", lambda cells: cells >= 1)
 
 
 @dataclass(frozen=True, slots=True)

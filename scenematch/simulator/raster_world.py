@@ -99,7 +99,7 @@ def _heights(
         raise MapError(f"surface: expected known heights under the map, got none in {surface}")
     filled = np.where(known, raw, np.float32(np.percentile(raw[known], 20.0))).astype(np.float32)
     columns, rows = np.arange(shape[1], dtype=np.float64), np.arange(shape[0], dtype=np.float64)
-    at = warp_between(grid, surface_grid).on_grid(columns, rows).astype(np.float32)
+    at = warp_between(grid, surface_grid)(np.stack(np.meshgrid(columns, rows), axis=-1)).astype(np.float32)
     heights: Any = cv2.remap(filled, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     lowest = float(heights.min())
     heights = np.asarray(heights - np.float32(lowest), dtype=np.float32)

@@ -139,9 +139,9 @@ def test_what_neighbours_share_widens_the_covariance(scene, camera):
 
 
 def test_samples_share_a_cell_within_an_eighth_of_the_picture(scene, camera):
-    fit = fitted(camera, scene, believed(scene[0]))
-    seen = fit.weights > 0
-    places, cells = (camera.matrix @ (fit.points / fit.points[2]))[:2, seen], fit.cells[seen]
+    _, _, points, _, _, weights, _, cells = fitted(camera, scene, believed(scene[0])).projected
+    seen = weights > 0
+    places, cells = (camera.matrix @ (points / points[2]))[:2, seen], cells[seen]
     assert len(np.unique(cells)) > 40
     for cell in np.unique(cells):
         assert np.ptp(places[:, cells == cell], axis=1).max() <= SIZE_PX / 8

@@ -6,7 +6,7 @@ import torch
 
 from engine import OrthoMap
 from engine.kernels.scores import enhance
-from engine.maps import prepared
+from engine.maps import prepared, tiles
 from engine.maps.prepared import PreparedMap, Region
 from engine.ncc_fft import prepare
 from engine.values import Window
@@ -41,7 +41,8 @@ def holes():
 def by_cells(monkeypatch):
     """Levels are prepared in cells of 128 pixels, none as a whole."""
     monkeypatch.setattr(prepared, "TILE_PX", 128)
-    monkeypatch.setattr(prepared, "WHOLE_LEVEL_PX", 0)
+    monkeypatch.setattr(tiles, "TILE_PX", 128)
+    monkeypatch.setattr(tiles, "WHOLE_LEVEL_PX", 0)
 
 
 def levels_of(search):
@@ -60,7 +61,7 @@ ROUNDED = 0.05
 def test_cells_join_without_a_seam(gray, holes, window, masked, monkeypatch, by_cells):
     site = site_of(gray, holes if masked else None)
     pieces = PreparedMap(site, CPU).cut(window, 0)
-    monkeypatch.setattr(prepared, "WHOLE_LEVEL_PX", 1 << 23)
+    monkeypatch.setattr(tiles, "WHOLE_LEVEL_PX", 1 << 23)
     whole = PreparedMap(site, CPU).cut(window, 0)
     assert pieces.window == whole.window
     tolerance = ROUNDED if masked else 2e-5  # running sums in float32 begin elsewhere

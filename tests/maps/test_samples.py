@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from engine import OrthoMap
-from engine.maps import samples
+from engine.maps import tiles
 from engine.maps.samples import BLOCK_PX, SampleMap
 from engine.maps.tiles import TILE_PX
 from engine.values import Window
@@ -24,7 +24,7 @@ def make_map(height_px, width_px):
 @pytest.fixture
 def by_cells(monkeypatch):
     """No level is small enough to be taken as a whole."""
-    monkeypatch.setattr(samples, "WHOLE_LEVEL_PX", 0)
+    monkeypatch.setattr(tiles, "WHOLE_LEVEL_PX", 0)
 
 
 @pytest.mark.parametrize("more_px", [0, 1, 2, 3, 4, 5])

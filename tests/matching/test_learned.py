@@ -15,7 +15,8 @@ from torch import nn
 from engine import Frame, MatcherOptions, NoFix, Prior, Reason, SceneMatcher, Window
 from engine.errors import OptionError
 from engine.features import sift
-from engine.learned import KeypointMatcher, Keypoints
+from engine.learned.keypoints import Keypoints
+from engine.learned.matchers import KeypointMatcher
 from engine.maps import keypoints as index
 from engine.maps.keypoints import KeypointMap
 from engine.options import LearnedOptions
@@ -33,7 +34,7 @@ def upright_sift(picture, count):
     found = sift(picture, max_keypoints=count, upright=True, spread=1)
     kept = found.valid[0]
     xy = found.xy_px[0, kept]
-    return Keypoints(xy, torch.arange(len(xy), 0, -1.0), found.descriptors[0, kept])
+    return Keypoints(xy, found.descriptors[0, kept])
 
 
 class Nearest(nn.Module):
@@ -124,7 +125,7 @@ def test_keypoints_of_a_window_are_the_level_s_own_in_the_windows_pixels(ground,
         y, x = torch.nonzero((image == highest) & (image > 0.3), as_tuple=True)
         order = image[y, x].argsort(descending=True, stable=True)
         xy = torch.stack([x, y], dim=1).float()[order]
-        return Keypoints(xy, image[y, x][order], image[y, x][order][:, None])
+        return Keypoints(xy, image[y, x][order][:, None])
 
     known = KeypointMap(site, KeypointMatcher(bright, Nearest(), 2048))
     window = Window(50, 70, 300, 260)
