@@ -57,8 +57,8 @@ class Landmarks:
     """Features of a part of the map.
 
     Attributes:
-        features: batch of one, N slots, in pixels of the level, as arrays.
-        xy_px: (N, 2) their positions.
+        features: batch of one, N slots, in pixels of the level, on the device.
+        xy_px: (N, 2) a copy of their positions in host memory.
         points_m: (N, 3) east, north and height of the surface.
     """
 
@@ -75,7 +75,7 @@ class LandmarkMap:
 
     Args:
         site: the map.
-        device: of detection, of the frame's features too.
+        device: of detection and of the returned features, the frame's too; the cache is in host memory.
         backend: of :func:`engine.features.sift`.
 
     Attributes:
@@ -102,10 +102,9 @@ class LandmarkMap:
         tiles = self.tiles.get(*self._keys(window, level, upright))
         max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
         parts = [(tile, _inside(tile, window, max_rank)) for tile in tiles]
-        found = {name: np.concatenate([part[name][i] for part, i in parts]) for name in tiles[0]}
-        xy, scale, angle, descriptors = (found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors"))
-        of_one = (each[None] for each in (xy, scale, angle, descriptors, scale > 0.0))  # of every landmark
-        return Landmarks(Features(*of_one), xy, found["points_m"])
+        return self._to_landmarks(
+            {name: np.concatenate([part[name][i] for part, i in parts]) for name in tiles[0]}
+        )
 
     def prepare(self, levels: Iterable[int] | None = None) -> None:
         """Describe whole levels, upright and not, and cache them in a file if the map comes from one.
@@ -181,6 +180,13 @@ class LandmarkMap:
         return tile | {
             "points_m": np.column_stack([self._site.enu_from_pixel(map_px), self._site.surface_at(map_px)])
         }
+
+    def _to_landmarks(self, found: NamedArrays) -> Landmarks:
+        columns = [found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors")]
+        xy, scale, angle, descriptors = (to_device(column[None], self.device) for column in columns)
+        valid = scale > 0.0  # of every landmark
+        features = Features(xy, scale, angle, as_float(descriptors, "float32"), valid)
+        return Landmarks(features, found["xy_px"], found["points_m"])
 
 
 def _count(tile: NamedArrays) -> int:

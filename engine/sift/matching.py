@@ -1,7 +1,4 @@
-"""Match descriptors by distance: Lowe's ratio test, a mutual test, and a limit on scale.
-
-On the host, whatever the device: a frame's descriptors are few, and the map's many are kept there.
-"""
+"""Match descriptors by distance: Lowe's ratio test, a mutual test, and a limit on scale."""
 
 from __future__ import annotations
 
@@ -12,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
-from engine.runtime.device import as_float, on_host, same_kind_as
-from engine.sift.values import Features, Matches
+from engine.runtime.device import Picture, as_float, device_of, on_host, same_kind_as
+from engine.sift.values import ROUNDING, TRAIN_CHUNK, Features, Limits, Matches, fields_of
 
 Floats = NDArray[np.float32]
+AnyArray = NDArray[Any]
 
-TRAIN_CHUNK = 4096  # train slots compared at a time, to bound memory for a whole map
-_ROUNDING = math.sqrt(128 * np.finfo(np.float32).eps)  # most between a descriptor and itself, by rounding
 _MAX = float(np.finfo(np.float32).max)
 
 
@@ -42,51 +38,67 @@ def match(
         max_scale_factor: Exclude pairs whose scales differ from ``scale`` by more than this factor.
 
     Returns:
-        For each of the N query slots: arrays, or tensors in host memory, as the query's are.
+        For each of the N query slots.
 
     Raises:
         OptionError: The ratio is not in (0, 1].
     """
     if not 0 < ratio <= 1:
         raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
-    first, index, second, is_mutual = _nearest(query, train, scale, max_scale_factor)
-    distance, next_distance = ((2 - 2 * cosine).clip(0) ** 0.5 for cosine in (first, second))
-    # Two equal distances have a ratio of 1, even if rounding makes one of them 0, or if both are infinite.
-    quotient = distance.clip(_ROUNDING, _MAX) / next_distance.clip(_ROUNDING, _MAX)
-    valid = (distance < math.inf) & (quotient <= ratio) & is_mutual
-    return Matches(*(same_kind_as(query.descriptors, values) for values in (index, distance, quotient, valid)))
+    limits, given = (scale, max_scale_factor), query.descriptors
+    if device_of(given).type == "cpu":
+        found: tuple[Picture, ...] = _nearest(_as_arrays(query), _as_arrays(train), limits)
+    else:
+        from engine.sift.matching_tensors import nearest  # torch takes a while to import
+
+        found = nearest(query, train, limits)
+    return Matches(*(same_kind_as(given, values) for values in tested(found, ratio)))
 
 
-def _nearest(
-    query: Features, train: Features, scale: float, max_scale_factor: float | None
-) -> tuple[NDArray[Any], ...]:
-    """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best.
+def tested(nearest: tuple[Picture, ...], ratio: float) -> tuple[Picture, ...]:
+    """The four fields of the matches.
 
-    Pairs that are not allowed have a cosine of minus infinity.
+    Args:
+        nearest: (B, N) each: cosine of the nearest, minus infinity if none was allowed; its slot; cosine of the
+            second nearest, likewise; whether the query is its slot's nearest, too.
+        ratio: see :func:`match`.
     """
+    first, index, second, is_mutual = nearest
+    distance, next_distance = ((2 - 2 * as_float(cosine, "float32")).clip(0) ** 0.5 for cosine in (first, second))
+    # Two equal distances have a ratio of 1, even if rounding makes one of them 0, or if both are infinite.
+    quotient = distance.clip(ROUNDING, _MAX) / next_distance.clip(ROUNDING, _MAX)
+    return index, distance, quotient, (distance < math.inf) & (quotient <= ratio) & is_mutual
+
+
+def _as_arrays(features: Features) -> Features:
+    *numbers, valid = fields_of(features)
+    xy_px, scale_px, angle_deg, descriptors = (on_host(as_float(each, "float32")) for each in numbers)
+    return Features(xy_px, scale_px, angle_deg, descriptors, on_host(valid))
+
+
+def _nearest(query: Features, train: Features, limits: Limits) -> tuple[AnyArray, ...]:
+    """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best."""
     from engine.kernels import nearest  # numba takes a while to import
 
-    (own, own_log), (other, other_log) = (
-        _described(features, factor, max_scale_factor is not None)
-        for features, factor in ((query, scale), (train, 1.0))
-    )
-    count, slots = max(len(own), len(other)), own.shape[1]
+    scale, max_scale_factor = limits
+    count, slots = max(len(query.valid), len(train.valid)), query.valid.shape[1]
     first, second = np.full((2, count, slots), -np.inf, np.float32)
     index, is_mutual = np.zeros((count, slots), np.int64), np.zeros((count, slots), np.bool_)
     most_log = np.float32(math.inf if max_scale_factor is None else math.log(max_scale_factor))
+    own = _log_scales(query, scale, max_scale_factor is not None)
+    other = _log_scales(train, 1.0, max_scale_factor is not None)
     for n in range(count):
-        q, t = min(n, len(own) - 1), min(n, len(other) - 1)
+        q, t = min(n, len(query.valid) - 1), min(n, len(train.valid) - 1)
         out = (first[n], index[n], second[n], is_mutual[n])
-        for start in range(0, other.shape[1], TRAIN_CHUNK):
+        for start in range(0, train.valid.shape[1], TRAIN_CHUNK):
             end = start + TRAIN_CHUNK
-            cosine = other[t, start:end] @ own[q].T
-            nearest.two_nearest(cosine, own_log[q], other_log[t, start:end], most_log, start, *out)
+            cosine = train.descriptors[t, start:end] @ query.descriptors[q].T
+            nearest.two_nearest(cosine, own[q], other[t, start:end], most_log, start, *out)
     return first, index, second, is_mutual
 
 
-def _described(features: Features, scale: float, is_limited: bool) -> tuple[Floats, Floats]:
-    """Descriptors (B, N, 128), and logarithm of scale (B, N) if limited, else 0; NaN without keypoint."""
-    valid = on_host(features.valid)
-    sizes = on_host(as_float(features.scale_px, "float32")) if is_limited else np.ones(valid.shape, np.float32)
-    log = np.log(np.where(valid, np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
-    return on_host(as_float(features.descriptors, "float32")), log.astype(np.float32, copy=False)
+def _log_scales(features: Features, scale: float, is_limited: bool) -> Floats:
+    """(B, N) logarithm of scale if that is limited, else 0; NaN without a keypoint."""
+    sizes = features.scale_px if is_limited else np.ones(features.valid.shape, np.float32)
+    log = np.log(np.where(features.valid, np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
+    return log.astype(np.float32, copy=False)

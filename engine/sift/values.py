@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+import numpy as np
 
 from engine.runtime.device import Picture
 from engine.values import check
+
+Limits = tuple[float, float | None]
+"""Ratio of the scales of matched keypoints, and the factor that it may be off by; None allows all."""
+TRAIN_CHUNK = 4096  # train slots compared at a time, to bound memory for a whole map
+ROUNDING = math.sqrt(128 * np.finfo(np.float32).eps)  # most between a descriptor and itself, by rounding
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from engine.errors import OptionError
-from engine.features import Features, match
-from engine.sift import matching
+from engine.features import Features, Matches, match
+from engine.sift import matching, matching_tensors
 from engine.sift.values import fields_of
 from tests.support.matches import pairs_of
 from tests.support.tensors import assert_close
@@ -51,15 +51,26 @@ def plainly(query, train, ratio, scale, factor):
     return pairs
 
 
+def by_tensor_ops(query, train, *, ratio=0.8, scale=1.0, max_scale_factor=None):
+    """As on a device."""
+    found = matching_tensors.nearest(query, train, (scale, max_scale_factor))
+    return Matches(*matching.tested(found, ratio))
+
+
+WAYS = pytest.mark.parametrize("way", [match, by_tensor_ops], ids=["loops", "tensor ops"])
+
+
+@WAYS
 @pytest.mark.parametrize("chunk", [7, 64, 4096])
 @pytest.mark.parametrize(("ratio", "factor"), [(1.0, None), (0.9, None), (0.9, 1.5), (0.9, 2.0)])
-def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, chunk, ratio, factor):
+def test_matches_are_those_of_every_pair_looked_at_by_itself(monkeypatch, way, chunk, ratio, factor):
     """Of one frame with two parts of the map."""
-    monkeypatch.setattr(matching, "TRAIN_CHUNK", chunk)
+    for module in (matching, matching_tensors):
+        monkeypatch.setattr(module, "TRAIN_CHUNK", chunk)
     query = described(60, 1)
     trains = [described(333, seed, like=query) for seed in (2, 3)]
     train = Features(*(torch.cat(values) for values in zip(*map(fields_of, trains), strict=True)))
-    found = match(query, train, ratio=ratio, scale=1.2, max_scale_factor=factor)
+    found = way(query, train, ratio=ratio, scale=1.2, max_scale_factor=factor)
     for element, part in enumerate(trains):
         expected = plainly(query, part, ratio, 1.2, factor or 1e9)
         assert len(expected) > 3
@@ -93,10 +104,11 @@ def test_nothing_matches_a_map_without_valid_features_and_one_feature_needs_no_s
     assert pairs_of(match(query, replace(train, valid=torch.arange(90)[None] == 10))) == [[10, 10]]
 
 
-def test_distances_are_those_of_the_pairs():
+@WAYS
+def test_distances_are_those_of_the_pairs(way):
     query = all_valid(described(70, 1))
     train = all_valid(described(90, 2, like=query))
-    found = match(query, train)
+    found = way(query, train)
     full = torch.cdist(query.descriptors, train.descriptors)
     assert_close(found.distance, full.amin(2), atol=1e-4, rtol=1e-4)
     two = full.topk(2, largest=False).values
