@@ -43,6 +43,11 @@ def agree_in_place(first: Fix, second: Fix) -> bool:
     return are_consistent(offset_between_m(first, second), covariance_m2)
 
 
+def are_near(first: Fix, second: Fix, exclusion_m: float) -> bool:
+    """Whether two fixes lie within the distance at which a rival is the peak itself."""
+    return float(np.hypot(*offset_between_m(first, second))) < exclusion_m
+
+
 def agree_in_height(first: Fix, second: Fix) -> bool:
     """Whether two poses are equally high; the telemetry may hold refinement at a wrong height.
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
-from engine.matching.agreement import agree_in_height, agree_in_place, offset_between_m
+from engine.matching.agreement import agree_in_height, agree_in_place, are_near
 from engine.matching.candidates import Candidate, nats
 from engine.matching.evidence import is_beyond_doubt
 from engine.matching.for_reports import Explanation
@@ -68,7 +66,7 @@ class Auto(Method):
     def locate(self, query: Query) -> Answer:
         """NCC's fix if the picture settles it, else what both propose.
 
-        SIFT runs last, so that it never takes time from NCC.
+        SIFT runs after NCC's looks at the telemetry's own pose, so that it never takes time from them.
         """
         if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
             return self.sift.locate(query)
@@ -89,12 +87,11 @@ class Auto(Method):
         Both compare the same picture and map with the same prior, so their evidence is not added.
         """
         both = [each for each in (first, second) if is_accepted(each, query)]
-        offset_m = offset_between_m(first.fix, second.fix)
-        is_near = float(np.hypot(*offset_m)) < self.ncc.options.exclusion_m
-        is_one_place = is_near or agree_in_place(first.fix, second.fix)
-        if len(both) < 2 or not is_one_place:
+        is_near = are_near(first.fix, second.fix, self.ncc.options.exclusion_m)
+        is_one = is_near or agree_in_place(first.fix, second.fix)
+        if len(both) < 2 or not is_one:
             best = max(both or [first, second], key=nats)
-            return best if is_one_place else best.against([first, second])
+            return best if is_one else best.against([first, second])
         if not _agree(first.fix, second.fix):
             # A telemetry error shifts the patch that NCC searches for, and the pose less so.
             return replace(second, fix=reaching(second.fix, first.fix))

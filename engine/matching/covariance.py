@@ -15,6 +15,11 @@ from engine.values import GridPose, Peak
 
 Array = NDArray[np.float64]
 
+_MAX_TURNED = math.radians(60.0)
+_ASIDE = math.tan(math.radians(2.0))  # of an axis that counts as vertical
+# Neighbouring pixels share their noise: a square with this side counts as one.
+_CORRELATION_PX = 5.0
+
 
 def tilt_covariance(cam_from_map: Array, sigma_rad: float) -> Array:
     """Covariance of an unknown tilt.
@@ -49,12 +54,6 @@ def scale_doubt_m(off_m: float, height_m: float, camera_down: Array, told_down: 
     aside = float(np.hypot(*camera_down[:2])) / max(-float(camera_down[2]), 1e-3) + _ASIDE
     turned = 0.0 if told_down is None else math.acos(min(1.0, float(told_down @ camera_down)))
     return math.hypot(off_m * aside, height_m * math.tan(min(turned, _MAX_TURNED)))
-
-
-_MAX_TURNED = math.radians(60.0)
-_ASIDE = math.tan(math.radians(2.0))  # of an axis that counts as vertical
-# Neighbouring pixels share their noise: a square with this side counts as one.
-_CORRELATION_PX = 5.0
 
 
 def score_sigma(pixels: int) -> float:

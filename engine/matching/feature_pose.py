@@ -196,23 +196,23 @@ class FeatureMatcher:
             ray_deg = math.degrees(math.acos(min(max(down, -1.0), 1.0)))
             detail = f"the pose looks {ray_deg:.0f} degrees off the vertical at a height of {up:.0f} m"
             return query.refuse(Reason.BAD_POSE, detail, self.method, score=share, window=window)
-        covariance = stats.covariance_center_m2 + _map_covariance_m2(site, up, options.errors)
-        turns_rad2 = stats.covariance[3:, 3:] + tilt_covariance(stats.rotation, _slope_rad(site, options.errors))
+        covariance, turns_rad2 = stats.covariance_center_m2, stats.covariance[3:, 3:]
         if not query.telemetry.has_tilt:  # features of a coarse picture share errors that look like a tilt
             wider = max(1.0, PAPER_SCALE / options.scale) ** 2
             covariance, turns_rad2 = covariance * wider, turns_rad2 * wider
         doubt_m = query.scale_doubt_m(nadir, up, stats.rotation[2], query.errors(options.errors))
         above_m = up - float(site.surface_at(nadir))
+        tilt_rad = math.hypot(_slope_rad(site, options.errors), doubt_m / above_m)
         return query.fix(
             self.method,
             nadir,
-            covariance + np.diag([doubt_m**2, doubt_m**2, 0.0]),
+            covariance + _map_covariance_m2(above_m * tilt_rad, options.errors),
             score=share,
             window=window,
             east_north_m=stats.center_m[:2],
             up_m=up,
             grid_attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ query.camera.mount.T)),
-            turn_covariance_rad2=turns_rad2 + tilt_covariance(stats.rotation, doubt_m / above_m),
+            turn_covariance_rad2=turns_rad2 + tilt_covariance(stats.rotation, tilt_rad),
             map_sigma_m=options.errors.map_m,
         )
 
@@ -239,9 +239,9 @@ class FeatureMatcher:
         return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
 
 
-def _map_covariance_m2(site: OrthoMap, height_m: float, errors: AssumedErrors) -> Array:
-    """(3, 3) of the map: its georeferencing accuracy, and a ground slope that PnP mistakes for a tilt."""
-    horizontal = errors.map_m**2 + (height_m * _slope_rad(site, errors)) ** 2
+def _map_covariance_m2(aside_m: float, errors: AssumedErrors) -> Array:
+    """(3, 3) of the map's georeferencing, and of a position so far aside because a slope was taken for a tilt."""
+    horizontal = errors.map_m**2 + aside_m**2
     return np.diag([horizontal, horizontal, errors.map_m**2])
 
 

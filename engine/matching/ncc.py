@@ -7,13 +7,12 @@ from collections.abc import Hashable
 from dataclasses import replace
 from typing import TypeGuard
 
-import numpy as np
-
+from engine.kernels.dense import EnhancedFrame
 from engine.maps.prepared import PreparedMap
 from engine.maps.samples import SampleMap
 from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.matching import hypothesis_search, refusals
-from engine.matching.agreement import agree_in_place, offset_between_m
+from engine.matching.agreement import are_near
 from engine.matching.candidates import PeakCandidate, nats
 from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
 from engine.matching.evidence import Evidence
@@ -27,7 +26,7 @@ from engine.matching.structure import match_structure
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.values import Fix, NoFix, Prior, Reason, Window
+from engine.values import NoFix, Prior, Reason, Window
 
 MAX_WINDOW_PX = WHOLE_LEVEL_PX
 """A window of a large map with more pixels than this is searched coarse to fine, as a whole map is."""
@@ -86,7 +85,7 @@ class Ncc(Method):
     def _known(self, query: Query, nats: float) -> Answer:
         """The frame's peak, with this evidence instead of its own."""
         found = self.find(query)
-        return found if isinstance(found, NoFix) else found.weighed(Evidence(nats, 0.0, math.e, 1.0, None))
+        return found if isinstance(found, NoFix) else found.weighed(Evidence(nats, 0.0, math.e, math.e, None))
 
     def locate(self, query: Query) -> Answer:
         """The place by the frame's own heading and height, else by others that they may be mistaken for."""
@@ -219,6 +218,7 @@ class _Rungs:
     def __init__(self, ncc: Ncc, query: Query) -> None:
         self._ncc, self._query = ncc, query
         self._works, self._frame_px = ncc.works(query), float(query.gray.size)
+        self._pictures: dict[int, EnhancedFrame] = {}
         self.coarsest = Rung(self._if_coarse_suffices, self._search_coarsely)
         self.at_once = Rung(self._if_coarse, self._refine_at_once)
         self.null = Rung(self._if_untested, self._test_null)
@@ -290,12 +290,15 @@ class _Rungs:
         return {step: work for step, work in finer if self._is_coarse(answer) and affordable({step: work})}
 
     def _correlate(self, answer: Answer | None, step: Hashable) -> Answer:
-        """The peak of one level, which sees more than a coarser one; of one place the greater evidence counts."""
+        """The peak of one level, which sees more than a coarser one; of one place the greater evidence counts.
+
+        Both peaks share the telemetry's errors, and so lie near each other if they are of one place.
+        """
         found = self._find(step)
         if not isinstance(found, PeakCandidate):
             return found
         found = self._resting(found)
-        if self._is_coarse(answer) and self._is_same(answer.fix, found.fix):
+        if self._is_coarse(answer) and are_near(answer.fix, found.fix, self._ncc.options.exclusion_m):
             best = max(answer, found, key=nats)
             found = replace(best, fix=replace(found.fix, confidence=best.fix.confidence))
         return found
@@ -366,10 +369,7 @@ class _Rungs:
 
     def refinement_of(self, found: PeakCandidate) -> Refinement:
         """Of the frame, with the heading and height of a candidate that a search fitted."""
-        query = self._query.at(found.aligned.pose) if found.is_fitted else self._query
-        return Refinement(query, self._ncc.samples, self._ncc.options)
-
-    def _is_same(self, coarse: Fix, fine: Fix) -> bool:
-        """Whether two peaks are of one place, so that neither is the other's rival."""
-        distance_m = float(np.hypot(*offset_between_m(coarse, fine)))
-        return distance_m < self._ncc.options.exclusion_m and agree_in_place(coarse, fine)
+        samples, options = self._ncc.samples, self._ncc.options
+        if found.is_fitted:
+            return Refinement(self._query.at(found.aligned.pose), samples, options)
+        return Refinement(self._query, samples, options, pictures=self._pictures)

@@ -120,13 +120,15 @@ class Refinement:
         if best is not None:
             return best
         if has_tilt and not is_oblique(query, query.telemetry.known_attitude):
-            found = found.weighed(replace(found.evidence, refined=-math.inf))  # of few right places
+            # Of few right places, but of many that a camera far off the vertical sees.
+            found = found.weighed(replace(found.evidence, refined=-math.inf))
         if not found.promises(query.risk):
             return found
         if has_tilt:
             return self._resting_on_prior(found)
         if not query.site.has_surface:
             return found
+        # Over a known surface nearly every pose can be refined: this tilt is beyond those that were tried.
         detail = "roll and pitch are unknown, and the picture does not determine them"
         return found.fix.refused(Reason.BAD_POSE, detail)
 
@@ -222,7 +224,7 @@ class Refinement:
     def _doubting(self) -> Refinement:
         """The same for a frame whose attitude is hardly known."""
         frame, sigma_deg = self.query.frame, self.options.errors.unknown_tilt_deg
-        heading_sigma_deg = max(frame.heading_sigma_deg or 0.0, sigma_deg)
+        heading_sigma_deg = max(self.query.errors(self.options.errors).heading_deg, sigma_deg)
         frame = replace(frame, tilt_sigma_deg=sigma_deg, heading_sigma_deg=heading_sigma_deg)
         return replace(self, query=replace(self.query, frame=frame), doubts_tilt=True)
 
@@ -237,13 +239,12 @@ class Refinement:
         if pose_covariance is None:
             return None
         if self._is_on_unknown_slope:
-            height_m, slope_deg = fit.pose.center_m[2] - query.site.ground_m, errors.unknown_slope_deg
+            height_m, slope_deg = self._above_m(fit.pose), errors.unknown_slope_deg
             over = over_unknown_slope(fit.pose, pose_covariance, prior.pose.center_m[:2], height_m, slope_deg)
             if over is None:
                 return None
             fit, pose_covariance = replace(fit, pose=over.pose), over.covariance
-        covariance = pose_covariance[:3, :3].copy()
-        height_m = fit.pose.center_m[2] - query.site.ground_m
+        covariance, height_m = pose_covariance[:3, :3].copy(), self._above_m(fit.pose)
         covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
         slope_rad, slope = 0.0, fit.pose.slope
         if self._is_on_unknown_slope:  # it may be a tilt of the camera, which looks the same
@@ -265,6 +266,11 @@ class Refinement:
             return None
         refined = self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3), turns_rad2)
         return Refined(refined, at, picture, ground) if agree_in_height(fix, refined) else None
+
+    def _above_m(self, pose: Pose) -> float:
+        """Height above the ground below a pose."""
+        site = self.query.site
+        return float(pose.center_m[2]) - float(site.ground_at(site.pixel_from_enu(pose.center_m[:2])))
 
     @property
     def _knows_tilt(self) -> bool:
@@ -387,9 +393,9 @@ def with_tilt_doubt(query: Query, fix: Fix) -> Fix:
 
 def reaching(fix: Fix, other: Fix) -> Fix:
     """The fix with a covariance that covers another as well: which of the two is right is unknown."""
-    offset_m, covariance_m2 = offset_between_m(fix, other), fix.covariance_m2.copy()
-    covariance_m2[:2, :2] += offset_m[:, None] * offset_m
-    return replace(fix, covariance_m2=covariance_m2)
+    up_m = 0.0 if fix.up_m is None or other.up_m is None else fix.up_m - other.up_m
+    offset_m = np.append(offset_between_m(fix, other), up_m)
+    return replace(fix, covariance_m2=fix.covariance_m2 + offset_m[:, None] * offset_m)
 
 
 def _less_certain(fix: Fix, sigma_m: float) -> Fix:

@@ -35,11 +35,12 @@ def _of_peak(candidate: PeakCandidate, risk: float) -> Refusal:
     if not candidate.is_inside:
         return Reason.AMBIGUOUS, f"NCC {score:.3f} still rises at the window's edge"
     sigmas, rival = (math.sqrt(2.0 * surprise) for surprise in (evidence.surprise, evidence.chance))
-    if replace(evidence, rival=0.0, null=0.0, elsewhere=0.0, prior_chi_square=None).nats < needed_nats(risk):
+    alone = replace(evidence, rival=0.0, null=0.0, elsewhere=0.0, prior_chi_square=None, refined=None)
+    if alone.nats < needed_nats(risk):
         needed = math.sqrt(2.0 * (math.log(evidence.tried) + needed_nats(risk)))
         among = f"{needed:.1f} are needed among {evidence.tried:,.0f} places"
         return Reason.LOW_SCORE, f"best NCC {score:.3f}, {sigmas:.1f} sigmas may be chance: {among}"
-    which = "mirrored frame" if evidence.null > evidence.rival else "rival"
+    which = "turned or mirrored frame" if evidence.null > evidence.rival else "rival"
     pose = "" if evidence.refined is None else f", its pose at {max(evidence.of_pose, 0.0):.1f} nats"
     figures = f"NCC {sigmas:.1f} sigmas, {which} at {rival:.1f}, {_from_prior(candidate)}{pose}"
     if not evidence.promises(risk):

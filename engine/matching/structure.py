@@ -89,7 +89,7 @@ def _on_level(correlator: Correlator, found: PeakCandidate, window: Window, coar
 def _coarser(correlator: Correlator, found: PeakCandidate, coarser: int) -> Aligned | None:
     """The candidate's hypothesis over the relief, so many levels above its own; None if it shows too little.
 
-    A peak that was refused by its own level is no better guess of the place than the prior.
+    Its own level takes the relief at the prior's place, coarser ones that at the peak's: each may be off.
     """
     own, site = found.aligned, correlator.query.site
     if coarser == 0 and (own.is_over_relief or not site.has_surface):

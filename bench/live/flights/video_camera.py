@@ -107,6 +107,8 @@ def film(view: View, link: Any, out: BinaryIO, rate_hz: float, delay_s: float, g
 
     A picture that this machine did not draw by then is left out: its age would be unknown.
     """
+    while link.recv_match(type=_STATES) is not None:  # states of the time in which nobody read
+        pass
     due_s = 0.0
     while True:
         message = link.recv_match(type=["HEARTBEAT", *_STATES], blocking=True)
