@@ -79,7 +79,11 @@ class Correlator:
     options: NccOptions
 
     def align(
-        self, pose: GridPose, level: int, nadir_px: Array | None = None, *, over_relief: bool = False
+        self,
+        pose: GridPose,
+        level: int,
+        nadir_px: Array | None = None,
+        over_relief_px: tuple[int, int] | None = None,
     ) -> Aligned | NoFix:
         """Equations 2 and 3: the frame in the pixels of one map level.
 
@@ -87,13 +91,14 @@ class Correlator:
             pose: the height and heading to align it by.
             level: of the pyramid.
             nadir_px: (2,) where to look up the ground's relief; None takes the prior's place, or level ground.
-            over_relief: whether to draw the frame over the relief, as every oblique one is, and not on a plane.
+            over_relief_px: rows and columns of the middle of the frame to draw over the relief; None draws it on
+                a plane, and all of an oblique frame over the relief.
         """
         query = self.query
         attitude, height = pose.known_attitude, pose.known_height_m
         jacobian = query.jacobian * 2.0**level
-        if over_relief or is_oblique(query, attitude):
-            return self._align_over_relief(pose, level, nadir_px)
+        if over_relief_px or is_oblique(query, attitude):
+            return self._align_over_relief(pose, level, nadir_px, over_relief_px)
         view = view_of(query.camera, attitude, height, jacobian)
         if view is None:
             return refusals.tilted(query, attitude, METHOD)
@@ -113,20 +118,21 @@ class Correlator:
         """
         own = aligned.patch.gray
         mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
-        again = replace(self, query=mirrored).align(
-            aligned.pose, aligned.level, aligned.nadir_px, over_relief=aligned.is_over_relief
-        )
+        size = (own.shape[0], own.shape[1]) if aligned.is_over_relief else None
+        again = replace(self, query=mirrored).align(aligned.pose, aligned.level, aligned.nadir_px, size)
         turned, patch = np.ascontiguousarray(own[::-1, ::-1]), np.ascontiguousarray(own[:, ::-1])
         if isinstance(again, Aligned) and again.patch.gray.shape == own.shape:
             patch = again.patch.gray
         return [turned, patch]
 
-    def _align_over_relief(self, pose: GridPose, level: int, nadir_px: Array | None) -> Aligned | NoFix:
+    def _align_over_relief(
+        self, pose: GridPose, level: int, nadir_px: Array | None, most_px: tuple[int, int] | None
+    ) -> Aligned | NoFix:
         """The frame drawn over the ground's relief; its view is that of the correlated part."""
         query = self.query
         attitude, height = pose.known_attitude, pose.known_height_m
         place = query.prior_px if nadir_px is None else nadir_px
-        patch = relief_patch(query, attitude, height, level, place)
+        patch = relief_patch(query, attitude, height, level, place, most_px)
         if patch is None:
             return refusals.tilted(query, attitude, METHOD)
         size = np.array(patch.gray.shape[::-1], np.float64)

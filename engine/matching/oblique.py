@@ -29,7 +29,12 @@ def is_oblique(query: Query, attitude: Attitude) -> bool:
 
 
 def relief_patch(
-    query: Query, attitude: Attitude, height_m: float, level: int, nadir_px: Array | None
+    query: Query,
+    attitude: Attitude,
+    height_m: float,
+    level: int,
+    nadir_px: Array | None,
+    most_px: tuple[int, int] | None = None,
 ) -> Patch | None:
     """The largest upright part of a frame over the relief that shows ground of the map, in pixels of a level.
 
@@ -39,6 +44,7 @@ def relief_patch(
         height_m: above the ground below the camera.
         level: of the pyramid.
         nadir_px: (2,) full-resolution pixel about which the ground is looked up; None takes it for level.
+        most_px: rows and columns of its middle that are kept; None keeps all.
 
     Returns:
         Patch | None: None if no 8 x 8 pixels are seen.
@@ -52,6 +58,9 @@ def relief_patch(
     if nadir_px is not None:
         valid &= _on_map(site, valid.shape, photo.offset_px + site.level_from_full(nadir_px, level), level)
     box = largest_rectangle(valid)
+    if most_px is not None:
+        height, width = min(most_px[0], box.height_px), min(most_px[1], box.width_px)
+        box = Window(box.x0 + (box.width_px - width) // 2, box.y0 + (box.height_px - height) // 2, width, height)
     if min(box.width_px, box.height_px) < MIN_SIDE_PX:
         return None
     part = photo.gray[box.y0 : box.y0 + box.height_px, box.x0 : box.x0 + box.width_px]

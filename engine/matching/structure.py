@@ -98,7 +98,8 @@ def _coarser(correlator: Correlator, found: PeakCandidate, coarser: int) -> Alig
     if coarser and (level >= site.levels or min(own.template.shape) >> coarser < MIN_SIDE_PX):
         return None
     place = correlator.nadir_px(found.peak, own) if coarser or correlator.query.prior is None else None
-    aligned = correlator.align(own.pose, level, place, over_relief=site.has_surface)
+    rows, columns = (n >> coarser for n in own.template.shape)
+    aligned = correlator.align(own.pose, level, place, (rows, columns) if site.has_surface else None)
     return aligned if isinstance(aligned, Aligned) else None
 
 

@@ -221,9 +221,10 @@ def test_drawn_over_the_relief_a_frame_matches_steep_ground_better_than_on_a_pla
     true = replace(frame, **ATTITUDE, height_agl_m=HEIGHT_M)
     query = matcher._query(true, ground.prior(NADIR), Deadline(Budget()))
     correlator = matcher._method._correlator(query)
-    scores = {}
+    scores, size = {}, None
     for over_relief in (False, True):
-        aligned = correlator.align(query.telemetry, 0, over_relief=over_relief)
+        aligned = correlator.align(query.telemetry, 0, None, size)
+        size = aligned.template.shape
         peak = correlator.search(aligned, correlator.window(aligned))
         scores[over_relief] = peak.score
         assert np.hypot(*(correlator.nadir_px(peak, aligned) - NADIR)) < (2.0 if over_relief else 10.0)
