@@ -28,7 +28,7 @@ from engine.matching.agreement import agree_in_height, are_consistent, offset_be
 from engine.matching.align import shrink
 from engine.matching.candidates import PeakCandidate
 from engine.matching.covariance import tilt_covariance
-from engine.matching.evidence import RELIABILITY, surprise_of
+from engine.matching.evidence import RELIABILITY, independent_places, surprise_of
 from engine.matching.oblique import is_oblique
 from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
@@ -39,6 +39,7 @@ from engine.values import SIGNIFICANCE, Attitude, Fix, NoFix, Reason, Window
 Array = NDArray[np.float64]
 
 _CAPTURE_PX = 20.0  # tilts are tried on the level on which one off by one sigma moves the ground by no more
+_CLIMBED = independent_places((2.0 * _CAPTURE_PX) ** 2)  # places about a pose, the best of which refinement finds
 _TILTS, _STARTS = np.arange(-3.0, 3.5, 1.5), 3  # sigmas of an unknown tilt, about both axes; the best are refined
 CONFIRMING_CORRELATION = 0.45
 """Correlation of a pose at which nothing else is tried: no coarser level, and no doubt of a known tilt.
@@ -163,8 +164,9 @@ class Refinement:
         """
         if refined is None:
             return None
-        tilts, off = 1 if self._knows_tilt else len(_TILTS) ** 2, self.query.prior_chi_square(refined.fix)
-        surprise = self.surprise_of(refined) - math.log(tilts) + log_prior
+        tried = _CLIMBED if self._knows_tilt else _CLIMBED * len(_TILTS) ** 2
+        off = self.query.prior_chi_square(refined.fix)
+        surprise = self.surprise_of(refined) - math.log(tried) + log_prior
         evidence = replace(found.evidence, refined=surprise, prior_chi_square=off)
         moved = replace(found, fix=refined.fix)
         if evidence.of_pose >= self.query.needed_nats:

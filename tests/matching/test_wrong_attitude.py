@@ -164,7 +164,8 @@ def test_a_pose_must_outdo_chance_at_its_place_and_not_among_all_places_of_the_w
     """The peak has settled the place: a blurred map shows a weak pose there, whose tilt counts all the same."""
     monkeypatch.setattr(Ncc, "find", weakened(14.0))
     monkeypatch.setattr(Refinement, "refine_pose", lambda _, fix: refined(fix, 0.3))
-    monkeypatch.setattr(Refinement, "surprise_of", lambda *_: pose_nats + math.log(25.0))  # tilts that were tried
+    tried = 25.0 * 100.0  # tilts, and places that a refinement reaches
+    monkeypatch.setattr(Refinement, "surprise_of", lambda *_: pose_nats + math.log(tried))
     frame = replace(ground.frame(camera, NADIR, 150.0, **TRUE), roll_deg=None, pitch_deg=None)
     fix = SceneMatcher(ground.map_of(), camera, "ncc", "cpu").locate(frame, ground.prior(NADIR))
     assert fix.stage == stage
