@@ -94,22 +94,12 @@ class Correlator:
             over_relief_px: rows and columns of the middle of the frame to draw over the relief; None draws it on
                 a plane, and all of an oblique frame over the relief.
         """
-        query = self.query
-        attitude, height = pose.known_attitude, pose.known_height_m
-        jacobian = query.jacobian * 2.0**level
-        if over_relief_px or is_oblique(query, attitude):
-            return self._align_over_relief(pose, level, nadir_px, over_relief_px)
-        view = view_of(query.camera, attitude, height, jacobian)
-        if view is None:
-            return refusals.tilted(query, attitude, METHOD)
-        rows, columns = query.site.level_shape(level)
-        if (MIN_SHRINK * FRACTION) ** 2 * view.area_px > rows * columns:
-            return query.refuse(Reason.OUTSIDE_MAP, "the frame covers more ground than the map", METHOD)
-        patch = rectify(query.gray, query.camera, view)
-        if patch is None:
-            detail = "the frame covers fewer than 8 x 8 pixels of the map"
-            return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
-        return Aligned(pose, level, jacobian, view, patch, enhance(patch.gray))
+        drawn = self._drawn(pose, level, nadir_px, over_relief_px)
+        if isinstance(drawn, NoFix):
+            return drawn
+        view, patch, place, is_over_relief = drawn
+        jacobian = self.query.jacobian * 2.0**level
+        return Aligned(pose, level, jacobian, view, patch, enhance(patch.gray), place, is_over_relief)
 
     def nowhere(self, aligned: Aligned) -> list[NDArray[np.uint8]]:
         """Patches for the null hypothesis, as large as the frame's: upside down, and mirrored.
@@ -119,27 +109,38 @@ class Correlator:
         own = aligned.patch.gray
         mirrored = replace(self.query, gray=np.ascontiguousarray(self.query.gray[:, ::-1]))
         size = (own.shape[0], own.shape[1]) if aligned.is_over_relief else None
-        again = replace(self, query=mirrored).align(aligned.pose, aligned.level, aligned.nadir_px, size)
+        drawn = replace(self, query=mirrored)._drawn(aligned.pose, aligned.level, aligned.nadir_px, size)
         turned, patch = np.ascontiguousarray(own[::-1, ::-1]), np.ascontiguousarray(own[:, ::-1])
-        if isinstance(again, Aligned) and again.patch.gray.shape == own.shape:
-            patch = again.patch.gray
+        if not isinstance(drawn, NoFix) and drawn[1].gray.shape == own.shape:
+            patch = drawn[1].gray
         return [turned, patch]
 
-    def _align_over_relief(
-        self, pose: GridPose, level: int, nadir_px: Array | None, most_px: tuple[int, int] | None
-    ) -> Aligned | NoFix:
-        """The frame drawn over the ground's relief; its view is that of the correlated part."""
+    def _drawn(
+        self, pose: GridPose, level: int, nadir_px: Array | None, over_relief_px: tuple[int, int] | None
+    ) -> tuple[GroundView, Patch, Array | None, bool] | NoFix:
+        """The frame on a plane or over the relief: how it is seen, the patch, where the relief is, and whether."""
         query = self.query
         attitude, height = pose.known_attitude, pose.known_height_m
-        place = query.prior_px if nadir_px is None else nadir_px
-        patch = relief_patch(query, attitude, height, level, place, most_px)
-        if patch is None:
+        if over_relief_px or is_oblique(query, attitude):
+            place = query.prior_px if nadir_px is None else nadir_px
+            patch = relief_patch(query, attitude, height, level, place, over_relief_px)
+            if patch is None:
+                return refusals.tilted(query, attitude, METHOD)
+            size = np.array(patch.gray.shape[::-1], np.float64)
+            extent = (float(size[0]), float(size[1]))
+            view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))
+            return view, patch, place, True
+        seen = view_of(query.camera, attitude, height, query.jacobian * 2.0**level)
+        if seen is None:
             return refusals.tilted(query, attitude, METHOD)
-        size = np.array(patch.gray.shape[::-1], np.float64)
-        extent = (float(size[0]), float(size[1]))
-        view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))
-        enhanced = enhance(patch.gray)
-        return Aligned(pose, level, query.jacobian * 2.0**level, view, patch, enhanced, place, is_over_relief=True)
+        rows, columns = query.site.level_shape(level)
+        if (MIN_SHRINK * FRACTION) ** 2 * seen.area_px > rows * columns:
+            return query.refuse(Reason.OUTSIDE_MAP, "the frame covers more ground than the map", METHOD)
+        patch = rectify(query.gray, query.camera, seen)
+        if patch is None:
+            detail = "the frame covers fewer than 8 x 8 pixels of the map"
+            return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
+        return seen, patch, None, False
 
     def window(self, aligned: Aligned) -> Window | None:
         """The adaptive window in full-resolution map pixels; the whole map without a prior."""

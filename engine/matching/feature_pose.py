@@ -200,7 +200,8 @@ class FeatureMatcher:
         if not query.telemetry.has_tilt:  # features of a coarse picture share errors that look like a tilt
             wider = max(1.0, PAPER_SCALE / options.scale) ** 2
             covariance, turns_rad2 = covariance * wider, turns_rad2 * wider
-        doubt_m = query.scale_doubt_m(nadir, up, stats.rotation[2], query.errors(options.errors))
+        measured_m = query.above_ground_m(nadir, up)
+        doubt_m = query.scale_doubt_m(measured_m, stats.rotation[2], query.errors(options.errors))
         above_m = up - float(site.surface_at(nadir))
         tilt_rad = math.hypot(_slope_rad(site, options.errors), doubt_m / above_m)
         return query.fix(
@@ -227,8 +228,8 @@ class FeatureMatcher:
             assert fix.up_m is not None
             # Above ground both count: an error of the map moves the ground with the camera.
             variance = errors.height_sigma_m(height_m) ** 2 + float(fix.covariance_m2[2, 2]) - errors.map_m**2
-            ground_m = query.site.ground_at(query.site.pixel_from_enu([fix.east_m, fix.north_m]))
-            height_chi_square = (fix.up_m - ground_m - height_m) ** 2 / variance
+            above_m = query.above_ground_m(np.array(fix.map_xy_px), fix.up_m)
+            height_chi_square = (above_m - height_m) ** 2 / variance
         if vote is not None:
             surprise, rival, tried = vote.surprise, vote.rival_surprise, float(vote.tried)
         else:

@@ -82,10 +82,10 @@ class Ncc(Method):
         else:
             rehearse(query, _Rungs(self, query).search, self._known(query, 0.0))
 
-    def _known(self, query: Query, nats: float) -> Answer:
+    def _known(self, query: Query, surprise: float) -> Answer:
         """The frame's peak, with this evidence instead of its own."""
         found = self.find(query)
-        return found if isinstance(found, NoFix) else found.weighed(Evidence(nats, 0.0, math.e, math.e, None))
+        return found if isinstance(found, NoFix) else found.weighed(Evidence(surprise, 0.0, math.e, math.e, None))
 
     def locate(self, query: Query) -> Answer:
         """The place by the frame's own heading and height, else by others that they may be mistaken for."""

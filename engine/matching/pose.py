@@ -299,10 +299,8 @@ def _other_pose(problem: Problem, fit: Fit, options: PoseOptions) -> Fit | None:
     other = gauss_newton(problem, R, center)
     if other is None or _same(other.rotation, fit.rotation):
         return None
-    close = _cost(problem, other.rotation, other.view, fit.variance_px2, options) < cost + chi_square_of(
-        SIGNIFICANCE, 1
-    )
-    return other if close else None
+    other_cost = _cost(problem, other.rotation, other.view, fit.variance_px2, options)
+    return other if other_cost < cost + chi_square_of(SIGNIFICANCE, 1) else None
 
 
 def _mirrored(points: Array, fit: Fit) -> tuple[Array, Array]:

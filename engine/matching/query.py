@@ -141,12 +141,20 @@ class Query:
         enu_from_camera = enu_from_body(known.roll_deg or 0.0, known.pitch_deg or 0.0, grid_heading_deg) @ mount
         return AttitudePrior(enu_from_camera.T, (*errors.tilts_deg(known), sigma_deg), axes=mount)
 
-    def scale_doubt_m(self, nadir_px: Array, up_m: float, camera_down: Array, errors: AssumedErrors) -> float:
-        """Position error to allow for if the measured height is not the telemetry's (:func:`.scale_doubt_m`).
+    def above_ground_m(self, nadir_px: Array, up_m: float) -> float:
+        """Height of a camera above the bare ground below it.
 
         Args:
             nadir_px: (2,) of the camera.
             up_m: of the camera.
+        """
+        return up_m - float(self.site.ground_at(nadir_px))
+
+    def scale_doubt_m(self, measured_m: float, camera_down: Array, errors: AssumedErrors) -> float:
+        """Position error to allow for if the measured height is not the telemetry's (:func:`.scale_doubt_m`).
+
+        Args:
+            measured_m: of the camera, above the ground.
             camera_down: (3,) optical axis in east, north, up.
             errors: of the telemetry.
 
@@ -156,7 +164,6 @@ class Query:
         told_m = self.told_height_m or self.telemetry.height_agl_m
         if told_m is None:
             return 0.0
-        measured_m = up_m - float(self.site.ground_at(nadir_px))
         off_m = abs(measured_m - told_m)
         if off_m <= _AGREE_SIGMAS * errors.height_sigma_m(told_m):
             return 0.0

@@ -241,12 +241,13 @@ class Refinement:
         if pose_covariance is None:
             return None
         if self._is_on_unknown_slope:
-            height_m, slope_deg = self._above_m(fit.pose), errors.unknown_slope_deg
+            height_m, slope_deg = fit.pose.center_m[2] - query.site.ground_m, errors.unknown_slope_deg
             over = over_unknown_slope(fit.pose, pose_covariance, prior.pose.center_m[:2], height_m, slope_deg)
             if over is None:
                 return None
             fit, pose_covariance = replace(fit, pose=over.pose), over.covariance
-        covariance, height_m = pose_covariance[:3, :3].copy(), self._above_m(fit.pose)
+        nadir_px, covariance = query.site.pixel_from_enu(fit.pose.center_m[:2]), pose_covariance[:3, :3].copy()
+        height_m = query.above_ground_m(nadir_px, float(fit.pose.center_m[2]))
         covariance[2, 2] += (_HEIGHT_SHARE * height_m) ** 2
         slope_rad, slope = 0.0, fit.pose.slope
         if self._is_on_unknown_slope:  # it may be a tilt of the camera, which looks the same
@@ -255,8 +256,7 @@ class Refinement:
         elif not query.site.has_surface:  # and a tilt may be a slope of the ground
             slope_rad = math.radians(errors.unknown_slope_deg)
             covariance[:2, :2] += (height_m * slope_rad) ** 2 * np.eye(2)
-        nadir_px = query.site.pixel_from_enu(fit.pose.center_m[:2])
-        doubt_m = query.scale_doubt_m(nadir_px, float(fit.pose.center_m[2]), fit.pose.rotation[2], errors)
+        doubt_m = query.scale_doubt_m(height_m, fit.pose.rotation[2], errors)
         covariance[:2, :2] += doubt_m**2 * np.eye(2)
         tilt_rad = math.hypot(doubt_m / height_m, slope_rad)
         turns_rad2 = pose_covariance[3:6, 3:6] + tilt_covariance(fit.pose.rotation, tilt_rad)
@@ -268,11 +268,6 @@ class Refinement:
             return None
         refined = self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3), turns_rad2)
         return Refined(refined, at, picture, ground) if agree_in_height(fix, refined) else None
-
-    def _above_m(self, pose: Pose) -> float:
-        """Height above the ground below a pose."""
-        site = self.query.site
-        return float(pose.center_m[2]) - float(site.ground_at(site.pixel_from_enu(pose.center_m[:2])))
 
     @property
     def _knows_tilt(self) -> bool:
