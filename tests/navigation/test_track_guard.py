@@ -164,6 +164,37 @@ def test_an_outage_with_a_wrong_velocity_is_recovered_from(off_mps, sigma_m):
     assert all(flight.fly(5.0, seen))  # it is right again
 
 
+@pytest.mark.parametrize("drift_mps2", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("shifted_s", [1.0, 20.0, 60.0])
+def test_a_map_that_shifts_back_is_trusted_at_once_whatever_the_estimator_states(flight, shifted_s, drift_mps2):
+    """The vehicle moved as the matches did, however far the estimator drifted without a fix."""
+    for second in range(round(shifted_s)):
+        assert not any(flight.fly(1.0, noisy(0.3, 40.0), off_mps=drift_mps2 * second))
+    assert sum(flight.fly(5.0, noisy(0.3), off_mps=drift_mps2 * shifted_s)) >= 48
+
+
+@pytest.mark.parametrize(("cover_s", "drift_mps2"), [(10.0, 0.2), (20.0, 0.1), (60.0, 0.1)])
+def test_an_estimator_without_fixes_drifts_and_is_right_again_before_it_is_proven_wrong(
+    flight, cover_s, drift_mps2
+):
+    for second in range(round(cover_s)):
+        flight.fly(1.0, covered, off_mps=drift_mps2 * second)
+    assert all(flight.fly(5.0, noisy(0.3)))
+
+
+@pytest.mark.parametrize("off_mps", [0.5, 2.0])
+def test_a_map_that_shifts_in_an_outage_is_not_explained_by_a_velocity_that_becomes_wrong_later(flight, off_mps):
+    flight.fly(10.0, covered, off_mps=0.5)
+    assert not any(flight.fly(30.0, noisy(0.3, 40.0), off_mps=0.5))
+    assert not any(flight.fly(60.0, noisy(0.3, 40.0), off_mps=off_mps))
+
+
+def test_a_vehicle_without_a_velocity_goes_on_by_inertia(flight):
+    """40 m aside in two seconds would be an acceleration of 20 m/s2."""
+    flight.fly(2.0, covered, velocity=False)
+    assert not any(flight.fly(30.0, noisy(0.3, 40.0), velocity=False))
+
+
 @pytest.mark.parametrize(("cover_s", "sigma_m"), [(0.0, 1.0), (5.0, 0.05), (10.0, 0.05), (10.0, 1.0)])
 def test_a_map_that_shifts_is_not_explained_by_a_velocity_that_is_right(flight, cover_s, sigma_m):
     flight.fly(cover_s, covered, off_mps=0.5)
