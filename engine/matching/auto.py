@@ -7,9 +7,8 @@ from dataclasses import replace
 
 from engine.matching.agreement import agree_in_height, agree_in_place, are_near
 from engine.matching.candidates import Candidate, nats
-from engine.matching.evidence import is_beyond_doubt
 from engine.matching.for_reports import Explanation
-from engine.matching.ladder import Answer, is_accepted, is_late
+from engine.matching.ladder import Answer, climb, is_accepted, is_late
 from engine.matching.method import Method
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
@@ -22,7 +21,7 @@ from engine.values import Fix, Window
 
 
 class Auto(Method):
-    """NCC if height and heading are known, and SIFT if that leaves doubt and time; their places are weighed.
+    """NCC if height and heading are known, and SIFT if that leaves doubt and time: one ladder, one posterior.
 
     Args:
         site: the map.
@@ -64,27 +63,28 @@ class Auto(Method):
             self.ncc.warmup_search(query)
 
     def locate(self, query: Query) -> Answer:
-        """NCC's fix if the picture settles it, else what both propose.
+        """What both propose, each rung in the light of the other method's answer.
 
-        SIFT runs after NCC's looks at the telemetry's own pose, so that it never takes time from them.
+        SIFT's follow NCC's looks at the telemetry's own pose, so that they never take time from them.
         """
-        if query.telemetry.height_agl_m is None or query.telemetry.grid_heading_deg is None:
-            return self.sift.locate(query)
-        first = self.ncc.by_telemetry(query)
-        if is_accepted(first, query) and _is_settled(first, query):
-            return first
-        with query.scheduler.with_fix(is_accepted(first, query)):
-            second = self.sift.locate(query)
-        if not (is_accepted(first, query) or is_accepted(second, query)):
-            first = self.ncc.search(query, first)
-        if isinstance(first, Candidate) and isinstance(second, Candidate):
-            return self._posterior(query, first, second)
-        return first if isinstance(first, Candidate) or is_late(second) else second
+        pose = query.telemetry
+        has_both = pose.height_agl_m is not None and pose.grid_heading_deg is not None
+        looks, searches = self.ncc.rungs(query) if has_both else ([], [])
+        answers = list(climb(query, [*looks, *self.sift.rungs(query), *searches]).values())
+        found = [each for each in answers if isinstance(each, Candidate)]
+        if len(found) == 2:
+            return self._posterior(query, *found)
+        return next((each for each in [*found, *reversed(answers)] if not is_late(each)), answers[0])
 
     def _posterior(self, query: Query, first: Candidate, second: Candidate) -> Candidate:
         """Of one place the more accurate candidate, of two the more evident one, with the other against it.
 
         Both compare the same picture and map with the same prior, so their evidence is not added.
+
+        Args:
+            query: the frame.
+            first: NCC's.
+            second: SIFT's.
         """
         both = [each for each in (first, second) if is_accepted(each, query)]
         is_near = are_near(first.fix, second.fix, self.ncc.options.exclusion_m)
@@ -101,11 +101,6 @@ class Auto(Method):
     def explain(self, query: Query, window: Window) -> Explanation:
         """As NCC does."""
         return self.ncc.explain(query, window)
-
-
-def _is_settled(first: Candidate, query: Query) -> bool:
-    """Whether the picture confirmed the whole pose, and its place is beyond doubt."""
-    return first.fix.stage == "refined" and is_beyond_doubt(first.evidence.nats, query.risk)
 
 
 def _agree(first: Fix, second: Fix) -> bool:

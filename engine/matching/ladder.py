@@ -1,6 +1,6 @@
 """The ladder: the one loop that makes one effort on a frame after another, cheap ones first, while time allows.
 
-Efforts give candidates. The last one's evidence decides whether its fix is handed out.
+Efforts give candidates, of one method or of two. The last one's evidence decides whether its fix is handed out.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TypeAlias, TypeGuard
 
 from engine.matching import refusals
 from engine.matching.candidates import Candidate
+from engine.matching.evidence import is_beyond_doubt
 from engine.matching.query import Query
 from engine.runtime.scheduler import OutOfTime, Scheduler
 from engine.values import NoFix, Reason, Result
@@ -24,44 +25,62 @@ Answer: TypeAlias = Candidate | NoFix
 """What is known of a frame's place, accepted or not, or why nothing is."""
 
 
+def is_accepted(answer: Answer | None, query: Query) -> TypeGuard[Candidate]:
+    """Whether the answer is a candidate whose fix may be handed out."""
+    return isinstance(answer, Candidate) and answer.suffices(query.risk)
+
+
+def is_settled(answer: Answer, query: Query) -> bool:
+    """Whether the picture confirmed the whole pose, and its place is beyond doubt."""
+    is_refined = isinstance(answer, Candidate) and answer.fix.stage == "refined"
+    return is_refined and is_accepted(answer, query) and is_beyond_doubt(answer.evidence.nats, query.risk)
+
+
 @dataclass(frozen=True, slots=True)
 class Rung:
     """One way to look at a frame, or to improve the answer so far.
 
     Attributes:
-        offers: the variants of its step, the best first, that may change the answer so far (None if there is none
-            yet); empty if it cannot.
-        run: gets the answer so far and a variant, and gives the new answer; None leaves the old one.
+        method: whose answer it gives or improves.
+        offers: the variants of its step, the best first, that may change the method's answer so far (None if there
+            is none yet); empty if it cannot.
+        run: gets the method's answer so far and a variant, and gives the new answer; None leaves the old one.
+        is_needless: whether another method's answer leaves nothing to look for.
     """
 
+    method: str
     offers: Callable[[Answer | None], Works]
     run: Callable[[Answer | None, Hashable], Answer | None]
+    is_needless: Callable[[Answer, Query], bool] = is_settled
 
 
-def climb(query: Query, method: str, rungs: Sequence[Rung], answer: Answer | None = None) -> Answer:
-    """The answer after every rung that can change it and that time allows.
+def climb(query: Query, rungs: Sequence[Rung]) -> dict[str, Answer]:
+    """Each method's answer after every rung that can change it and that time allows.
 
     With a fix, work ends before a deadline that would make it late; a refusal for lack of time replaces no fix.
-    Any other answer of a later rung replaces an earlier one.
+    Any other answer of a later rung replaces an earlier one of its method.
 
     Args:
         query: the frame.
-        method: named in the refusal of a frame for which there was no time.
-        rungs: in their order, cheap ones first.
-        answer: to go on from; None begins.
+        rungs: in their order, cheap ones first; the last one's method is named if there was no time for any.
     """
+    answers: dict[str, Answer] = {}
     for rung in rungs:
+        own, others = answers.get(rung.method), [each for name, each in answers.items() if name != rung.method]
         if not query.scheduler.deadline.met:
             break  # no step is refused for its cost
-        works, has_fix = rung.offers(answer), is_accepted(answer, query)
+        if any(rung.is_needless(each, query) for each in others):
+            continue
+        has_fix = any(is_accepted(each, query) for each in answers.values())
         with query.scheduler.with_fix(has_fix), suppress(OutOfTime):
+            works = rung.offers(own)
             step = _affordable(query.scheduler, works)
             if step is not None:
                 with query.scheduler.costed(step, works[step]):
-                    looked = rung.run(answer, step)
-                if looked is not None and not (has_fix and is_late(looked)):
-                    answer = looked
-    return answer or refusals.late(query, method)
+                    looked = rung.run(own, step)
+                if looked is not None and not (is_accepted(own, query) and is_late(looked)):
+                    answers[rung.method] = looked
+    return answers or {rungs[-1].method: refusals.late(query, rungs[-1].method)}
 
 
 def settled(query: Query, answer: Candidate | Result) -> Result:
@@ -71,11 +90,6 @@ def settled(query: Query, answer: Candidate | Result) -> Result:
     if answer.suffices(query.risk):
         return answer.fix
     return answer.fix.refused(*refusals.of_candidate(answer, query.risk))
-
-
-def is_accepted(answer: Answer | None, query: Query) -> TypeGuard[Candidate]:
-    """Whether the answer is a candidate whose fix may be handed out."""
-    return isinstance(answer, Candidate) and answer.suffices(query.risk)
 
 
 def rehearse(query: Query, rung: Rung, answer: Answer | None) -> list[Answer | None]:

@@ -91,20 +91,13 @@ class Ncc(Method):
         """The place by the frame's own heading and height, else by others that they may be mistaken for."""
         if query.telemetry.height_agl_m is None:
             return self._refuse_without_height(query)
+        looks, searches = self.rungs(query)
+        return climb(query, [*looks, *searches])[METHOD]
+
+    def rungs(self, query: Query) -> tuple[list[Rung], list[Rung]]:
+        """The rungs at a frame's own heading and height, and those at others, if all else is refused."""
         rungs = _Rungs(self, query)
-        return climb(query, METHOD, [*rungs.by_telemetry, *rungs.searches])
-
-    def by_telemetry(self, query: Query) -> Answer:
-        """The place of a coarse peak if the picture confirms its pose, else of the finest level in time.
-
-        Args:
-            query: the frame, with its height.
-        """
-        return climb(query, METHOD, _Rungs(self, query).by_telemetry)
-
-    def search(self, query: Query, answer: Answer) -> Answer:
-        """The answer of :meth:`by_telemetry`; if refused, that of a search of headings and heights."""
-        return climb(query, METHOD, _Rungs(self, query).searches, answer)
+        return rungs.by_telemetry, rungs.searches
 
     def works(self, query: Query) -> Works:
         """Correlation on each level, the frame's own first; or the search of the whole map."""
@@ -219,13 +212,13 @@ class _Rungs:
         self._ncc, self._query = ncc, query
         self._works, self._frame_px = ncc.works(query), float(query.gray.size)
         self._pictures: dict[int, EnhancedFrame] = {}
-        self.coarsest = Rung(self._if_coarse_suffices, self._search_coarsely)
-        self.at_once = Rung(self._if_coarse, self._refine_at_once)
-        self.null = Rung(self._if_untested, self._test_null)
-        self.levels = Rung(self._finer, self._correlate)
-        self.refinement = Rung(self._if_unrefined, self._refine)
-        self.structure = Rung(self._if_unseen, self._match_structure)
-        self.search = Rung(self._if_refused, self._search)
+        self.coarsest = Rung(METHOD, self._if_coarse_suffices, self._search_coarsely)
+        self.at_once = Rung(METHOD, self._if_coarse, self._refine_at_once)
+        self.null = Rung(METHOD, self._if_untested, self._test_null)
+        self.levels = Rung(METHOD, self._finer, self._correlate)
+        self.refinement = Rung(METHOD, self._if_unrefined, self._refine)
+        self.structure = Rung(METHOD, self._if_unseen, self._match_structure)
+        self.search = Rung(METHOD, self._if_refused, self._search, is_accepted)
 
     @property
     def by_telemetry(self) -> list[Rung]:
@@ -239,7 +232,7 @@ class _Rungs:
     @property
     def searches(self) -> list[Rung]:
         """Those at other headings and heights, if the looks are refused."""
-        return [self.search, self.refinement]
+        return [self.search, replace(self.refinement, is_needless=is_accepted)]
 
     def _if_coarse_suffices(self, answer: Answer | None) -> Works:
         """The coarsest level, if refinement may start from its peak and there is time for both.

@@ -96,10 +96,12 @@ class Sift(Method):
 
         Few features take a fifth of the time, and refinement restores the accuracy that their pose lacks.
         """
-        answer = climb(query, METHOD, _Rungs(self, query).in_order)
-        if isinstance(answer, PoseCandidate) and answer.is_quick:  # it follows the telemetry's attitude
-            answer = replace(answer, fix=with_tilt_doubt(query, answer.fix)).coarse()
-        return answer
+        return climb(query, self.rungs(query))[METHOD]
+
+    def rungs(self, query: Query) -> list[Rung]:
+        """Its rungs, cheap ones first."""
+        rungs = _Rungs(self, query)
+        return [rungs.few, rungs.refinement, rungs.all, rungs.refinement]
 
     def few_options(self, query: Query) -> SiftOptions | None:
         """Of few features, at their scale; None if they are not wanted or the map has no such level."""
@@ -110,9 +112,11 @@ class Sift(Method):
         return None if scale is None else replace(self._few, scale=scale)
 
     def find_few(self, query: Query, options: SiftOptions) -> PoseCandidate | NoFix:
-        """The pose by half as many keypoints, a level coarser and not upsampled."""
+        """The pose by half as many keypoints, a level coarser and not upsampled; it follows the told attitude."""
         found = FeatureMatcher(query, self.landmarks, options).find_at_once()
-        return found if isinstance(found, NoFix) else replace(found, is_quick=True)
+        if isinstance(found, NoFix):
+            return found
+        return replace(found, fix=with_tilt_doubt(query, found.fix), is_quick=True).coarse()
 
     def can_refine(self, query: Query) -> bool:
         """Whether poses are refined: only with trusted telemetry over a surface model."""
@@ -172,14 +176,9 @@ class _Rungs:
         self._sift, self._query = sift, query
         self._few_options = sift.few_options(query)
         self._works = sift.works(query)
-        self.few = Rung(self._if_few_suffice, self._by_few)
-        self.all = Rung(self._if_few_do_not_suffice, self._by_all)
-        self.refinement = Rung(self._if_refinable, self._refine)
-
-    @property
-    def in_order(self) -> list[Rung]:
-        """Cheap ones first."""
-        return [self.few, self.refinement, self.all, self.refinement]
+        self.few = Rung(METHOD, self._if_few_suffice, self._by_few)
+        self.all = Rung(METHOD, self._if_few_do_not_suffice, self._by_all)
+        self.refinement = Rung(METHOD, self._if_refinable, self._refine)
 
     def _if_few_suffice(self, answer: Answer | None) -> Works:
         """Few features, if time allows all of them as well, or only few."""

@@ -8,6 +8,7 @@ import pytest
 
 from engine import SceneMatcher
 from engine.matching.evidence import Evidence, probability
+from engine.matching.ladder import Rung, climb
 from engine.matching.ncc import Ncc
 from engine.matching.sift import Sift
 from engine.values import Fix, NoFix, Reason
@@ -18,19 +19,20 @@ def told(site, camera, frame, prior, monkeypatch):
     """The answer of auto if NCC's fix is this far off, by the evidence for each; and SIFT's fix."""
 
     def answer(off_m, ncc_nats, sift_nats):
-        by_ncc, by_sift, seen = Ncc.by_telemetry, Sift.locate, []
+        rungs_of_ncc, rungs_of_sift, seen = Ncc.rungs, Sift.rungs, []
 
-        def off(self, query, *args, **kwargs):
-            found = by_ncc(self, query, *args, **kwargs)
+        def off(self, query):
+            found = climb(query, rungs_of_ncc(self, query)[0])["ncc"]
             moved = {"east_m": found.fix.east_m + off_m, "covariance_m2": 0.01 * np.eye(3), "map_sigma_m": 0.0}
-            return weighed(replace(found, fix=replace(found.fix, stage="fine", **moved)), ncc_nats)
+            found = weighed(replace(found, fix=replace(found.fix, stage="fine", **moved)), ncc_nats)
+            return [Rung("ncc", lambda _: {"told": 1.0}, lambda *_: found)], []
 
-        def noted(self, query, *args):
-            seen.append(weighed(by_sift(self, query, *args), sift_nats))
-            return seen[-1]
+        def noted(self, query):
+            seen.append(weighed(climb(query, rungs_of_sift(self, query))["sift"], sift_nats))
+            return [Rung("sift", lambda _: {"told": 1.0}, lambda *_: seen[0])]
 
-        monkeypatch.setattr(Ncc, "by_telemetry", off)
-        monkeypatch.setattr(Sift, "locate", noted)
+        monkeypatch.setattr(Ncc, "rungs", off)
+        monkeypatch.setattr(Sift, "rungs", noted)
         return SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior), seen[0].fix
 
     return answer
@@ -66,7 +68,8 @@ def test_two_places_that_are_about_as_evident_refuse(told, sift_nats):
 
 
 def test_a_refined_fix_beyond_doubt_is_not_matched_a_second_time(site, camera, frame, prior, monkeypatch):
-    monkeypatch.setattr(Sift, "locate", lambda *_: pytest.fail("SIFT was asked"))
+    monkeypatch.setattr(Sift, "find_few", lambda *_: pytest.fail("SIFT was asked"))
+    monkeypatch.setattr(Sift, "find", lambda *_: pytest.fail("SIFT was asked"))
     fix = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)
     assert (fix.method, fix.stage) == ("ncc", "refined")
     assert 1.0 - fix.confidence < 1e-11

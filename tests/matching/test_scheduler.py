@@ -204,7 +204,7 @@ def test_a_short_way_that_was_too_dear_once_is_tried_again(
 
 def test_beside_a_fix_a_step_leaves_room_for_a_preemption(make, frame, prior, monkeypatch):
     """Which would lose the fix; without one the step is tried all the same."""
-    monkeypatch.setattr("engine.matching.auto._is_settled", lambda *_: False)
+    monkeypatch.setattr("engine.matching.ladder.is_beyond_doubt", lambda *_: False)
     matcher = make("auto")
     assert matcher.locate(frame, prior, HURRY).stage == "verified"
     matcher._costs.longest_wait_ms = 0.9 * HURRY.total_ms
