@@ -14,7 +14,9 @@ import os
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -202,14 +204,16 @@ def report(log: Path, pilot: LoggedPilot, begin_s: float, duration_s: float, fau
         lines.append(f"\n{off:.1f} m off, {row[0] - begin_s:.1f} s after the receiver's end")
     if not faults:
         return "\n".join(lines)
-    titles = ("fault", "EKF to truth meanwhile, worst", "first fix after its end", "off by")
-    lines += ["", f"| {' | '.join(titles)} |", "|---|---|---|---|"]
+    titles = ("fault", "EKF to truth meanwhile, worst", "first fix after its end, off by")
+    lines += ["", f"| {' | '.join(titles)} |", "|---|---|---|"]
+    worst_m, firsts = defaultdict[str, float](float), defaultdict[str, list[str]](list)
     for fault, until in zip(faults, [*[f.begin_s for f in faults[1:]], duration_s], strict=True):
         during = (ekf[:, 0] >= begin_s + fault.begin_s) & (ekf[:, 0] < begin_s + until)
         after = np.flatnonzero((fixes[:, 0] > begin_s + fault.end_s) & (fixes[:, 0] < begin_s + until))
         first_s = fixes[after, 0] - begin_s - fault.end_s
-        row = f"{first_s[0]:.2f} s | {fixes_m[after[0]]:.2f} m" if len(after) else "none |"
-        lines.append(f"| {fault.name} | {ekf_m[during].max():.2f} m | {row} |")
+        worst_m[fault.name] = max(worst_m[fault.name], float(ekf_m[during].max()))
+        firsts[fault.name].append(f"{first_s[0]:.2f} s, {fixes_m[after[0]]:.2f} m" if len(after) else "none")
+    lines += [f"| {name} | {far_m:.2f} m | {'; '.join(firsts[name])} |" for name, far_m in worst_m.items()]
     return "\n".join(lines)
 
 
@@ -220,16 +224,18 @@ def parser_of(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--method", choices=("auto", "ncc"), default="auto")
     parser.add_argument("--wind-mps", type=float, default=5.0)
     parser.add_argument("--seconds", type=float, default=300.0, help="without GNSS")
-    parser.add_argument("--faults", action="store_true")
+    parser.add_argument("--faults", type=int, nargs="?", const=1, default=0, help="how often each")
     return parser
 
 
 def planned(arguments: argparse.Namespace) -> tuple[Path, tuple[Fault, ...], float]:
     """The flight's folder, drawn if there is none, its faults, and its seconds without GNSS."""
-    folder, faults = arguments.flight.absolute(), FAULTS if arguments.faults else ()
+    folder, round_s = arguments.flight.absolute(), FAULTS[-1].end_s + _AFTER_S
+    rounds = range(arguments.faults)
+    faults = tuple(replace(fault, begin_s=fault.begin_s + k * round_s) for k in rounds for fault in FAULTS)
     if not folder.exists():
         write_flight(folder, plan_flight(1, frames=round(FLIGHT_S * RATE_HZ), rate_hz=RATE_HZ))
-    return folder, faults, faults[-1].end_s + _AFTER_S if faults else arguments.seconds
+    return folder, faults, len(rounds) * round_s if faults else arguments.seconds
 
 
 def main() -> None:

@@ -8,10 +8,12 @@ stamps. A fault's row has the time from its end to the bridge's "fixes begin" on
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -124,10 +126,11 @@ def report(pilot: Px4Pilot, begin_s: float, ended: list[tuple[Fault, float]]) ->
     off = off_m(truth, ekf[(ekf[:, 0] > begin_s) & (ekf[:, 0] < truth[-1, 0])])
     lines = [f"EKF to truth, RMS and worst: {np.sqrt((off**2).mean()):.2f}, {off.max():.2f} m of {len(off)}", ""]
     lines += ["| fault | fixes begin after its end |", "|---|---|"] * bool(ended)
-    for fault, end_s in ended:
-        after = [begun - end_s for begun in pilot.begun_s if begun > end_s]
-        lines.append(f"| {fault.name} | {after[0]:.2f} s |" if after else f"| {fault.name} | none |")
-    return "\n".join(lines)
+    firsts = defaultdict[str, list[str]](list)
+    for (fault, end_s), until_s in zip(ended, [*(at_s for _, at_s in ended[1:]), math.inf], strict=True):
+        after = [begun - end_s for begun in pilot.begun_s if end_s < begun < until_s]
+        firsts[fault.name].append(f"{after[0]:.2f} s" if after else "none")
+    return "\n".join([*lines, *(f"| {name} | {'; '.join(those)} |" for name, those in firsts.items())])
 
 
 def main() -> None:
