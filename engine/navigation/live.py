@@ -117,6 +117,7 @@ class Live:
         self._options, self._clock_ns = options or LiveOptions(), clock_ns or time.monotonic_ns
         self._machine_ns = machine_ns or time.monotonic_ns
         self._last: tuple[Fix, int, Navigator] | None = None  # its capture, and whose it is
+        self._anew: Prior | None = None  # where a new navigator was asked to start
         self._changed = threading.Condition()
         self._delivering = threading.Lock()
         self._waiting: _Job | None = None
@@ -155,6 +156,16 @@ class Live:
             self._waiting = job
             self._changed.notify_all()
 
+    def restart(self, start: Prior) -> None:
+        """Match the next frame by a new navigator: this one follows a wrong track.
+
+        Args:
+            start: where it starts.
+        """
+        with self._changed:
+            self._anew = start
+            self._changed.notify_all()
+
     def close(self) -> None:
         """Take no more frames; the one in work is still answered, one that waits is dropped.
 
@@ -181,10 +192,16 @@ class Live:
 
     def _work(self, navigator: Navigator | None, number: int) -> None:
         """The worker: takes the newest frame, matches it, and delivers the result if it is not too late."""
+        start: Prior | None = None
         while True:
-            navigator = navigator or self._create_navigator()
+            navigator, start = navigator or self._create_navigator(start), None
             with self._changed:
-                self._changed.wait_for(lambda: self._waiting is not None or self._closed or self._number != number)
+                self._changed.wait_for(
+                    lambda: self._waiting or self._anew or self._closed or self._number != number
+                )
+                if self._anew is not None:
+                    navigator, start, self._anew = None, self._anew, None
+                    continue
                 if self._waiting is None or self._number != number or navigator is None:
                     return
                 job, self._working, self._waiting = self._waiting, self._waiting, None
@@ -203,11 +220,11 @@ class Live:
                 with self._changed:
                     self._counts["workers_replaced"] += 1
 
-    def _create_navigator(self) -> Navigator | None:
-        """A navigator that starts at the last fix; one that fails is tried again after a pause, until closing."""
+    def _create_navigator(self, start: Prior | None) -> Navigator | None:
+        """A navigator that starts there, else at the last fix; one that fails is tried again until closing."""
         while not self._closed:
             try:
-                return self._make_navigator(self._resume())
+                return self._make_navigator(start or self._resume())
             except Exception:
                 _log.exception("make_navigator failed; tried again after %g ms", self._options.patience_ms)
             with self._changed:

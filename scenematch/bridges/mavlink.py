@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from engine.navigation.live import Answer, Live, LiveOptions
-from engine.navigation.motion import position_of
+from engine.navigation.motion import place_of, position_of
 from engine.navigation.navigator import Navigator
 from engine.navigation.track_guard import TrackGuard
 from engine.orthomap import OrthoMap
 from engine.runtime.realtime import start_thread
-from engine.values import Fix, Prior
+from engine.values import Fix, NoFix, Prior
 from scenematch.bridges import mavlink_out
 from scenematch.bridges.fix_velocity import VelocityFromFixes
 from scenematch.bridges.links import Connection, Link, PeerAddress, parse_connection
@@ -193,7 +193,11 @@ class MavlinkBridge:
         if site is not None and gnss is not None and abs(stamp_ns - gnss.time_ns) < _GNSS_STALE_NS:
             prior = Prior(lat_deg=gnss.lat_deg, lon_deg=gnss.lon_deg, sigma_m=gnss.sigma_m)
             self._guard.anchor(position_of(prior, site))
-        trusted = self._guard.trusts(answer.result)
+        was_disputed, result = self._guard.is_disputed, answer.result
+        trusted = self._guard.trusts(result)
+        if was_disputed and not self._guard.is_disputed and isinstance(result, NoFix) and result.match:
+            # What was sent is confirmed by matches that the navigator refused: it follows the shifted map.
+            self._live.restart(place_of(result.match).prior())
         if self._guard.is_disputed:
             self._tell(self._notices.doubted(self._guard.distance_m, now_s))
         return trusted

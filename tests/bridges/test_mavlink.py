@@ -808,11 +808,13 @@ def bridge_to():
     opened = []
 
     def make(options=None, **more):
-        port, navigator = free_port(), Matched()
+        port, navigator, starts = free_port(), Matched(), []
         link = parse_connection(f"udpin:127.0.0.1:{port}")
-        bridge = MavlinkBridge(link, lambda _: navigator, options or MavlinkOptions(), **more)
+        bridge = MavlinkBridge(
+            link, lambda start: starts.append(start) or navigator, options or MavlinkOptions(), **more
+        )
         opened.append(bridge)
-        return SimpleNamespace(bridge=bridge, navigator=navigator, port=port)
+        return SimpleNamespace(bridge=bridge, navigator=navigator, port=port, starts=starts)
 
     yield make
     for bridge in opened:
@@ -1013,6 +1015,20 @@ def test_fixes_that_contradict_the_track_are_sent_on_an_operators_word_only(loop
     pilot.socket.send(word.pack(station))
     fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 5)
     assert [m.result for m, _ in pilot.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED]
+
+
+def test_a_navigator_that_followed_a_shifted_map_starts_anew_where_its_refused_matches_continue_the_track(loop):
+    made, pilot = loop()
+    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) >= 5)
+    made.navigator.result = fix(east_m=40.0)
+    fly(made.bridge, lambda: made.bridge.status.withheld.get("contradicts the track", 0) > 10)
+    made.navigator.result = NoFix(reason=Reason.INCONSISTENT, match=fix(east_m=1.0))
+    fly(made.bridge, lambda: len(made.starts) > 1)
+    assert made.starts[0] is None
+    assert made.starts[1].east_m == 1.0
+    made.navigator.result, before = fix(east_m=1.0), len(pilot.of("VISION_POSITION_ESTIMATE"))
+    fly(made.bridge, lambda: len(pilot.of("VISION_POSITION_ESTIMATE")) > before + 5)
+    assert len(made.starts) == 2
 
 
 def test_a_bridge_of_another_id_sends_by_it_is_commanded_by_it_and_hears_197(loop):

@@ -12,7 +12,7 @@ import pytest
 from engine.errors import StateError, TelemetryError
 from engine.navigation.live import Live, LiveOptions
 from engine.options import NavigatorOptions
-from engine.values import Fix, Frame, NoFix, Reason
+from engine.values import Fix, Frame, NoFix, Prior, Reason
 from tests.support.fixes import a_fix
 from tests.support.waiting import wait_until
 
@@ -187,6 +187,16 @@ def test_a_worker_that_hangs_is_replaced_and_starts_from_the_last_fix():
     assert first is None
     assert (second.east_m, second.sigma_m) == (0.0, pytest.approx(1.0 + 16.0 * 1.5))
     assert [a.frame.timestamp_ns for a in answers] == [0, 1, 2, 3]
+
+
+def test_a_navigator_that_is_on_a_wrong_track_is_started_where_it_should_be():
+    navigators = Navigators()
+    with running(navigators) as (live, answers):
+        send(live, answers, 0)
+        live.restart(Prior(east_m=7.0, north_m=8.0, sigma_m=2.0))
+        assert send(live, answers, 1, 2) == ["fix"] * 3
+    assert navigators.starts == [None, Prior(east_m=7.0, north_m=8.0, sigma_m=2.0)]
+    assert live.counts.workers_replaced == 0
 
 
 def test_a_worker_that_dies_is_replaced_and_its_frame_answered():
