@@ -69,17 +69,19 @@ class Refined:
         pose: that was correlated; over an unknown slope the fix differs.
         picture: as it was compared with the map.
         ground: the samples of the map.
+        is_consistent: whether it agrees with the fix from which it began; if not, the picture alone speaks for it.
     """
 
     fix: Fix
     pose: Pose
     picture: EnhancedFrame
     ground: Samples
+    is_consistent: bool
 
     @property
     def is_clear(self) -> bool:
-        """Whether the correlation leaves nothing else to try."""
-        return self.fix.score >= CONFIRMING_CORRELATION
+        """Whether it leaves nothing else to try."""
+        return self.is_consistent and self.fix.score >= CONFIRMING_CORRELATION
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +168,8 @@ class Refinement:
             return None
         tried = _CLIMBED if self._knows_tilt else _CLIMBED * len(_TILTS) ** 2
         off = self.query.prior_chi_square(refined.fix)
+        if not refined.is_consistent:
+            log_prior += math.log(1.0 - RELIABILITY)
         surprise = self.surprise_of(refined) - math.log(tried) + log_prior
         evidence = replace(found.evidence, refined=surprise, prior_chi_square=off)
         moved = replace(found, fix=refined.fix)
@@ -231,7 +235,7 @@ class Refinement:
         return replace(self, query=replace(self.query, frame=frame), doubts_tilt=True)
 
     def _refined(self, fix: Fix, prior: GaussianPrior, coarser: int) -> Refined | None:
-        """The fix with its pose refined from a coarser level on; None if that failed or led elsewhere."""
+        """The fix with its pose refined from a coarser level on; None if that failed, or hardly fits elsewhere."""
         query, errors = self.query, self.query.errors(self.options.errors)
         found = self._through_levels(prior, coarser)
         if found is None:
@@ -264,10 +268,11 @@ class Refinement:
         allowed_m2 = fix.relative_covariance_m2 + covariance[:2, :2]
         if self.doubts_tilt:  # which displaced the peak
             allowed_m2 += (height_m * math.radians(errors.tilt_deg)) ** 2 * np.eye(2)
-        if not are_consistent(moved, allowed_m2):
-            return None
         refined = self._refined_fix(fix, fit, covariance + errors.map_m**2 * np.eye(3), turns_rad2)
-        return Refined(refined, at, picture, ground) if agree_in_height(fix, refined) else None
+        is_consistent = are_consistent(moved, allowed_m2) and agree_in_height(fix, refined)
+        if not is_consistent and refined.score < CONFIRMING_CORRELATION:
+            return None
+        return Refined(refined, at, picture, ground, is_consistent)
 
     @property
     def _knows_tilt(self) -> bool:

@@ -130,7 +130,7 @@ class Sift(Method):
         """The fix with its pose refined; None if that fails, or chance may have given that pose as well."""
         refinement = self._refinement(query)
         found = refinement.refine_pose(fix)
-        if found is None:
+        if found is None or not found.is_consistent:
             return None
         counts = found.is_clear or is_beyond_doubt(refinement.surprise_of(found), query.risk)
         return found.fix if counts else None

@@ -37,6 +37,8 @@ WRONG = [
     {"roll_deg": 0.07, "pitch_deg": -0.05},  # radians
     *({**TRUE, "roll_deg": roll_deg} for roll_deg in (14.0, -6.0)),
     *({**TRUE, "pitch_deg": pitch_deg} for pitch_deg in (7.0, -13.0)),
+    *({**TRUE, "pitch_deg": pitch_deg} for pitch_deg in (13.0, -19.0)),  # the position is 42 m from where it says
+    {"roll_deg": -10.0, "pitch_deg": 9.0},
 ]
 
 
@@ -142,7 +144,7 @@ def weakened(nats):
 
 
 def refined(fix, score):
-    return Refined(replace(fix, stage="refined", score=score), None, None, None)
+    return Refined(replace(fix, stage="refined", score=score), None, None, None, is_consistent=True)
 
 
 def test_a_refined_pose_does_not_stand_for_the_structure_that_a_search_must_show(
