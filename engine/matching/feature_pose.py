@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.assumed_errors import AssumedErrors
-from engine.geo import attitude_from_rotation
+from engine.geo import attitude_from_rotation, wrap_difference_deg
 from engine.maps.landmarks import LandmarkMap
 from engine.matching import refusals
 from engine.matching.align import MIN_DOWN
@@ -27,6 +27,7 @@ from engine.matching.votes import Vote
 from engine.options import MIN_HEIGHT_M, PAPER_SCALE, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, NoFix, Reason, Window
+from engine.window import SPREAD_SIGMAS
 
 if TYPE_CHECKING:  # it loads torch
     from engine.matching.point_finding import PointFinder
@@ -165,7 +166,8 @@ class FeatureMatcher:
         """The pose that the matches agree on and the attitude allows.
 
         Few matches hardly separate a tilt from a displacement. A known tilt counts even if the heading is unknown:
-        the matches themselves then give the heading.
+        the matches themselves then give the heading. If they refute a known one, the tilt is as doubtful: of the
+        poses that rest on it and on the matches alone, the more certain one counts.
         """
         query, options = self.query, self.options
         pose = replace(options.pose, reprojection_px=found.tolerance_px)
@@ -177,13 +179,29 @@ class FeatureMatcher:
             return solve()
         errors = query.errors(options.errors)
         heading_deg, sigma_deg = query.telemetry.grid_heading_deg, errors.heading_deg
-        if heading_deg is None or hypothesis.x_axis_deg is None:
-            free = solve()
-            if free is None:
-                return None
-            heading_deg = attitude_from_rotation(free.rotation.T @ query.camera.mount.T)[2]
-            sigma_deg = _MATCHED_HEADING_SIGMA_DEG
-        return solve(prior=query.attitude_prior(heading_deg, sigma_deg, errors))
+        if heading_deg is not None and hypothesis.x_axis_deg is not None:
+            return solve(prior=query.attitude_prior(heading_deg, sigma_deg, errors))
+        free = solve()
+        if free is None:
+            return None
+        seen_deg = attitude_from_rotation(free.rotation.T @ query.camera.mount.T)[2]
+        told = solve(prior=query.attitude_prior(seen_deg, _MATCHED_HEADING_SIGMA_DEG, errors))
+        if told is None or heading_deg is None:
+            return told
+        if abs(wrap_difference_deg(seen_deg - heading_deg)) <= SPREAD_SIGMAS * sigma_deg:
+            return told
+        doubting = replace(errors, tilt_deg=max(errors.tilt_deg, errors.unknown_tilt_deg))
+        seen = solve(prior=query.attitude_prior(seen_deg, _MATCHED_HEADING_SIGMA_DEG, doubting))
+        told = self._with_tilt_doubt(told, math.radians(doubting.tilt_deg))
+        return min(filter(None, (told, seen)), key=lambda each: float(np.trace(each.covariance_center_m2)))
+
+    def _with_tilt_doubt(self, stats: PoseStats, sigma_rad: float) -> PoseStats:
+        """The pose with a covariance for a wrong tilt."""
+        nadir_px, covariance = self.query.site.pixel_from_enu(stats.center_m[:2]), stats.covariance.copy()
+        aside_m = self.query.above_ground_m(nadir_px, float(stats.center_m[2])) * sigma_rad
+        covariance[:2, :2] += aside_m**2 * np.eye(2)
+        covariance[3:, 3:] += tilt_covariance(stats.rotation, sigma_rad)
+        return replace(stats, covariance=covariance)
 
     def _fix(self, stats: PoseStats, window: Window) -> Fix | NoFix:
         """The camera's centre as a fix; refused if a drone over this map cannot be there."""

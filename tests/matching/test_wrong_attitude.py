@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, NoFix, Reason, SceneMatcher
+from engine import Fix, MatcherOptions, NoFix, Reason, SceneMatcher, SiftOptions
 from engine.geo import chi_square_of
 from engine.matching.evidence import Evidence, probability
 from engine.matching.ncc import Ncc
@@ -52,6 +52,18 @@ def test_the_picture_outweighs_a_wrong_roll_and_pitch(ground, matchers, camera, 
     assert ground.chi_square(fix, NADIR) < chi_square_of(SIGNIFICANCE, 2)
     assert abs(fix.attitude.roll_deg - TRUE["roll_deg"]) < 0.5
     assert abs(fix.attitude.pitch_deg - TRUE["pitch_deg"]) < 0.5
+
+
+@pytest.mark.parametrize(
+    "told", [{"roll_deg": -1.0, "pitch_deg": 0.0, "heading_deg": 110.0}, {"heading_deg": 200.0}]
+)
+def test_a_heading_that_the_matches_refute_makes_the_tilt_as_doubtful(ground, site, camera, told):
+    """A mount that is turned by 90 degrees turns both; of few matches a wrong tilt would move the pose by 12 m."""
+    nadir, few = np.array([330.0, 280.0]), MatcherOptions(sift=SiftOptions(max_keypoints=40))
+    frame = replace(ground.frame(camera, nadir, 150.0, **TRUE), **told)
+    fix = SceneMatcher(site, camera, "sift", "cpu", few).locate(frame, ground.prior(nadir))
+    assert np.hypot(*ground.off_m(fix, nadir)) < 1.0
+    assert ground.chi_square(fix, nadir) < chi_square_of(SIGNIFICANCE, 2)
 
 
 @pytest.mark.parametrize("method", ["ncc", "auto"])
