@@ -48,6 +48,7 @@ class FeatureMatcher:
         options: settings.
         finder: finds the matched points instead of features.
         method: name of the method in fixes and refusals.
+        doubts_tilt: whether the told roll and pitch are no better known than untold ones.
     """
 
     query: Query
@@ -55,6 +56,7 @@ class FeatureMatcher:
     options: SiftOptions
     finder: PointFinder | None = None
     method: str = METHOD
+    doubts_tilt: bool = False
 
     def find(self) -> PoseCandidate | NoFix:
         """The pose of the frame, or a refusal if there is none."""
@@ -167,7 +169,7 @@ class FeatureMatcher:
 
         Few matches hardly separate a tilt from a displacement. A known tilt counts even if the heading is unknown:
         the matches themselves then give the heading. If they refute a known one, the tilt is as doubtful: of the
-        poses that rest on it and on the matches alone, the more certain one counts.
+        poses that rest on it and on the matches, the more certain one counts.
         """
         query, options = self.query, self.options
         pose = replace(options.pose, reprojection_px=found.tolerance_px)
@@ -178,20 +180,21 @@ class FeatureMatcher:
         if not options.use_attitude:
             return solve()
         errors = query.errors(options.errors)
-        heading_deg, sigma_deg = query.telemetry.grid_heading_deg, errors.heading_deg
-        if heading_deg is not None and hypothesis.x_axis_deg is not None:
-            return solve(prior=query.attitude_prior(heading_deg, sigma_deg, errors))
-        free = solve()
-        if free is None:
-            return None
-        seen_deg = attitude_from_rotation(free.rotation.T @ query.camera.mount.T)[2]
-        told = solve(prior=query.attitude_prior(seen_deg, _MATCHED_HEADING_SIGMA_DEG, errors))
-        if told is None or heading_deg is None:
-            return told
-        if abs(wrap_difference_deg(seen_deg - heading_deg)) <= SPREAD_SIGMAS * sigma_deg:
+        told_deg, sigma_deg = query.telemetry.grid_heading_deg, errors.heading_deg
+        heading_deg, doubts_tilt = told_deg, self.doubts_tilt
+        if heading_deg is None or hypothesis.x_axis_deg is None:
+            free = solve()
+            if free is None:
+                return None
+            heading_deg = attitude_from_rotation(free.rotation.T @ query.camera.mount.T)[2]
+            if told_deg is not None:
+                doubts_tilt |= abs(wrap_difference_deg(heading_deg - told_deg)) > SPREAD_SIGMAS * sigma_deg
+            sigma_deg = _MATCHED_HEADING_SIGMA_DEG
+        told = solve(prior=query.attitude_prior(heading_deg, sigma_deg, errors))
+        if told is None or not doubts_tilt:
             return told
         doubting = replace(errors, tilt_deg=max(errors.tilt_deg, errors.unknown_tilt_deg))
-        seen = solve(prior=query.attitude_prior(seen_deg, _MATCHED_HEADING_SIGMA_DEG, doubting))
+        seen = solve(prior=query.attitude_prior(heading_deg, sigma_deg, doubting))
         told = self._with_tilt_doubt(told, math.radians(doubting.tilt_deg))
         return min(filter(None, (told, seen)), key=lambda each: float(np.trace(each.covariance_center_m2)))
 

@@ -142,14 +142,18 @@ class Sift(Method):
         """The matches in a window at the frame's own height and heading."""
         return explain_features(FeatureMatcher(query, self.landmarks, self.options), window)
 
-    def find(self, query: Query, options: SiftOptions | None = None) -> PoseCandidate | NoFix:
+    def find(
+        self, query: Query, options: SiftOptions | None = None, *, doubts_tilt: bool = False
+    ) -> PoseCandidate | NoFix:
         """The pose of one frame, or a refusal if there is none.
 
         Args:
             query: the frame.
             options: replace the method's own.
+            doubts_tilt: as :class:`.FeatureMatcher`.
         """
-        return FeatureMatcher(query, self.landmarks, options or self.options).find()
+        options = options or self.options
+        return FeatureMatcher(query, self.landmarks, options, doubts_tilt=doubts_tilt).find()
 
     def works(self, query: Query) -> Works:
         """Shares of the usual scale, by the pixels of the matched picture, which determine the cost."""
@@ -162,10 +166,10 @@ class Sift(Method):
             return {(step, share): query.gray.size * (scale * share) ** 2 for share in SHARES}
         return {(step, share): drawn_px(query, known.height_agl_m, scale * share) for share in SHARES}
 
-    def at_scale(self, query: Query, share: float) -> PoseCandidate | NoFix:
+    def at_scale(self, query: Query, share: float, *, doubts_tilt: bool = False) -> PoseCandidate | NoFix:
         """The pose by all features at a share of the usual scale, not refined."""
         options = self.options if share == 1.0 else replace(self.options, scale=self.options.scale * share)
-        found = self.find(query, options)
+        found = self.find(query, options, doubts_tilt=doubts_tilt)
         return found if share == 1.0 or isinstance(found, NoFix) else found.coarse()
 
 
@@ -204,10 +208,10 @@ class _Rungs:
     def _by_all(self, answer: Answer | None, step: Hashable) -> Answer:
         """The pose by all features."""
         assert isinstance(step, tuple)
-        found = self._sift.at_scale(self._query, step[1])
-        if isinstance(found, NoFix) or not isinstance(answer, PoseCandidate):
-            return found
-        return replace(found, is_refinable=answer.is_refinable)
+        if not isinstance(answer, PoseCandidate) or answer.is_refinable:
+            return self._sift.at_scale(self._query, step[1])
+        found = self._sift.at_scale(self._query, step[1], doubts_tilt=True)
+        return found if isinstance(found, NoFix) else replace(found, is_refinable=False)
 
     def _if_refinable(self, answer: Answer | None) -> Works:
         """The pose of few features that promise a fix, or of all that suffice, unless a refinement has failed."""
@@ -218,11 +222,14 @@ class _Rungs:
         return {_REFINEMENT: float(self._query.gray.size)} if offered else {}
 
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer | None:
-        """The pose refined, if its features are beyond doubt or the picture confirms it."""
+        """The pose refined if features beyond doubt or the picture confirm it; else its tilt is in doubt."""
         assert isinstance(answer, PoseCandidate)  # or it was not offered
         refined = self._sift.refined(self._query, answer.fix)
-        if refined is None:
+        if refined is None and answer.is_quick:
             return replace(answer, is_refinable=False)
+        if refined is None:
+            again = self._sift.find(self._query, doubts_tilt=True)
+            return again if isinstance(again, NoFix) else replace(again, is_refinable=False)
         if not (is_accepted(answer, self._query) or refined.score >= CONFIRMING_CORRELATION):
             return None
         return replace(answer, fix=refined, is_quick=False, evidence=replace(answer.evidence, is_tested=True))

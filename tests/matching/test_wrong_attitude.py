@@ -12,6 +12,7 @@ from engine.geo import chi_square_of
 from engine.matching.evidence import Evidence, probability
 from engine.matching.ncc import Ncc
 from engine.matching.refinement import Refined, Refinement
+from engine.matching.sift import Sift
 from engine.runtime.scheduler import OutOfTime
 from engine.values import SIGNIFICANCE
 
@@ -64,6 +65,21 @@ def test_a_heading_that_the_matches_refute_makes_the_tilt_as_doubtful(ground, si
     fix = SceneMatcher(site, camera, "sift", "cpu", few).locate(frame, ground.prior(nadir))
     assert np.hypot(*ground.off_m(fix, nadir)) < 1.0
     assert ground.chi_square(fix, nadir) < chi_square_of(SIGNIFICANCE, 2)
+
+
+@pytest.mark.parametrize("nadir_px", [(310.0, 305.0), (290.0, 320.0), (330.0, 280.0)])
+def test_a_pose_by_features_that_the_picture_does_not_confirm_rests_on_no_told_tilt(
+    ground, matchers, camera, monkeypatch, nadir_px
+):
+    """Most of the picture is noise; a tilt wrong by 7 degrees, held to 0.4, would move the pose by a metre."""
+    monkeypatch.setattr(Sift, "refined", lambda *_: None)
+    frame, nadir = ground.frame(camera, np.array(nadir_px), 150.0, **TRUE), np.array(nadir_px)
+    image = np.array(frame.image)
+    hidden = image[:, round(0.3 * image.shape[1]) :]
+    hidden[:] = np.random.default_rng(0).integers(0, 255, hidden.shape)
+    fix = matchers["sift"].locate(replace(frame, image=image, roll_deg=-1.0, pitch_deg=2.0), ground.prior(nadir))
+    assert np.hypot(*ground.off_m(fix, nadir)) < 0.5
+    assert abs(fix.attitude.roll_deg - TRUE["roll_deg"]) < 0.5
 
 
 @pytest.mark.parametrize("method", ["ncc", "auto"])
