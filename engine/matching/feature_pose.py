@@ -67,10 +67,12 @@ class FeatureMatcher:
         first: NoFix | PoseCandidate | None = None
         found: list[tuple[PoseCandidate, FeatureMatcher, TelemetryHypothesis]] = []
         deadline = query.scheduler.deadline
-        for matcher, hypothesis in self._attempts():
+        for count, (matcher, hypothesis) in enumerate(self._attempts(), 1):
             if first is not None and deadline.remaining_ms < deadline.elapsed_ms:
                 break
             result = matcher._find_with(hypothesis)
+            if isinstance(result, PoseCandidate):  # it is the best of all that was tried so far
+                result = result.weighed(replace(result.evidence, tried=result.evidence.tried * count))
             first = first or result
             if isinstance(result, PoseCandidate):
                 found.append((result, matcher, hypothesis))
