@@ -183,8 +183,7 @@ class MavlinkBridge:
 
     def _is_trusted(self, answer: Answer, now_s: float) -> bool:
         """Whether a fix continues the track sent to the autopilot or, before the first fix, its GNSS."""
-        stamp_ns, gnss = answer.frame.timestamp_ns, self.telemetry.gnss
-        assert stamp_ns is not None  # set by submit
+        stamp_ns, gnss = answer.frame.timestamp_ns or 0, self.telemetry.gnss
         if self._confirmed:
             self._guard.confirm()
             self._confirmed = False
@@ -193,13 +192,12 @@ class MavlinkBridge:
         if site is not None and gnss is not None and abs(stamp_ns - gnss.time_ns) < _GNSS_STALE_NS:
             prior = Prior(lat_deg=gnss.lat_deg, lon_deg=gnss.lon_deg, sigma_m=gnss.sigma_m)
             self._guard.anchor(position_of(prior, site))
-        was_disputed, result = self._guard.is_disputed, answer.result
-        trusted = self._guard.trusts(result)
-        if was_disputed and not self._guard.is_disputed and isinstance(result, NoFix) and result.match:
-            # What was sent is confirmed by matches that the navigator refused: it follows the shifted map.
-            self._live.restart(place_of(result.match).prior())
+        was_disputed, trusted = self._guard.is_disputed, self._guard.trusts(answer.result)
         if self._guard.is_disputed:
             self._tell(self._notices.doubted(self._guard.distance_m, now_s))
+        elif was_disputed and isinstance(answer.result, NoFix) and answer.result.match is not None:
+            # The navigator refused what confirms the fixes that were sent: it follows a shifted map.
+            self._live.restart(place_of(answer.result.match).prior())
         return trusted
 
     def _send_fix(self, fix: Fix, captured_ns: int, *, trusted: bool) -> str | None:
