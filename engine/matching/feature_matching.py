@@ -176,8 +176,8 @@ def _voted(
     share_px = _VOTE_SHARE * slant_m(query, height_m) / (site.gsd_m_per_px * 2.0**level)
     radius_px = max(share_px, 2.0 * options.tolerance_px)
     middle = (np.array(photo.gray.shape[::-1]) - 1.0) / 2.0
-    # A finer picture shows the same objects by more pixels: no more of its matches are independent.
-    distinct_px = options.pose.distinct_px * max(1.0, options.scale / PAPER_SCALE)
+    # Matches so near to each other that they agree wherever they are: of one object, right or wrong together.
+    distinct_px = max(options.pose.distinct_px, 1.5 * radius_px)
     found = vote(photo_px - middle, map_px, radius_px, distinct_px)
     if found is None:
         return matched
