@@ -83,6 +83,11 @@ class Refined:
         """Whether it leaves nothing else to try."""
         return self.is_consistent and self.fix.score >= CONFIRMING_CORRELATION
 
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """The greater, the better."""
+        return self.is_clear, self.fix.score
+
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
@@ -216,7 +221,7 @@ class Refinement:
         prior, best = self._prior(fix), None
         for coarser in self._levels_above:
             refined = self._refined(fix, prior, coarser)
-            if refined is not None and (best is None or refined.fix.score > best.fix.score):
+            if refined is not None and (best is None or refined.rank > best.rank):
                 best = refined
             if best is not None and best.is_clear:
                 break
