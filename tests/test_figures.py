@@ -24,7 +24,7 @@ FIGURES = {  # page: claim: results page, heading and words of each row that sta
             [("field.md", "`gazebo-a1`:", "| auto,"), ("field.md", "The paper's recipe", "| `gazebo-a1` |")],
         "| the same in the evening, map of noon | 0.21 | 0 | 1.31 |":
             [("field.md", "`gazebo-a1-evening`", "| auto,", "| plain classical recipe")],
-        "4 to 116 ms on one":
+        "5 to 91 ms on one":
             [("field.md", "`gazebo-a1`:", "| auto,"), ("field.md", "`brighton`", "| auto |")],
         "30 to 150 m above ground":
             [("field.md", "`caliterra`", "survey photographs"),
