@@ -100,7 +100,7 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(make, frame, pr
     assert apart_m < by_fine.relative_sigma_m
 
 
-def out_of_time(*_):
+def out_of_time(*_, **__):
     raise OutOfTime
 
 
