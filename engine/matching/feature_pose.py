@@ -197,16 +197,9 @@ class FeatureMatcher:
             return told
         doubting = replace(errors, tilt_deg=max(errors.tilt_deg, errors.unknown_tilt_deg))
         seen = solve(prior=query.attitude_prior(heading_deg, sigma_deg, doubting))
-        told = self._with_tilt_doubt(told, math.radians(doubting.tilt_deg))
+        above_m = query.above_ground_m(query.site.pixel_from_enu(told.center_m[:2]), float(told.center_m[2]))
+        told = _with_tilt_doubt(told, above_m, math.radians(doubting.tilt_deg))
         return min(filter(None, (told, seen)), key=lambda each: float(np.trace(each.covariance_center_m2)))
-
-    def _with_tilt_doubt(self, stats: PoseStats, sigma_rad: float) -> PoseStats:
-        """The pose with a covariance for a wrong tilt."""
-        nadir_px, covariance = self.query.site.pixel_from_enu(stats.center_m[:2]), stats.covariance.copy()
-        aside_m = self.query.above_ground_m(nadir_px, float(stats.center_m[2])) * sigma_rad
-        covariance[:2, :2] += aside_m**2 * np.eye(2)
-        covariance[3:, 3:] += tilt_covariance(stats.rotation, sigma_rad)
-        return replace(stats, covariance=covariance)
 
     def _fix(self, stats: PoseStats, window: Window) -> Fix | NoFix:
         """The camera's centre as a fix; refused if a drone over this map cannot be there."""
@@ -219,24 +212,22 @@ class FeatureMatcher:
             ray_deg = math.degrees(math.acos(min(max(down, -1.0), 1.0)))
             detail = f"the pose looks {ray_deg:.0f} degrees off the vertical at a height of {up:.0f} m"
             return query.refuse(Reason.BAD_POSE, detail, self.method, score=share, window=window)
-        covariance, turns_rad2 = stats.covariance_center_m2, stats.covariance[3:, 3:]
         if not query.telemetry.has_tilt:  # features of a coarse picture share errors that look like a tilt
-            wider = max(1.0, PAPER_SCALE / options.scale) ** 2
-            covariance, turns_rad2 = covariance * wider, turns_rad2 * wider
+            stats = replace(stats, covariance=stats.covariance * max(1.0, PAPER_SCALE / options.scale) ** 2)
         measured_m = query.above_ground_m(nadir, up)
         doubt_m = query.scale_doubt_m(measured_m, stats.rotation[2], query.errors(options.errors))
         above_m = up - float(site.surface_at(nadir))
-        tilt_rad = math.hypot(_slope_rad(site, options.errors), doubt_m / above_m)
+        stats = _with_tilt_doubt(stats, above_m, math.hypot(_slope_rad(site, options.errors), doubt_m / above_m))
         return query.fix(
             self.method,
             nadir,
-            covariance + _map_covariance_m2(above_m * tilt_rad, options.errors),
+            stats.covariance_center_m2 + options.errors.map_m**2 * np.eye(3),
             score=share,
             window=window,
             east_north_m=stats.center_m[:2],
             up_m=up,
             grid_attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ query.camera.mount.T)),
-            turn_covariance_rad2=turns_rad2 + tilt_covariance(stats.rotation, tilt_rad),
+            turn_covariance_rad2=stats.covariance[3:, 3:],
             map_sigma_m=options.errors.map_m,
         )
 
@@ -263,10 +254,12 @@ class FeatureMatcher:
         return PoseCandidate(replace(fix, confidence=probability(evidence.nats)), evidence)
 
 
-def _map_covariance_m2(aside_m: float, errors: AssumedErrors) -> Array:
-    """(3, 3) of the map's georeferencing, and of a position so far aside because a slope was taken for a tilt."""
-    horizontal = errors.map_m**2 + aside_m**2
-    return np.diag([horizontal, horizontal, errors.map_m**2])
+def _with_tilt_doubt(stats: PoseStats, above_m: float, sigma_rad: float) -> PoseStats:
+    """The pose with a covariance for a wrong tilt, of the camera or of the ground so far below it."""
+    covariance = stats.covariance.copy()
+    covariance[:2, :2] += (above_m * sigma_rad) ** 2 * np.eye(2)
+    covariance[3:, 3:] += tilt_covariance(stats.rotation, sigma_rad)
+    return replace(stats, covariance=covariance)
 
 
 def _slope_rad(site: OrthoMap, errors: AssumedErrors) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import replace
+from typing import TypeGuard
 
 from engine.maps.landmarks import LandmarkMap
 from engine.maps.samples import SampleMap
@@ -101,7 +102,7 @@ class Sift(Method):
     def rungs(self, query: Query) -> list[Rung]:
         """Its rungs, cheap ones first."""
         rungs = _Rungs(self, query)
-        return [rungs.few, rungs.refinement, rungs.all, rungs.refinement]
+        return [rungs.few, rungs.refinement, rungs.all, rungs.refinement, rungs.doubted]
 
     def few_options(self, query: Query) -> SiftOptions | None:
         """Of few features, at their scale; None if they are not wanted or the map has no such level."""
@@ -183,6 +184,7 @@ class _Rungs:
         self.few = Rung(METHOD, self._if_few_suffice, self._by_few)
         self.all = Rung(METHOD, self._if_few_do_not_suffice, self._by_all)
         self.refinement = Rung(METHOD, self._if_refinable, self._refine)
+        self.doubted = Rung(METHOD, self._if_unconfirmed, self._by_matches)
 
     def _if_few_suffice(self, answer: Answer | None) -> Works:
         """Few features, if time allows all of them as well, or only few."""
@@ -203,15 +205,21 @@ class _Rungs:
         return found if isinstance(found, PoseCandidate) and found.promises(self._query.risk) else None
 
     def _if_few_do_not_suffice(self, answer: Answer | None) -> Works:
-        return self._works if answer is None or _is_quick(answer) else {}
+        return self._works if answer is None or (_is_quick(answer) and answer.is_refinable) else {}
 
     def _by_all(self, answer: Answer | None, step: Hashable) -> Answer:
         """The pose by all features."""
         assert isinstance(step, tuple)
-        if not isinstance(answer, PoseCandidate) or answer.is_refinable:
-            return self._sift.at_scale(self._query, step[1])
-        found = self._sift.at_scale(self._query, step[1], doubts_tilt=True)
-        return found if isinstance(found, NoFix) else replace(found, is_refinable=False)
+        return self._sift.at_scale(self._query, step[1])
+
+    def _if_unconfirmed(self, answer: Answer | None) -> Works:
+        """All features without the stated tilt, if a refinement has failed, which makes that doubtful."""
+        return self._works if isinstance(answer, PoseCandidate) and not answer.is_refinable else {}
+
+    def _by_matches(self, answer: Answer | None, step: Hashable) -> Answer:
+        """The pose by all features that does not rest on the stated tilt."""
+        assert isinstance(step, tuple)
+        return self._sift.at_scale(self._query, step[1], doubts_tilt=True)
 
     def _if_refinable(self, answer: Answer | None) -> Works:
         """The pose of few features that promise a fix, or of all that suffice, unless a refinement has failed."""
@@ -222,18 +230,15 @@ class _Rungs:
         return {_REFINEMENT: float(self._query.gray.size)} if offered else {}
 
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer | None:
-        """The pose refined if features beyond doubt or the picture confirm it; else its tilt is in doubt."""
+        """The pose refined, if its features are beyond doubt or the picture confirms it."""
         assert isinstance(answer, PoseCandidate)  # or it was not offered
         refined = self._sift.refined(self._query, answer.fix)
-        if refined is None and answer.is_quick:
-            return replace(answer, is_refinable=False)
         if refined is None:
-            again = self._sift.find(self._query, doubts_tilt=True)
-            return again if isinstance(again, NoFix) else replace(again, is_refinable=False)
+            return replace(answer, is_refinable=False)
         if not (is_accepted(answer, self._query) or refined.score >= CONFIRMING_CORRELATION):
             return None
         return replace(answer, fix=refined, is_quick=False, evidence=replace(answer.evidence, is_tested=True))
 
 
-def _is_quick(answer: Answer | None) -> bool:
+def _is_quick(answer: Answer | None) -> TypeGuard[PoseCandidate]:
     return isinstance(answer, PoseCandidate) and answer.is_quick

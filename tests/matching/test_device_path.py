@@ -225,9 +225,7 @@ METRES = {"ncc": 1e-6, "sift": 1e-2, "auto": 1e-5}  # of auto it may be SIFT's, 
 )
 def test_a_frame_crosses_once_and_its_fix_is_the_cpus(method, backend, monkeypatch):
     scene = flight(1)
-    monkeypatch.setattr(
-        "engine.matching.ladder.is_beyond_doubt", lambda *_: False
-    )  # so that auto asks both methods
+    monkeypatch.setattr("engine.matching.ladder.is_beyond_doubt", lambda *_: False)  # auto asks both methods
     options = MatcherOptions(sift=SiftOptions(backend=backend))
     matcher = SceneMatcher(scene.site, scene.camera, method, "cpu", options)
     expected = [matcher.locate(*pair) for pair in zip(scene.frames, scene.priors, strict=True)]
