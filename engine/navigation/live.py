@@ -199,10 +199,12 @@ class Live:
                 self._changed.wait_for(
                     lambda: self._waiting or self._anew or self._closed or self._number != number
                 )
+                if self._number != number:
+                    return  # replaced meanwhile
                 if self._anew is not None:
                     navigator, start, self._anew = None, self._anew, None
                     continue
-                if self._waiting is None or self._number != number or navigator is None:
+                if self._waiting is None or navigator is None:
                     return
                 job, self._working, self._waiting = self._waiting, self._waiting, None
                 self._changed.notify_all()

@@ -125,8 +125,8 @@ class _Rival:
         gain_s = covariance[1, 2] / variance
         scale = max(1.0, 0.5 * float(found_mps @ found_mps) / variance)
         variance_m2 = scale * (covariance[1, 1] - gain_s * covariance[1, 2])
-        en_m = parted.track.filtered_m + gain_s * found_mps
-        return replace(parted.estimate, en_m=en_m, sigma_m=math.sqrt(variance_m2))
+        place_m = parted.track.filtered_m + gain_s * found_mps
+        return replace(parted.estimate, en_m=place_m, sigma_m=math.sqrt(variance_m2))
 
 
 class TrackGuard:
