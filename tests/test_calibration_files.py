@@ -7,6 +7,7 @@ import yaml
 
 from engine.camera import Camera, mount_rotation
 from engine.errors import CalibrationError
+from scenematch.files.flight import camera_info
 from tests.support.refusals import refusal
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 505.0, 239.5], [0.0, 0.0, 1.0]])
@@ -69,6 +70,13 @@ def test_reads_camera_info_with_the_default_mount(save):
     np.testing.assert_array_equal(read.distortion, PLUMB_BOB)
     assert read.focal_px == 502.5
     np.testing.assert_array_equal(read.mount, mount_rotation("nadir"))
+
+
+def test_a_flights_camera_yaml_is_read_back(save):
+    camera = Camera(640, 480, K, distortion=DIGITS, mount=mount_rotation("nadir", -30.0))
+    read = Camera.load(save(camera_info(camera)))
+    for name in ("matrix", "distortion", "mount"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(camera, name))
 
 
 @pytest.mark.parametrize("zeros", ["[]", "[0, 0, 0, 0]", "[0, 0, 0, 0, 0]"])

@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from docs.draw_architecture import drawn, members, picture
+from docs.draw_architecture import drawn, floors, members, picture
 from docs.site_commands import with_options
 from docs.site_roles import on_page_content
 from engine import AssumedErrors, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, Reason, SiftOptions
@@ -125,23 +125,12 @@ def test_pages_use_the_words_of_the_field():
 PATH = re.compile(r"`(engine/[\w/]+(?:\.\w+)?)`")
 
 
-@pytest.mark.slow
 def test_architecture_is_drawn_from_the_code():
     """``python docs/draw_architecture.py`` draws it anew."""
+    assert sorted(name for names in floors() for name in names) == sorted(members())
     page = read("docs/architecture.md")
     assert page == drawn(page)
     assert read("docs/img/architecture.svg") == picture()
-
-
-def test_floors_on_the_page_are_those_that_import_linter_keeps():
-    contracts = tomllib.loads(read("pyproject.toml"))["tool"]["importlinter"]["contracts"]
-    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
-    kept = [{part.strip() for part in re.split(r"[|:]", layer)} for layer in layers]
-    shown = {}
-    for floor, name in re.findall(r"^\| (\d+) \| `([\w.]+)/?` \|", read("docs/architecture.md"), re.MULTILINE):
-        shown.setdefault(int(floor), set()).add(name)
-    assert [shown[floor] for floor in sorted(shown, reverse=True)] == kept
-    assert sorted(name for names in kept for name in names) == sorted(members())
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)

@@ -104,12 +104,6 @@ def test_differences_of_angles_wrap_to_half_a_turn(given_deg, expected_deg):
     assert wrap_difference_deg(np.array([given_deg])) == [expected_deg]
 
 
-def test_heading_of_a_rotation_a_hair_west_of_north_is_below_360():
-    rotation = enu_from_body(0.0, 0.0, 0.0)
-    rotation[0, 0] = -1e-20
-    assert attitude_from_rotation(rotation)[2] == 0.0
-
-
 def test_chi_square_counts_in_standard_deviations():
     assert chi_square(np.array([3.0, 8.0]), np.diag([9.0, 16.0])) == pytest.approx(5.0)
 

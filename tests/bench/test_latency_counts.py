@@ -8,7 +8,7 @@ import pytest
 
 from bench.live import endless
 from bench.live.burden import hogs
-from bench.live.endless import GRACE_MS, Flown, Taken, cause, draw, stage_at, summary, there_and_back
+from bench.live.endless import GRACE_MS, Flown, Taken, cause, draw, stage_at, summary
 from bench.live.growth import slope
 from bench.pages.latency import share
 from scenematch.simulator import plan_flight
@@ -21,13 +21,6 @@ def flown(wall_ms, error_m, error_sigmas, budget_ms=5.0):
     wall = np.array(wall_ms, float)
     errors = np.array(error_m, float), np.array(error_sigmas, float)
     return Flown(budget_ms, wall, 0.5 * wall, *errors, Counter(), Counter(), 0, 1, Counter())
-
-
-def test_the_way_leads_forth_and_back_without_a_jump():
-    way = [there_and_back(number, 4) for number in range(9)]
-    assert [index for index, _ in way] == [0, 1, 2, 3, 2, 1, 0, 1, 2]
-    assert [back for _, back in way] == [False] * 4 + [True] * 2 + [False] * 3
-    assert there_and_back(7, 1) == (0, False)
 
 
 def test_an_endless_course_moves_as_its_velocities_say_also_on_the_way_back(monkeypatch):

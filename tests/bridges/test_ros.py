@@ -853,10 +853,3 @@ def test_arguments_of_another_ros_are_refused(capsys, tmp_path):
     ):
         assert main(["bridge", "ros", "--ros", version, "--map", str(tmp_path / "m.tif"), *given]) == 2
         assert stated in capsys.readouterr().err
-
-
-def test_the_settings_name_the_topics_of_the_code(capsys):
-    assert main(["doctor", "--settings"]) == 0
-    text = " ".join(capsys.readouterr().out.split())
-    for name in RosTopics.__slots__:
-        assert getattr(RosTopics(), name) in text

@@ -97,11 +97,6 @@ def test_texture_of_water_is_its_noise(found):
     assert found.statistics.texture[water] == pytest.approx(np.full(water.sum(), NOISE * 6 / 16), rel=0.08)
 
 
-def test_a_field_that_repeats_is_its_own_rival(found):
-    assert (found.statistics.rival[well_inside(found, 0, HALF)] > 0.95).all()
-    assert (found.statistics.rival[well_inside(found, 0, 0)] < 0.9).all()
-
-
 def test_more_lead_and_more_score_never_make_a_fix_less_probable():
     ladder = np.linspace(0.0, 40.0, 100)
     assert (np.diff(fix_probability(20.0, 15.0, ladder)) >= 0).all()

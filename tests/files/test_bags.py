@@ -6,7 +6,6 @@ from functools import cache, partial
 import numpy as np
 import pytest
 from PIL import Image
-from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.serde import utils as serde_utils
@@ -107,24 +106,6 @@ def test_a_flight_comes_back(bag):
     for row, true in zip(open_truth(path, frames[0].timestamp_ns), truth, strict=True):
         for name in Truth.__slots__:
             assert getattr(row, name) == pytest.approx(getattr(true, name), abs=1e-9)
-
-
-def test_others_read_what_is_written(bag):
-    """By rosbags alone: the names, types and numbers that a ROS tool finds."""
-    path, frames, _ = bag
-    with AnyReader([path]) as reader:
-        assert {c.topic: c.msgtype for c in reader.connections}[IMAGE] == "sensor_msgs/msg/Image"
-        found = {}
-        for connection, time_ns, data in reader.messages():
-            message = reader.deserialize(data, connection.msgtype)
-            found.setdefault(connection.topic, []).append((time_ns, message))
-    assert [time_ns for time_ns, _ in found[IMAGE]] == [frame.timestamp_ns for frame in frames]
-    first = found[IMAGE][0][1]
-    assert (first.encoding, first.height, first.width, first.step) == ("rgb8", 23, 31, 93)
-    assert bytes(first.data) == frames[0].image.tobytes()
-    assert (first.header.stamp.sec, first.header.stamp.nanosec) == (1_700_000_000, 123_456_789)
-    compass = [message.data for _, message in found["/mavros/global_position/compass_hdg"]]
-    assert compass == [frame.heading_deg for frame in frames]
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """Telemetry, truth, frames, flights, tracks and GeoTIFF: what is read, what is written, what is refused."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,7 +9,7 @@ import rasterio
 from PIL import Image
 
 from engine import CalibrationError, Camera, DtypeError, MapError, OptionError, ShapeError
-from engine.values import Frame, NoFix, Prior, Reason, Truth, Window
+from engine.values import NoFix, Prior, Reason, Truth, Window
 from scenematch.files.flight import open_flight
 from scenematch.files.frames import open_frames, read_image
 from scenematch.files.geotiff import write_geotiff
@@ -24,7 +23,6 @@ from scenematch.files.telemetry import (
 )
 from scenematch.files.track import COLUMNS, NOTE_COLUMNS, TrackRow, read_track, track_row, write_track
 from scenematch.files.truth import interpolate_truth, read_truth, write_truth
-from scenematch.runs.simulation import write_folder
 from tests.support.fixes import a_fix
 from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
@@ -365,33 +363,6 @@ def test_a_camera_of_another_size_is_refused_up_front(folder):
     assert len(open_flight(folder, camera=Camera.from_fov(8, 6, 60.0))) == 3
     message = refusal(open_flight, folder, camera=Camera.from_fov(300, 300, 60.0), error=CalibrationError)
     assert "calibrated for 300 x 300, but the frame is 8 x 6" in message
-
-
-AFFINE = [[0.5, 0.0, 600_000.25], [0.0, -0.5, 3_600_000.75]]
-TOWN = SimpleNamespace(
-    ortho=picture(9, (20, 10)), surface_m=np.zeros((10, 20), np.float32), pixel_to_crs=AFFINE, crs_epsg=32636
-)
-
-
-def test_a_written_flight_folder_reads_back(tmp_path):
-    matrix = np.array([[7.1, 0, 3.5], [0, 7.2, 2.5], [0, 0, 1]])
-    camera = Camera(8, 6, matrix, "plumb_bob", np.array([0.1, 0, 0, 0]), np.eye(3))
-    truth = [Truth(timestamp_ns=i * 10**8, lat_deg=32.0, lon_deg=35.0) for i in range(3)]
-    frames = [
-        (f"{i:06d}.png", Frame(picture(i), i * 10**8, 150.0 + i, -90.0, 1.0, 2.0, 3.0, 4.0)) for i in range(3)
-    ]
-    write_folder(tmp_path, TOWN, camera, frames, truth, 32.0, 35.0)
-    loaded = Camera.load(tmp_path / "camera.yaml")
-    for name in ("matrix", "distortion", "mount"):
-        np.testing.assert_array_equal(getattr(loaded, name), getattr(camera, name))
-    flight = list(open_flight(tmp_path / "frames", tmp_path / "telemetry.csv", loaded))
-    assert [item.frame.height_agl_m for item in flight] == [150.0, 151.0, 152.0]
-    assert flight[0].frame.heading_deg == 270.0
-    assert (flight[2].frame.image == 2).all()
-    assert [item.prior for item in flight] == [Prior(lat_deg=32.0, lon_deg=35.0, sigma_m=10.0), None, None]
-    assert read_truth(tmp_path / "truth.csv") == truth
-    with rasterio.open(tmp_path / "map.tif") as ortho, rasterio.open(tmp_path / "dsm.tif") as surface:
-        assert (ortho.count, ortho.crs.to_epsg(), surface.dtypes) == (3, 32636, ("float32",))
 
 
 # -------------------------------------------------------------------------------------------------- GeoTIFF

@@ -51,6 +51,7 @@ def test_a_flight_folder_is_what_track_reads(folder):
     truth = read_truth(folder / "truth.csv")
     site = OrthoMap.open(folder / "map.tif", surface=folder / "dsm.tif")
     assert len(flight) == len(truth) == 3
+    assert [item.prior is not None for item in flight] == [True, False, False]
     for item, true in zip(flight, truth, strict=True):
         assert item.frame.timestamp_ns == true.timestamp_ns
         assert item.frame.height_agl_m == pytest.approx(true.height_agl_m, abs=4.0)

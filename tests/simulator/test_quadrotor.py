@@ -203,13 +203,6 @@ def test_the_imus_biases_walk_as_far_as_they_should():
     assert np.std(turned) == pytest.approx(imu.gyro_walk * root, rel=0.2)
 
 
-def test_the_imu_adds_its_errors_to_what_is_felt():
-    felt = IdealImu(np.array([1.0, 2.0, -9.0]), np.array([0.1, 0.2, 0.3]))
-    with_motion, without = instruments(4).imu(felt), instruments(4).imu(NOTHING)
-    np.testing.assert_allclose(with_motion.force_mps2 - without.force_mps2, felt.force_mps2, atol=1e-12)
-    np.testing.assert_allclose(with_motion.rates_rps - without.rates_rps, felt.rates_rps, atol=1e-12)
-
-
 def test_the_compass_is_off_by_one_angle_in_a_flight_and_by_others_in_others():
     compass = Compass(noise_deg=0.5, bias_deg=2.0)
     biases = []
