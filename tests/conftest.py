@@ -64,6 +64,18 @@ def _bare_runs():
         yield
 
 
+@pytest.fixture
+def save(tmp_path):
+    """Write a file with given contents; its path."""
+
+    def write(content, name="telemetry.csv"):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write
+
+
 @pytest.fixture(scope="session")
 def shared():
     """The folder of the shared flights; tests that ask for it are skipped where it is missing."""

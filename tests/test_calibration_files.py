@@ -1,5 +1,7 @@
 """Calibrations: camera_info, and as OpenCV's FileStorage, Kalibr's camchain and ROS's messages have them."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -54,13 +56,8 @@ def opencvs(path, **content):
 
 
 @pytest.fixture
-def save(tmp_path):
-    def write(text):
-        path = tmp_path / "camera.yaml"
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return path
-
-    return write
+def save(save):
+    return partial(save, name="camera.yaml")
 
 
 def test_reads_camera_info_with_the_default_mount(save):
