@@ -85,14 +85,6 @@ def test_words_that_say_nothing_find_next_to_nothing(places):
     assert figures.matching_score < 0.02
 
 
-def test_no_keypoints_score_nothing(places):
-    none = Keypoints(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 32), np.float32))
-    figures = judge(keypoints(places), none, pair_by(np.eye(3)))
-    assert (figures.repeatability, figures.matching_score, figures.correct) == (0.0, 0.0, 0.0)
-    assert np.isnan(figures.error_px)
-    assert quality.mean([figures, judge(none, none, pair_by(np.eye(3)))]).keypoints == len(places) / 4.0
-
-
 def correlation(pair):
     """Of the second picture with the first laid on it by the pair's map."""
     rows, columns = pair.second.shape

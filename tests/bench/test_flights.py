@@ -17,7 +17,6 @@ pytest.importorskip("pymavlink", reason="pymavlink is not installed")
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from bench.live.flights import fly, sitl
-from bench.live.flights.camera import shown_picture
 from bench.live.flights.faults import FAULTS
 from bench.live.flights.recorded import captured_s, off_m, recorded
 from bench.live.flights.sitl import Pilot
@@ -48,21 +47,11 @@ def test_a_fault_is_scored_by_the_first_fix_after_its_end():
     assert "| camera covered 10 s | none | | 20.0 |" in lines
 
 
-def test_a_flight_without_faults_has_no_table_of_them_and_one_without_fixes_says_so():
-    assert "fault" not in fly.report([(1.0, 0.1, 10.0)], "begun")
-    assert fly.report([], "begun", FAULTS) == "begun\n\nno fixes"
-
-
 def test_a_global_position_is_stamped_when_it_is_sent_and_says_how_long_it_took():
     sensor = message("GLOBAL_POSITION_SENSOR", time_usec=5_300_000, processing_time=300_000)
     assert captured_s(sensor) == pytest.approx(5.0)
     estimate = message("VISION_POSITION_ESTIMATE", usec=5_000_000)
     assert captured_s(estimate) == pytest.approx(5.0)
-
-
-def test_a_fault_covers_the_camera_or_freezes_its_picture():
-    faults = ("camera covered", "picture frozen", "")
-    assert [shown_picture(b"seen", b"black", b"last", fault) for fault in faults] == [b"black", b"last", b"seen"]
 
 
 def test_a_fix_is_scored_about_the_origin_that_the_autopilot_has():
@@ -178,32 +167,6 @@ def test_it_flies_the_positions_and_the_velocity_of_the_subtitles(tmp_path):
 def test_subtitles_without_a_heading_are_refused(tmp_path):
     with pytest.raises(TelemetryError, match="expected subtitles beside it with position, rel_alt and gimbal"):
         recorded(video(tmp_path, ""))
-
-
-def folder(path, truth, telemetry):
-    """Two seconds due north, a row a second, with these columns besides."""
-    for name, columns in (("truth", truth), ("telemetry", telemetry)):
-        places = {"lat_deg": 48.1, "lon_deg": 16.2} if name == "truth" else {"frame": 0}
-        columns = places | columns
-        rows = [",".join(["timestamp_ns", *columns])]
-        for k in range(3):
-            steps = {"lat_deg": 1e-4 * k, "frame": k}
-            values = [value + steps.get(column, 0) for column, value in columns.items()]
-            rows.append(",".join(map(str, [10**9 * (k + 1), *values])))
-        (path / f"{name}.csv").write_text("\n".join(rows) + "\n")
-    return path
-
-
-def test_a_truth_without_heights_above_ground_is_flown_at_the_telemetrys(tmp_path):
-    heading, height, altitude = {"heading_deg": 30.0}, {"height_agl_m": 150.0}, {"alt_amsl_m": 200.0}
-    motion, _, _ = recorded(folder(tmp_path, heading | altitude, height))
-    assert [motion(time_s).height_m for time_s in (0.0, 0.5, 2.0)] == [150.0] * 3
-    motion, _, _ = recorded(folder(tmp_path, heading | {"height_agl_m": 149.0}, height))
-    assert motion(1.0).height_m == 149.0
-    with pytest.raises(TelemetryError, match=r"height_agl_m in truth.csv or telemetry.csv, got none in either$"):
-        recorded(folder(tmp_path, heading | altitude, {}))
-    with pytest.raises(TelemetryError, match=r"truth.csv: expected a heading_deg in every row$"):
-        recorded(folder(tmp_path, altitude, height))
 
 
 # --------------------------------------------------------------------------------------- the camera that shows one
