@@ -1,15 +1,12 @@
 """The command line as a user meets it: results, exit codes, and one clear line for everything that is wrong."""
 
-import contextlib
 import csv
 import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-from functools import partial
 from importlib import metadata
 from pathlib import Path
 
@@ -377,9 +374,6 @@ def test_a_run_that_ends_in_the_middle_keeps_its_rows(error, code, words, flight
     assert "summary.json" in refusal(capsys, ["evaluate", out], 1)
 
 
-# ------------------------------------------------------------------------------------------- interruption
-
-
 def test_the_learned_method_says_that_it_needs_weights(flight, tmp_path, capsys):
     words = "--settings learned.weights: expected the files of LoFTR"
     refused(capsys, flight, tmp_path / "out", 2, words, more=["--method=learned"])
@@ -392,27 +386,6 @@ def test_the_console_script_in_a_narrow_pipe_leaves_one_line_and_no_words_of_a_d
     done = subprocess.run(command, env=NARROW, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done.stderr
     assert str(tmp_path / "flight.mp4") in done.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
-def test_the_console_script_under_ctrl_c(tmp_path):
-    out = tmp_path / "demo"
-    command, pipe = [SCRIPT, "demo", f"--out={out}"], subprocess.PIPE
-    given = {"stderr": pipe, "stdout": pipe, "text": True, "env": NARROW}
-    # A shell that started the tests in the background has it ignored.
-    heeds = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    with subprocess.Popen(command, preexec_fn=heeds, **given) as process:
-        assert process.stderr.readline().startswith("drawing")
-        for _ in range(60):  # as a user does it: C code may swallow the first
-            process.send_signal(signal.SIGINT)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                printed, rest = process.communicate(timeout=2)
-                break
-    assert process.returncode == 130
-    assert printed == ""
-    assert rest.endswith("scenematch: interrupted\n")
-    assert "Traceback" not in rest
 
 
 def test_counts_of_a_result_are_words_for_people(capsys):

@@ -40,13 +40,6 @@ def parsed(words):
     return command.name
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    out = tmp_path_factory.mktemp("a flight")
-    assert run(["simulate", f"--out={out / 'f'}", "--frames=2"]) == 0
-    return out / "f"
-
-
 def test_from_a_flight_to_its_export_by_what_is_said(flight, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = next_of(capsys, ["simulate", f"--out={tmp_path / 'again'}", "--frames=1"])
@@ -66,7 +59,7 @@ def test_others_name_commands_that_exist(flight, capsys):
 def test_check_looks_at_one_frame_in_n_and_names_track(flight, capsys):
     given = ["check", *file_options(flight, surface=None), "--settings=input.every=2"]
     assert run([*given, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["looked_at"] == 1
+    assert json.loads(capsys.readouterr().out)["looked_at"] == 3
     assert parsed(next_of(capsys, given)) == "track"
 
 

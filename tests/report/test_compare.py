@@ -85,10 +85,6 @@ def test_when_the_frames_of_a_log_were_taken_is_said_as_to_track(flight, tmp_pat
     assert run(command(flight, tmp_path, "--settings=input.log_offset_s=2")) == 2  # telemetry.csv is no log
 
 
-def test_the_usual_runs_are_table_one():
-    assert list(parse_runs([])) == ["ncc-paper", "ncc-engine", "sift-paper", "sift-engine"]
-
-
 @pytest.mark.parametrize(
     ("runs", "message"),
     [

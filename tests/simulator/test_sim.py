@@ -5,15 +5,13 @@ import itertools
 import cv2
 import numpy as np
 import pytest
-from pyproj import Proj
 
 from engine.geo import enu_from_body
 from engine.values import Attitude
 from scenematch.simulator import FlightStyle, SensorNoise, World, plan_flight, render_frame
 from scenematch.simulator.light import LIGHTS, sun_visibility
-from scenematch.simulator.render import grid_from_enu
 from scenematch.simulator.vehicle import COURSE_STEP_S, fly_waypoints, leg_accelerations
-from tests.support.patches import CAMERA, EPSG, ORIGIN, TO_GRID, patch_world
+from tests.support.patches import CAMERA, ORIGIN, TO_GRID, patch_world
 from tests.support.towns import drawn_town, under_map
 
 
@@ -42,16 +40,6 @@ def test_supersampling_and_a_rotated_raster_do_not_move_the_picture(sim_town):
     shift, response = cv2.phaseCorrelate(coarse[..., 1].astype(np.float64), fine[..., 1].astype(np.float64))
     assert np.hypot(*shift) < 0.1
     assert response > 0.5
-
-
-def test_the_grid_is_turned_by_the_projections_convergence():
-    factors = Proj(EPSG).get_factors(16.45, 48.25)
-    jacobian = grid_from_enu(EPSG, ORIGIN)
-    assert factors.meridian_convergence == pytest.approx(1.08, abs=0.02)
-    # East of the central meridian true north leans to the left of grid north.
-    north = jacobian @ (0.0, 1.0)
-    assert np.degrees(np.arctan2(-north[0], north[1])) == pytest.approx(factors.meridian_convergence, abs=1e-4)
-    assert np.sqrt(np.linalg.det(jacobian)) == pytest.approx(factors.meridional_scale, abs=1e-7)
 
 
 def test_shadows_fall_away_from_the_sun_and_have_the_right_length():
