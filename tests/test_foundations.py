@@ -1,7 +1,6 @@
 """The ground floor: budget and clock, the device switch, the values that travel, the tree of errors."""
 
 import dataclasses
-import enum
 import math
 import os
 from itertools import combinations
@@ -17,7 +16,7 @@ from engine.errors import DeviceError, DtypeError, EngineError, OptionError, Sha
 from engine.options import NavigatorOptions
 from engine.runtime.device import resolve
 from engine.runtime.threads import set_threads
-from engine.values import Attitude, Fix, Frame, NoFix, Peak, Prior, Reason, Timings, Window
+from engine.values import Attitude, Fix, Frame, NoFix, Peak, Prior, Timings, Window
 from tests.support.fixes import a_fix
 from tests.support.interpreters import done_by
 from tests.support.refusals import refusal
@@ -222,11 +221,6 @@ def test_no_circle_protects_where_the_place_may_be_a_wrong_one(confidence):
 def test_a_risk_is_a_probability(risk):
     with pytest.raises(OptionError, match="risk: expected a probability above 0 and below 1"):
         a_fix(confidence=0.99999).protection_level_m(risk)
-
-
-def test_reasons_are_an_enum_of_their_own_names():
-    assert issubclass(Reason, enum.Enum)
-    assert all(reason.value == reason.name.lower() for reason in Reason)
 
 
 # Errors
