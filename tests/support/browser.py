@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tests.support.waiting import wait_until
+
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-component-update",
     "--disable-sync", "--no-first-run", "--hide-scrollbars",
@@ -138,22 +140,14 @@ def open_browser(gl: tuple[str, ...] = WITHOUT_GL) -> Iterator[Browser]:
 
 @contextmanager
 def serve_recording(recording: Path) -> Iterator[str]:
-    """The address of rerun's viewer in the browser, on loopback, with a recording in it.
-
-    Raises:
-        TimeoutError: it does not begin to listen.
-    """
+    """The address of rerun's viewer in the browser, on loopback, with a recording in it."""
     data_port, page_port = _free_port(), _free_port()
     command = [sys.executable, "-m", "rerun_cli", "--serve-web", "--bind", "127.0.0.1"]
     command += ["--port", str(data_port), "--web-viewer-port", str(page_port), str(recording)]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     server = subprocess.Popen(command, start_new_session=True, **quiet)  # Python starts the server proper
     try:
-        end = time.monotonic() + _PATIENCE_S
-        while not (_listens(page_port) and _listens(data_port)):
-            if time.monotonic() > end or server.poll() is not None:
-                raise TimeoutError("rerun did not begin to listen")
-            time.sleep(0.2)
+        wait_until(lambda: _listens(page_port) and _listens(data_port), _PATIENCE_S)
         source = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
         yield f"http://127.0.0.1:{page_port}/?url={source}&renderer=webgl&hide_welcome_screen=1"
     finally:
