@@ -30,6 +30,7 @@ from scenematch.files.truth import interpolate_truth, read_truth
 from tests.support.commands import file_options
 from tests.support.photos import write_pictures
 from tests.support.refusals import refusal
+from tests.support.subtitles import write_subtitles
 from tests.support.videos import write_video
 
 
@@ -233,22 +234,14 @@ def test_a_list_of_frames_stamps_them(pictures, tmp_path):
     assert "`log_offset_s`" in message
 
 
-FRAME = """{k}
-00:00:{s:02d},{ms:03d} --> 00:00:{s:02d},{ms:03d}
-<font size="28">{count}2023-11-14 22:13:20.123
-[latitude: 32.5000{k:02d}] [longitude: -35.250000] [rel_alt: 80.500 abs_alt: 712.300] {gimbal}</font>
-
-"""
+FRAME = """<font size="28">{count}2023-11-14 22:13:20.123
+[latitude: 32.5000{n:02d}] [longitude: -35.250000] [rel_alt: 80.500 abs_alt: 712.300] {gimbal}</font>"""
 
 
 def subtitles(path, frames=60, count="FrameCnt: {n}, DiffTime: 33ms\n", gimbal="", step_ms=40):
     """Subtitles of a video at 25 Hz, a cue a frame."""
-    cues = []
-    for k in range(frames):
-        s, ms = divmod(step_ms * k, 1000)
-        cues.append(FRAME.format(k=k + 1, s=s, ms=ms, count=count.format(n=k + 1), gimbal=gimbal))
-    path.write_text("".join(cues))
-    return path
+    texts = (FRAME.format(n=n, count=count.format(n=n), gimbal=gimbal) for n in range(1, frames + 1))
+    return write_subtitles(path, texts, step_ms)
 
 
 def extracted(folder, names):

@@ -20,6 +20,7 @@ from scenematch.runs.inputs import check_pictures
 from scenematch.runs.record import RunRecord
 from tests.support.commands import refusal
 from tests.support.photos import gimbal, photograph
+from tests.support.subtitles import write_subtitles
 from tests.support.videos import write_video
 
 UTM, WEST, NORTH = "EPSG:32633", 598_000.0, 5_342_000.0
@@ -211,17 +212,12 @@ def test_a_bridge_that_plays_pictures_takes_a_field_of_view_or_their_own(tmp_pat
         BridgeFiles(map=MapInput("m.tif"), frames=tmp_path).load_camera()
 
 
-def subtitles(heights_m):
-    """A cue each 40 ms."""
-    cue = "{n}\n00:00:00,{ms:03d} --> 00:00:00,{ms:03d}\n[latitude: 48.1] [longitude: 16.2] [rel_alt: {h}]\n\n"
-    return "".join(cue.format(n=k + 1, ms=40 * k, h=height_m) for k, height_m in enumerate(heights_m))
-
-
 def test_one_frame_in_some_keeps_its_own_telemetry(tmp_path):
     """Of a video with a log: pictures, stamps, heights and corrections are those of the frames that are left."""
     path = tmp_path / "DJI_0002.avi"
     write_video(path, [30 * k for k in range(8)])
-    (tmp_path / "DJI_0002.SRT").write_text(subtitles([80.0 + k * k for k in range(8)]))
+    texts = (f"[latitude: 48.1] [longitude: 16.2] [rel_alt: {80.0 + k * k}]" for k in range(8))
+    write_subtitles(tmp_path / "DJI_0002.SRT", texts)
     late = Corrections(offset_s=0.04)  # by one frame, which only all of the rows can say
     named = {"map": "m.tif", "frames": path, "hfov_deg": 70.0}
     whole, part = FlightFiles.from_flat(**named), FlightFiles.from_flat(**named, every=3, corrections=late)
