@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -25,12 +26,24 @@ from engine.navigation.motion import (
 )
 from engine.navigation.odometry import VisualOdometry, odometry_of
 from engine.navigation.repeats import Picture
-from engine.navigation.state import NavigatorState
 from engine.navigation.telemetry_errors import Calibration, TelemetryErrors, considered
 from engine.navigation.tracks import MISS, RELIABLE, Match, Track, Tracks, Weighed
 from engine.options import MatcherOptions, NavigatorOptions
 from engine.orthomap import OrthoMap
 from engine.values import Fix, Frame, NoFix, Prior, Reason
+
+
+class NavigatorState(enum.Enum):
+    """How well a navigator knows the position.
+
+    ``SEARCHING`` before the first fix, ``TRACKING`` if the newest frame gave a fix, ``COASTING`` on dead reckoning
+    since the last fix, ``LOST`` when dead reckoning has become useless.
+    """
+
+    SEARCHING = "searching"
+    TRACKING = "tracking"
+    COASTING = "coasting"
+    LOST = "lost"
 
 
 @dataclass(frozen=True, slots=True)
