@@ -217,20 +217,20 @@ class TelemetryErrors:
         least = SPREAD_SIGMAS * max(assumed, math.sqrt(self._covariance[_HEIGHT, _HEIGHT]))
         return frame if abs(share) <= least else replace(frame, height_agl_m=(1.0 + share) * height_m)
 
-    def note(self, fix: Fix, ground_m: float | None) -> None:
+    def note(self, fix: Fix, height_m: float | None) -> None:
         """Learn from an accepted fix of the newest frame.
 
         Args:
-            fix: an accepted fix. One without a height did not measure its attitude.
-            ground_m: height of the ground below it; None if the ground is assumed flat, where a slope looks like a
-                tilt: nothing is learnt then.
+            fix: an accepted fix.
+            height_m: that it measured above the ground. None if it measured none, and so no attitude, or if the
+                ground is assumed flat, where a slope looks like a tilt: nothing is learnt then.
         """
         self._settling = max(self._settling - 1, 0)
         if self._searched:  # earlier estimates were wrong
             self._searched = False
             self.forget()
         seen, known = fix.attitude, self._angles_deg
-        if fix.up_m is None or ground_m is None:
+        if height_m is None:
             return
         if seen is not None and known is not None and abs(seen.pitch_deg) <= _MAX_PITCH_DEG:
             apart = np.array([seen.roll_deg, seen.pitch_deg, seen.heading_deg]) - known
@@ -238,7 +238,7 @@ class TelemetryErrors:
             sigma_deg = _REFINED_DEG if fix.stage in ("refined", "verified") else _FEATURES_DEG
             self._seen = _Seen(off, sigma_deg)
         if self._height_m is not None:
-            share = (fix.up_m - ground_m) / self._height_m - 1.0
+            share = height_m / self._height_m - 1.0
             noise_m2 = float(fix.covariance_m2[2, 2]) + self._assumed.height_sigma_m(self._height_m) ** 2
             self._update(np.array([share]), np.eye(5)[[_HEIGHT]], np.array([noise_m2 / self._height_m**2]))
             self._heights += 1
