@@ -122,11 +122,6 @@ class Navigator:
         return NavigatorState.TRACKING if self.anchor_age_s == 0.0 else NavigatorState.COASTING
 
     @property
-    def tracking(self) -> bool:
-        """Whether there is a fix to continue from."""
-        return self.state in (NavigatorState.TRACKING, NavigatorState.COASTING)
-
-    @property
     def anchor_age_s(self) -> float | None:
         """Age of the last fix when the newest frame was taken, or None before the first."""
         if self._last is None or self._accepted is None:
@@ -137,7 +132,7 @@ class Navigator:
     def healthy(self) -> bool:
         """Whether the position is based on a fix from the last ``healthy_s`` seconds."""
         age_s = self.anchor_age_s
-        return self.tracking and age_s is not None and age_s <= self._options.healthy_s
+        return age_s is not None and age_s <= self._options.healthy_s and self._frames_lost == 0
 
     @property
     def reset_count(self) -> int:
@@ -317,7 +312,11 @@ class Navigator:
     def _judged(self, fix: Fix, weighed: Weighed, moment: _Moment) -> Fix | NoFix:
         """The fix if there is enough evidence for it; otherwise it is refused."""
         if weighed.log_odds >= needed_nats(self._options.risk):
-            self._accept(fix, weighed.number, moment.time_s)
+            last, self._accepted = self._accepted, _Accepted(fix, moment.time_s, weighed.number)
+            if last is not None and (self._frames_lost or weighed.number != last.number):  # a jump
+                self._resets += 1
+                self._errors.forget()  # what was learnt came from a wrong position
+            self._refusals = self._frames_lost = 0
             return fix
         self._refusals += 1
         best = moment.tracks.best
@@ -332,12 +331,3 @@ class Navigator:
         """Whether a track may contradict a match: a start, or one that gave a fix, if it is not too uncertain."""
         known = track.fix is None or track.log_odds >= needed_nats(self._options.risk)
         return known and not self._is_vague(track)
-
-    def _accept(self, fix: Fix, number: int, time_s: float) -> None:
-        """Continue from this fix, which belongs to an account of this number."""
-        last = self._accepted
-        if last is not None and (self._frames_lost or number != last.number):  # a jump
-            self._resets += 1
-            self._errors.forget()  # what was learnt came from a wrong position
-        self._accepted = _Accepted(fix, time_s, number)
-        self._refusals = self._frames_lost = 0
