@@ -198,10 +198,9 @@ def en_m(fix: Fix) -> Array:
 
 def is_valid(fix: Fix) -> bool:
     """Whether the position is finite and the covariance positive definite."""
-    finite = bool(np.isfinite(fix.covariance_m2).all() and np.isfinite(en_m(fix)).all())
-    if not finite or not np.linalg.eigvalsh(fix.covariance_m2)[0] > 0.0:
-        return False
-    return bool(np.linalg.eigvalsh(fix.relative_covariance_m2)[0] > 0.0)
+    covariances = fix.covariance_m2, fix.relative_covariance_m2
+    is_finite = np.isfinite(fix.covariance_m2).all() and np.isfinite(en_m(fix)).all()
+    return bool(is_finite and all(np.linalg.eigvalsh(each)[0] > 0.0 for each in covariances))
 
 
 def velocity_of(frame: Frame) -> Array | None:

@@ -11,7 +11,8 @@ import numpy as np
 
 from engine.assumed_errors import map_sigma_of
 from engine.budget import Budget, Deadline
-from engine.errors import TelemetryError
+from engine.camera import Camera
+from engine.errors import OptionError, TelemetryError
 from engine.matching.evidence import SEARCHED, needed_nats, probability
 from engine.navigation.motion import (
     GroundMotion,
@@ -22,7 +23,7 @@ from engine.navigation.motion import (
     position_of,
     told_step,
 )
-from engine.navigation.odometry import odometry_of
+from engine.navigation.odometry import VisualOdometry
 from engine.navigation.repeats import Picture
 from engine.navigation.telemetry_errors import Calibration, TelemetryErrors, considered
 from engine.navigation.tracks import MISS, RELIABLE, Match, Track, Tracks, Weighed
@@ -83,7 +84,10 @@ class Navigator:
         matcher: matches single frames.
         start: where the flight begins; None searches the whole map until the first fix.
         budget: of each frame; None sets no limit.
-        options: settings; ``odometry`` needs a matcher with a ``camera``.
+        options: settings.
+
+    Raises:
+        OptionError: odometry was asked for, and the matcher has no ``camera``.
     """
 
     def __init__(
@@ -99,7 +103,11 @@ class Navigator:
         options_of = getattr(matcher, "options", None)
         assumed = options_of.ncc.errors if isinstance(options_of, MatcherOptions) else None
         self._errors = TelemetryErrors(o, assumed)
-        self._pictures = odometry_of(matcher) if o.odometry else None
+        self._camera: Camera | None = getattr(matcher, "camera", None)
+        self._pictures = VisualOdometry(self._camera) if o.odometry and self._camera else None
+        if o.odometry and self._pictures is None:
+            matcher_type = type(matcher).__name__
+            raise OptionError(f"odometry: expected a matcher with a `camera`, got {matcher_type} without")
         self._motion: GroundMotion | None = None  # up to the newest frame
         self._start = None if start is None else position_of(start, matcher.site)
         self._last: _Moment | None = None
@@ -184,7 +192,7 @@ class Navigator:
         left = budget and budget.after(clock.elapsed_ms if self._pictures else 0.0)
         result = self._matcher.locate(self._with_height(shown), searched, left)
         if isinstance(result, Fix):
-            result = considered(result, frame, shown, getattr(self._matcher, "camera", None))
+            result = considered(result, frame, shown, self._camera)
             if not is_valid(result):
                 result = result.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
         tracks = moment.tracks

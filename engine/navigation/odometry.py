@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
-from engine.errors import OptionError
 from engine.geo import larger_variance
 from engine.matching.align import MAX_FIELD_DEG, to_gray
 from engine.matching.pose import AttitudePrior, PoseStart, solve_pose
@@ -178,18 +177,6 @@ class VisualOdometry:
         options = PoseOptions(reprojection_px=_CLOSER_PX)
         closer = solve_pose(ground_m[kept], shown_px[kept], matrix, options, prior=prior, start=start) or pose
         return closer.center_m[:2], _POINTS_PER_ERROR * closer.covariance_center_m2[:2, :2]
-
-
-def odometry_of(matcher: object) -> VisualOdometry:
-    """Odometry with a matcher's camera.
-
-    Raises:
-        OptionError: the matcher has no camera.
-    """
-    camera = getattr(matcher, "camera", None)
-    if not isinstance(camera, Camera):
-        raise OptionError(f"odometry: expected a matcher with a `camera`, got {type(matcher).__name__} without")
-    return VisualOdometry(camera)
 
 
 def track_corners(earlier: Gray, later: Gray, expected: Array) -> tuple[Array, Array]:

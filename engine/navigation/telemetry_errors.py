@@ -32,7 +32,6 @@ _WALK = np.array([0.2, 0.2, 0.5, 1e-3, 0.01])  # standard deviations of the stat
 _REFINED_DEG, _FEATURES_DEG = 0.6, 2.0  # standard deviations of a measured attitude, refined or by features alone
 _MAX_INTERVAL_S = 0.5  # between frames; over longer ones the turn rates are unknown
 _MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
-_MAX_LAG_DEG = 180.0  # timestamps in a wrong unit make rates of any size
 _MIN_SIGMAS = 2.0  # of an angle's error before it is corrected: every frame's matching allows for less
 
 
@@ -166,7 +165,7 @@ class TelemetryErrors:
             is_off = np.abs(self._mean[_ANGLES]) > _MIN_SIGMAS * sigma_deg
             off = off + self._mean[_ANGLES] * is_off
             wider_deg2 = wider_deg2 + variance[_ANGLES] * is_off
-        wider_deg2 = np.minimum(wider_deg2, _MAX_LAG_DEG**2)
+        wider_deg2 = np.minimum(wider_deg2, 180.0**2)  # timestamps in a wrong unit make rates of any size
         if not wider_deg2.any():
             return frame
         roll, pitch, heading = (angles + off).tolist()

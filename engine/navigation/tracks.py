@@ -212,10 +212,10 @@ class Match:
     fix: Fix
     searched_m2: float
     ways: Ways
-    height_m: float | None = None
-    refusals: int = 0
-    given: PositionEstimate | None = None
-    is_about_given: bool = False
+    height_m: float | None
+    refusals: int
+    given: PositionEstimate | None
+    is_about_given: bool
 
     @property
     def support(self) -> float:

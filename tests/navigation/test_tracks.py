@@ -47,7 +47,8 @@ def position_and_velocity(track):
 
 def match(fix, searched_m2=AREA_M2, *, told=None, seen=None, **known):
     """A match a fifth of a second after the frame before."""
-    return Match(fix, searched_m2, Ways(0.2, told, seen), **known)
+    usual = {"height_m": None, "refusals": 0, "given": None, "is_about_given": False}
+    return Match(fix, searched_m2, Ways(0.2, told, seen), **(usual | known))
 
 
 # Motion
