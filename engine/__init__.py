@@ -15,8 +15,7 @@ _NAMES = {
     "engine.navigation.live": "Answer Live LiveOptions",
     "engine.matching.matcher": "SceneMatcher",
     "engine.options": "LearnedOptions MatcherOptions NavigatorOptions NccOptions PoseOptions SiftOptions",
-    "engine.navigation.navigator": "Navigator",
-    "engine.navigation.state": "NavigatorState",
+    "engine.navigation.navigator": "Navigator NavigatorState",
     "engine.orthomap": "OrthoMap",
     "engine.runtime.realtime": "Realtime set_realtime",
     "engine.values": "Attitude Fix Frame NoFix Prior Reason Timings Window",
@@ -47,7 +46,7 @@ if TYPE_CHECKING:  # the same names for type checkers; `as` makes them public
     from engine.navigation.live import Live as Live
     from engine.navigation.live import LiveOptions as LiveOptions
     from engine.navigation.navigator import Navigator as Navigator
-    from engine.navigation.state import NavigatorState as NavigatorState
+    from engine.navigation.navigator import NavigatorState as NavigatorState
     from engine.options import LearnedOptions as LearnedOptions
     from engine.options import MatcherOptions as MatcherOptions
     from engine.options import NavigatorOptions as NavigatorOptions

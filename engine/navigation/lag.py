@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
 from engine.geo import enu_from_body
-from engine.navigation.odometry import small_shift
+from engine.navigation.odometry import picture_shift
 
 Array = NDArray[np.float64]
 
@@ -39,8 +39,7 @@ def turn_between(first: NDArray[np.uint8], second: NDArray[np.uint8], focal_px: 
     Returns:
         Radians.
     """
-    shift, (width, _) = small_shift(first, second)
-    return math.atan2(math.hypot(*shift), focal_px * (width / first.shape[1]))
+    return math.atan2(math.hypot(*picture_shift(first, second)), focal_px)
 
 
 def camera_lag(times_s: Array, turns_rad: Array, attitude: Array, mount: Array, max_lag_s: float = 0.6) -> Lag:

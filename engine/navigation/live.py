@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from functools import partial
 
 from engine.budget import Budget
-from engine.errors import EngineError, OptionError, StateError
+from engine.errors import EngineError, StateError
 from engine.navigation.navigator import Navigator
 from engine.runtime.realtime import Realtime, check_realtime, start_thread
-from engine.values import Fix, Frame, NoFix, Prior, Reason, Result, check_positive
+from engine.values import Fix, Frame, NoFix, Prior, Reason, Result, check, check_positive
 
 _log = logging.getLogger("scenematch")
 
@@ -45,8 +45,7 @@ class LiveOptions:
     def __post_init__(self) -> None:
         check_positive(self, "deadline_ms", "patience_ms")
         for name in ("deadline_ms", "patience_ms"):
-            if getattr(self, name) > _MAX_MS:
-                raise OptionError(f"{name}: expected at most {_MAX_MS:g}, got {getattr(self, name):g}")
+            check(self, name, f"at most {_MAX_MS:g}", lambda wait_ms: wait_ms <= _MAX_MS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +93,6 @@ class Live:
         start: where the flight begins.
         options: settings.
         clock_ns: clock of the frames' capture and age, such as a simulator's; None is ``time.monotonic_ns``.
-        machine_ns: clock that detects a hanging worker; None is the same.
 
     Raises:
         OptionError, BackendError: real time was requested, and the system is not Linux or does not permit it.
@@ -111,11 +109,9 @@ class Live:
         start: Prior | None = None,
         options: LiveOptions | None = None,
         clock_ns: Callable[[], int] | None = None,
-        machine_ns: Callable[[], int] | None = None,
     ) -> None:
         self._make_navigator, self._deliver = make_navigator, deliver
         self._options, self._clock_ns = options or LiveOptions(), clock_ns or time.monotonic_ns
-        self._machine_ns = machine_ns or time.monotonic_ns
         self._last: tuple[Fix, int, Navigator] | None = None  # its capture, and whose it is
         self._anew: Prior | None = None  # where a new navigator was asked to start
         self._changed = threading.Condition()
@@ -147,7 +143,7 @@ class Live:
         Raises:
             StateError: the pipeline was closed.
         """
-        job = _Job(frame, prior, self._clock_ns() if captured_ns is None else captured_ns, self._machine_ns())
+        job = _Job(frame, prior, self._clock_ns() if captured_ns is None else captured_ns, time.monotonic_ns())
         with self._changed:
             if self._closed:
                 raise StateError("submit: expected an open pipeline, got one that was closed")
@@ -255,25 +251,30 @@ class Live:
                     return
                 jobs = [job for job in (self._working, self._waiting) if job is not None and not job.answered]
                 due = [job for job in jobs if self._age_ms(job) >= self._options.deadline_ms]
-                hangs_in_ms, number = self._hangs_in_ms(), self._number
-                hung = hangs_in_ms <= 0
+                hangs_in_ms = self._hangs_in_ms()
+                replaces = hangs_in_ms <= 0 and not self._closed
                 if self._waiting in due:
                     self._waiting = None
-                if not due and not hung:
+                if hangs_in_ms <= 0:  # it is abandoned: its results are ignored
+                    self._working = None
+                    self._number += replaces
+                    self._counts["workers_replaced"] += replaces
+                    self._changed.notify_all()
+                elif not due:
                     left_ms = min([hangs_in_ms, *(self._options.deadline_ms - self._age_ms(job) for job in jobs)])
                     wait_s = min(max(left_ms, 0.0) * 1e-3, _LOOK_S)
                     self._changed.wait(wait_s if math.isfinite(left_ms) else None)
                     continue
             for job in due:
                 self._answer(job, _refusal(job, Reason.LATE, "no answer by the deadline"))
-            if hung:
-                self._replace(number)
+            if replaces:
+                self._start_thread(self._work, None, self._number)
 
     def _hangs_in_ms(self) -> float:
         """Time until the worker counts as hanging on a frame that was answered without it."""
         if self._working is None or not self._working.answered:
             return math.inf
-        since_ns = self._machine_ns() - self._working.submitted_ns
+        since_ns = time.monotonic_ns() - self._working.submitted_ns
         return self._options.deadline_ms + self._options.patience_ms - since_ns * 1e-6
 
     def _answer(self, job: _Job, result: Result) -> None:
@@ -294,17 +295,6 @@ class Live:
                 self._deliver(Answer(job.frame, result, age_ms))
             except Exception:  # an error in the receiver must not stop the answers
                 _log.exception("deliver failed")
-
-    def _replace(self, number: int) -> None:
-        """Abandon a worker that hangs, and start another."""
-        with self._changed:
-            self._working = None
-            self._changed.notify_all()
-            if self._closed:
-                return
-            self._number += 1
-            self._counts["workers_replaced"] += 1
-        self._start_thread(self._work, None, number + 1)
 
     def _resume(self) -> Prior | None:
         """Where a new worker starts: at the last fix, widened by how far the vehicle may have moved since."""

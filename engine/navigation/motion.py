@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engine.errors import TelemetryError
 from engine.geo import chi_square, larger_variance
 from engine.options import NavigatorOptions
 from engine.orthomap import OrthoMap
@@ -81,70 +80,16 @@ class GroundMotion:
         lasting_m2 = self.lasting_share**2 * float(self.moved_m @ self.moved_m)
         return np.asarray((self.noise_m2 + lasting_m2 * np.eye(2)) / self.interval_s**2)
 
-    def step(self, begin_mps: Array | None) -> Step:
-        """The way of this motion.
+    def step(self, before: Step | None) -> Step:
+        """The way of this motion, whose lasting error is a share of the velocity.
 
         Args:
-            begin_mps: (2,) velocity up to the earlier picture, if it was measured.
-
-        Returns:
-            Step: its lasting error is a share of the velocity.
+            before: the step up to the earlier picture; None if it was not measured.
         """
+        begin_mps = None if before is None else before.end_mps
         sigma_mps = self.lasting_share * float(np.hypot(*self.velocity_mps))
         noise_m2 = self.drift * larger_variance(self.noise_m2)
         return Step(self.moved_m, begin_mps, self.velocity_mps, sigma_mps, noise_m2)
-
-
-class FrameClock:
-    """Times the frames and integrates the telemetry's velocity between them.
-
-    Args:
-        options: of the navigator.
-    """
-
-    def __init__(self, options: NavigatorOptions) -> None:
-        self._options = options
-        self._newest_ns: int | None = None
-        self._told_mps: Array | None = None  # with the newest frame
-
-    def interval_s(self, frame: Frame) -> float:
-        """Time from the newest frame to this one.
-
-        Raises:
-            TelemetryError: it is not newer.
-        """
-        stamp, newest = frame.timestamp_ns, self._newest_ns
-        if stamp is None or newest is None:
-            return self._options.default_interval_s
-        if stamp <= newest:
-            raise TelemetryError(f"timestamp_ns: expected later than the last frame's {newest}, got {stamp}")
-        return (stamp - newest) * 1e-9
-
-    def told(self, frame: Frame) -> Step | None:
-        """The way to a new frame by the velocities that came with it and with the newest.
-
-        Between the two the velocity walks at random, by the vehicle's acceleration.
-        """
-        end_mps, begin_mps = velocity_of(frame), self._told_mps
-        if end_mps is None:
-            return None
-        interval_s, mean_mps, changes = self.interval_s(frame), end_mps, 3.0
-        if begin_mps is not None:
-            mean_mps, changes = 0.5 * (begin_mps + end_mps), 12.0
-        between_m2 = self._options.acceleration_mps2**2 * interval_s**3 / changes  # of a walk between known ends
-        between_m2 += 2.0 * self._options.attitude_jitter_s**2 * float(mean_mps @ mean_mps)  # both stamps are off
-        return Step(mean_mps * interval_s, begin_mps, end_mps, self.sigma_mps(frame), between_m2)
-
-    def sigma_mps(self, frame: Frame) -> float:
-        """Standard deviation of the frame's velocity."""
-        stated = frame.velocity_sigma_mps
-        return self._options.measured_velocity_sigma_mps if stated is None else stated
-
-    def append(self, frame: Frame) -> None:
-        """Add a frame that was matched."""
-        if frame.timestamp_ns is not None:
-            self._newest_ns = frame.timestamp_ns
-        self._told_mps = velocity_of(frame)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,10 +115,8 @@ class PositionEstimate:
         Returns:
             (2, 2) square metres, east and north.
         """
-        covariance_m2 = fix.relative_covariance_m2 if self.on_map else fix.covariance_m2[:2, :2].copy()
-        covariance_m2[0, 0] += self.sigma_m**2
-        covariance_m2[1, 1] += self.sigma_m**2
-        return covariance_m2
+        covariance_m2 = fix.relative_covariance_m2 if self.on_map else fix.covariance_m2[:2, :2]
+        return covariance_m2 + self.sigma_m**2 * np.eye(2)
 
     def spread_m2(self, fix: Fix) -> float:
         """Area of the Gaussian of the difference to a fix: where both agree, its density is one over it."""
@@ -255,10 +198,9 @@ def en_m(fix: Fix) -> Array:
 
 def is_valid(fix: Fix) -> bool:
     """Whether the position is finite and the covariance positive definite."""
-    finite = bool(np.isfinite(fix.covariance_m2).all() and np.isfinite(en_m(fix)).all())
-    if not finite or not np.linalg.eigvalsh(fix.covariance_m2)[0] > 0.0:
-        return False
-    return bool(np.linalg.eigvalsh(fix.relative_covariance_m2)[0] > 0.0)
+    covariances = fix.covariance_m2, fix.relative_covariance_m2
+    is_finite = np.isfinite(fix.covariance_m2).all() and np.isfinite(en_m(fix)).all()
+    return bool(is_finite and all(np.linalg.eigvalsh(each)[0] > 0.0 for each in covariances))
 
 
 def velocity_of(frame: Frame) -> Array | None:
@@ -273,3 +215,27 @@ def velocity_of(frame: Frame) -> Array | None:
     if frame.east_velocity_mps is None or frame.north_velocity_mps is None:
         return None
     return np.array([frame.east_velocity_mps, frame.north_velocity_mps])
+
+
+def told_step(before: Step | None, frame: Frame, interval_s: float, options: NavigatorOptions) -> Step | None:
+    """The way to a frame by the velocities that came with it and with the one before.
+
+    Between the two the velocity walks at random, by the vehicle's acceleration.
+
+    Args:
+        before: the step to the frame before; None if it came without a velocity.
+        frame: the later one.
+        interval_s: between them.
+        options: of the navigator.
+
+    Returns:
+        Step | None: None if the later frame came without a velocity.
+    """
+    end_mps, begin_mps = velocity_of(frame), None if before is None else before.end_mps
+    if end_mps is None:
+        return None
+    mean_mps, changes = (end_mps, 3.0) if begin_mps is None else (0.5 * (begin_mps + end_mps), 12.0)
+    between_m2 = options.acceleration_mps2**2 * interval_s**3 / changes  # of a walk between known ends
+    between_m2 += 2.0 * options.attitude_jitter_s**2 * float(mean_mps @ mean_mps)  # both stamps are off
+    sigma_mps = frame.velocity_sigma_mps or options.measured_velocity_sigma_mps
+    return Step(mean_mps * interval_s, begin_mps, end_mps, sigma_mps, between_m2)

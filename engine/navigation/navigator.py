@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -10,22 +11,20 @@ import numpy as np
 
 from engine.assumed_errors import map_sigma_of
 from engine.budget import Budget, Deadline
+from engine.camera import Camera
+from engine.errors import OptionError, TelemetryError
 from engine.matching.evidence import SEARCHED, needed_nats, probability
 from engine.navigation.motion import (
-    Array,
-    FrameClock,
     GroundMotion,
     PositionEstimate,
-    Step,
     Ways,
     en_m,
     is_valid,
     position_of,
-    velocity_of,
+    told_step,
 )
-from engine.navigation.odometry import VisualOdometry, odometry_of
+from engine.navigation.odometry import VisualOdometry
 from engine.navigation.repeats import Picture
-from engine.navigation.state import NavigatorState
 from engine.navigation.telemetry_errors import Calibration, TelemetryErrors, considered
 from engine.navigation.tracks import MISS, RELIABLE, Match, Track, Tracks, Weighed
 from engine.options import MatcherOptions, NavigatorOptions
@@ -33,11 +32,25 @@ from engine.orthomap import OrthoMap
 from engine.values import Fix, Frame, NoFix, Prior, Reason
 
 
+class NavigatorState(enum.Enum):
+    """How well a navigator knows the position.
+
+    ``SEARCHING`` before the first fix, ``TRACKING`` if the newest frame gave a fix, ``COASTING`` on dead reckoning
+    since the last fix, ``LOST`` when dead reckoning has become useless.
+    """
+
+    SEARCHING = "searching"
+    TRACKING = "tracking"
+    COASTING = "coasting"
+    LOST = "lost"
+
+
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    """The flight at one frame: its time, the way to it, its picture, and the tracks after it."""
+    """The flight at one frame: its time and newest stamp, the ways to it, its picture, and the tracks after it."""
 
     time_s: float
+    stamp_ns: int | None
     ways: Ways
     picture: Picture
     tracks: Tracks
@@ -71,7 +84,10 @@ class Navigator:
         matcher: matches single frames.
         start: where the flight begins; None searches the whole map until the first fix.
         budget: of each frame; None sets no limit.
-        options: settings; ``odometry`` needs a matcher with a ``camera``.
+        options: settings.
+
+    Raises:
+        OptionError: odometry was asked for, and the matcher has no ``camera``.
     """
 
     def __init__(
@@ -84,17 +100,19 @@ class Navigator:
         self._matcher = matcher
         self._budget = budget
         self._options = o = options or NavigatorOptions()
-        self._clock = FrameClock(o)
         options_of = getattr(matcher, "options", None)
         assumed = options_of.ncc.errors if isinstance(options_of, MatcherOptions) else None
         self._errors = TelemetryErrors(o, assumed)
-        self._pictures = odometry_of(matcher) if o.odometry else None
+        self._camera: Camera | None = getattr(matcher, "camera", None)
+        self._pictures = VisualOdometry(self._camera) if o.odometry and self._camera else None
+        if o.odometry and self._pictures is None:
+            matcher_type = type(matcher).__name__
+            raise OptionError(f"odometry: expected a matcher with a `camera`, got {matcher_type} without")
         self._motion: GroundMotion | None = None  # up to the newest frame
         self._start = None if start is None else position_of(start, matcher.site)
         self._last: _Moment | None = None
         self._accepted: _Accepted | None = None
         self._refusals = self._frames_lost = 0  # in a row
-        self._fixed = self._lost = False  # whether the newest frame was fixed; whether the flight is lost
         self._resets = 0
 
     @property
@@ -107,14 +125,9 @@ class Navigator:
         """How well the position is known after the last frame."""
         if self._accepted is None:
             return NavigatorState.SEARCHING
-        if self._lost:
+        if self._frames_lost:
             return NavigatorState.LOST
-        return NavigatorState.TRACKING if self._fixed else NavigatorState.COASTING
-
-    @property
-    def tracking(self) -> bool:
-        """Whether there is a fix to continue from."""
-        return self.state in (NavigatorState.TRACKING, NavigatorState.COASTING)
+        return NavigatorState.TRACKING if self.anchor_age_s == 0.0 else NavigatorState.COASTING
 
     @property
     def anchor_age_s(self) -> float | None:
@@ -127,7 +140,7 @@ class Navigator:
     def healthy(self) -> bool:
         """Whether the position is based on a fix from the last ``healthy_s`` seconds."""
         age_s = self.anchor_age_s
-        return self.tracking and age_s is not None and age_s <= self._options.healthy_s
+        return age_s is not None and age_s <= self._options.healthy_s and self._frames_lost == 0
 
     @property
     def reset_count(self) -> int:
@@ -172,62 +185,79 @@ class Navigator:
         moment = self._next(frame)
         repeated = moment.picture.refusal(frame)
         if repeated is not None:
-            self._take(frame, moment, is_fixed=False)
+            self._take(moment)
             return repeated
         searched, is_given = self._searched(moment.tracks, prior)
         shown = self._errors.corrected(frame, moment.time_s, self._refusals)
         left = budget and budget.after(clock.elapsed_ms if self._pictures else 0.0)
         result = self._matcher.locate(self._with_height(shown), searched, left)
         if isinstance(result, Fix):
-            result = considered(result, frame, shown, getattr(self._matcher, "camera", None))
+            result = considered(result, frame, shown, self._camera)
             if not is_valid(result):
                 result = result.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
         tracks = moment.tracks
         if isinstance(result, Fix):
-            given = None if prior is None else position_of(prior, self._matcher.site)
-            match = self._match(result, frame, moment.ways.seen, searched, given, is_about_given=is_given)
-            weighed = tracks.weighed(match)
+            weighed = tracks.weighed(self._match(result, frame, moment.ways, searched, prior, is_given=is_given))
             result, tracks = self._judged(result, weighed, moment), weighed.tracks
         elif result.reason is not Reason.LATE:  # a lack of time is no evidence about the position
             self._refusals += 1
             tracks = tracks.missed()
         if isinstance(result, Fix):
-            self._errors.note(result, self._ground_below(result))
-        self._take(frame, replace(moment, tracks=tracks), is_fixed=isinstance(result, Fix))
+            self._errors.note(result, self._height_of(result) if self._matcher.site.has_surface else None)
+        self._take(replace(moment, tracks=tracks))
         return result
 
     # ------------------------------------------------------------------------------------------ predictions
 
-    def _seen_motion(self, pictures: VisualOdometry, frame: Frame) -> GroundMotion | None:
+    def _interval_s(self, frame: Frame) -> float:
+        """Time from the newest frame to this one.
+
+        Raises:
+            TelemetryError: it is not newer.
+        """
+        stamp, newest = frame.timestamp_ns, None if self._last is None else self._last.stamp_ns
+        if stamp is None or newest is None:
+            return self._options.default_interval_s
+        if stamp <= newest:
+            raise TelemetryError(f"timestamp_ns: expected later than the last frame's {newest}, got {stamp}")
+        return (stamp - newest) * 1e-9
+
+    def _seen_motion(self, frame: Frame) -> GroundMotion | None:
         """How far the vehicle moved since the last frame, if the pictures show it."""
-        motion = pictures.update(self._with_height(self._errors.without_errors(frame)))
+        if self._pictures is None:
+            return None
+        motion = self._pictures.update(self._with_height(self._errors.without_errors(frame)))
         return motion if isinstance(motion, GroundMotion) else None
 
     def _next(self, frame: Frame) -> _Moment:
         """A new frame, by what was known before."""
-        interval_s, last = self._clock.interval_s(frame), self._last
-        self._motion = motion = None if self._pictures is None else self._seen_motion(self._pictures, frame)
+        interval_s, last, stamp_ns = self._interval_s(frame), self._last, frame.timestamp_ns
+        self._motion = motion = self._seen_motion(frame)
         if last is None:
-            tracks, start = Tracks(self._options), self._start
-            begun = tracks.begun(start, self._velocity(frame)) if start else tracks
-            return _Moment(0.0, Ways(0.0), Picture.of(frame), begun)
+            ways, tracks = Ways(0.0, told_step(None, frame, 0.0, self._options)), Tracks(self._options)
+            begun = tracks.begun(self._start, ways) if self._start else tracks
+            return _Moment(0.0, stamp_ns, ways, Picture.of(frame), begun)
         seen = None
         if motion is not None and math.isclose(motion.interval_s, interval_s, abs_tol=1e-6):
-            seen = motion.step(None if last.ways.seen is None else last.ways.seen.end_mps)
-        ways = Ways(interval_s, self._clock.told(frame), seen)  # not seen if a frame in between failed
-        return _Moment(last.time_s + interval_s, ways, last.picture.next(frame, ways), last.tracks.carried(ways))
+            seen = motion.step(last.ways.seen)  # not seen if a frame in between failed
+        ways = Ways(interval_s, told_step(last.ways.told, frame, interval_s, self._options), seen)
+        return _Moment(
+            last.time_s + interval_s,
+            last.stamp_ns if stamp_ns is None else stamp_ns,
+            ways,
+            last.picture.next(frame, ways),
+            last.tracks.carried(ways),
+        )
 
-    def _take(self, frame: Frame, moment: _Moment, *, is_fixed: bool) -> None:
+    def _take(self, moment: _Moment) -> None:
         """Continue from a frame, and declare the flight lost after too many refusals or too much uncertainty."""
-        self._clock.append(frame)
-        self._last, self._fixed = moment, is_fixed
-        track = moment.tracks.best
-        if is_fixed or track is None:
+        self._last, track = moment, moment.tracks.best
+        if self.anchor_age_s == 0.0 or track is None:
             return
-        self._frames_lost += self._lost
-        if not self._lost and (track.is_lost or self._is_vague(track)):
-            self._lost = True
-            self._errors.forget()  # a wrong or outdated bias would keep frames refused
+        if self._frames_lost or track.is_lost or self._is_vague(track):
+            if not self._frames_lost:
+                self._errors.forget()  # a wrong or outdated bias would keep frames refused
+            self._frames_lost += 1
 
     def _searched(self, tracks: Tracks, prior: Prior | None) -> tuple[Prior | None, bool]:
         """Where the matcher searches: about the best track, or the other source if that is tighter (True)."""
@@ -242,7 +272,8 @@ class Navigator:
     def _leads_nowhere(self, track: Track) -> bool:
         """Whether the whole map is searched instead: if the flight is lost, in turns."""
         vague = self._is_vague(track)
-        return self._lost and (vague or track.is_lost) and self._is_turn(0 if vague else self._frames_lost)
+        is_hopeless = self._frames_lost > 0 and (vague or track.is_lost)
+        return is_hopeless and self._is_turn(0 if vague else self._frames_lost - 1)
 
     def _is_vague(self, track: Track) -> bool:
         """Whether a track is too uncertain to lead a search, or to contradict a match."""
@@ -252,15 +283,9 @@ class Navigator:
         """Whether this frame, of those without a useful prediction, searches the whole map: every second does."""
         return self._matcher.site.is_searchable and count % 2 == 0
 
-    def _ground_below(self, fix: Fix) -> float | None:
-        """Height of the ground below a fix that measured its height; None if the ground is assumed flat."""
-        site = self._matcher.site
-        known = fix.up_m is not None and site.has_surface
-        return float(site.ground_at(np.array(fix.map_xy_px))) if known else None
-
     def _with_height(self, frame: Frame) -> Frame:
         """The frame, with the last fix's height if it came without one."""
-        if frame.height_agl_m is not None or self._accepted is None or self._lost:
+        if frame.height_agl_m is not None or self._accepted is None or self._frames_lost:
             return frame
         return replace(frame, height_agl_m=self._height_of(self._accepted.fix))
 
@@ -268,8 +293,7 @@ class Navigator:
         """Height above the ground, if the fix measured it."""
         if fix.up_m is None:
             return None
-        site = self._matcher.site
-        height_m = float(fix.up_m - site.ground_at(site.pixel_from_enu(en_m(fix))))
+        height_m = float(fix.up_m - self._matcher.site.ground_at(np.array(fix.map_xy_px)))
         return height_m if height_m > 0.0 else None
 
     # ---------------------------------------------------------------------------------------------- acceptance
@@ -278,30 +302,29 @@ class Navigator:
         self,
         fix: Fix,
         frame: Frame,
-        seen: Step | None,
+        ways: Ways,
         searched: Prior | None,
-        given: PositionEstimate | None,
+        prior: Prior | None,
         *,
-        is_about_given: bool,
+        is_given: bool,
     ) -> Match:
         """A match, with what it is to be judged by."""
         about = PositionEstimate(en_m(fix), 0.0 if searched is None else searched.sigma_m, on_map=True)
         area_m2 = SEARCHED * about.spread_m2(fix)
         if searched is None or fix.confidence is None:  # without a confidence it has not weighed the prior
             area_m2 = max(area_m2, fix.window.area_px * self._matcher.site.gsd_m_per_px**2)
-        velocity = self._velocity(frame)
         height_m = frame.height_agl_m or self._height_of(fix)
-        return Match(fix, area_m2, height_m, velocity, seen, self._refusals, given, is_about_given)
-
-    def _velocity(self, frame: Frame) -> tuple[Array, float] | None:
-        """The frame's velocity and its standard deviation."""
-        told_mps = velocity_of(frame)
-        return None if told_mps is None else (told_mps, self._clock.sigma_mps(frame))
+        given = None if prior is None else position_of(prior, self._matcher.site)
+        return Match(fix, area_m2, ways, height_m, self._refusals, given, is_given)
 
     def _judged(self, fix: Fix, weighed: Weighed, moment: _Moment) -> Fix | NoFix:
         """The fix if there is enough evidence for it; otherwise it is refused."""
         if weighed.log_odds >= needed_nats(self._options.risk):
-            self._accept(fix, weighed.number, moment.time_s)
+            last, self._accepted = self._accepted, _Accepted(fix, moment.time_s, weighed.number)
+            if last is not None and (self._frames_lost or weighed.number != last.number):  # a jump
+                self._resets += 1
+                self._errors.forget()  # what was learnt came from a wrong position
+            self._refusals = self._frames_lost = 0
             return fix
         self._refusals += 1
         best = moment.tracks.best
@@ -316,12 +339,3 @@ class Navigator:
         """Whether a track may contradict a match: a start, or one that gave a fix, if it is not too uncertain."""
         known = track.fix is None or track.log_odds >= needed_nats(self._options.risk)
         return known and not self._is_vague(track)
-
-    def _accept(self, fix: Fix, number: int, time_s: float) -> None:
-        """Continue from this fix, which belongs to an account of this number."""
-        last = self._accepted
-        if last is not None and (self._lost or number != last.number):  # a jump
-            self._resets += 1
-            self._errors.forget()  # what was learnt came from a wrong position
-        self._accepted = _Accepted(fix, time_s, number)
-        self._refusals, self._frames_lost, self._lost = 0, 0, False

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
-from engine.errors import OptionError
 from engine.geo import larger_variance
 from engine.matching.align import MAX_FIELD_DEG, to_gray
 from engine.matching.pose import AttitudePrior, PoseStart, solve_pose
@@ -52,12 +51,6 @@ class NoMotion:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Picture:
-    frame: Frame
-    gray: Gray
-
-
 class VisualOdometry:
     """Follows the ground from picture to picture.
 
@@ -72,7 +65,7 @@ class VisualOdometry:
         from engine.kernels import clusters, pose_fit  # noqa: F401  # loaded before the flight: it takes a while
 
         self._given, self._camera = camera, camera.scaled_to(width, height)
-        self._last: _Picture | None = None
+        self._last: tuple[Frame, Gray] | None = None
         self._velocity_mps: Array | None = None  # (3,) expected in the next step
 
     def update(self, frame: Frame) -> GroundMotion | NoMotion:
@@ -91,19 +84,18 @@ class VisualOdometry:
         self._given.check_size(frame.image.shape)
         size = self._camera.width_px, self._camera.height_px
         gray = cv2.resize(to_gray(frame), size, interpolation=cv2.INTER_AREA)  # a copy: the buffer may be reused
-        last, self._last = self._last, _Picture(frame, gray)
+        last, self._last = self._last, (frame, gray)
         if velocity_of(frame) is not None:
             motion: GroundMotion | NoMotion = NoMotion("the velocity is known")
         elif last is None:
             motion = NoMotion("there is no picture before")
         else:
-            motion = self._between(last, self._last)
+            motion = self._between(*last, frame, gray)
         self._velocity_mps = np.append(motion.velocity_mps, 0.0) if isinstance(motion, GroundMotion) else None
         return motion
 
-    def _between(self, last: _Picture, now: _Picture) -> GroundMotion | NoMotion:
-        """The motion from one picture to the next."""
-        earlier, later = last.frame, now.frame
+    def _between(self, earlier: Frame, before: Gray, later: Frame, now: Gray) -> GroundMotion | NoMotion:
+        """The motion from one frame and its picture to the next."""
         if earlier.timestamp_ns is None or later.timestamp_ns is None:
             return NoMotion("a frame has no timestamp")
         interval_s = (later.timestamp_ns - earlier.timestamp_ns) * 1e-9
@@ -112,7 +104,7 @@ class VisualOdometry:
         height_m, begin, end = earlier.height_agl_m, earlier.attitude, later.attitude
         if height_m is None or begin is None or end is None:
             return NoMotion("height or heading is unknown")
-        if np.array_equal(last.gray, now.gray):
+        if np.array_equal(before, now):
             self._last = None  # its timestamp is wrong, so the next interval would be too
             return NoMotion("the picture repeats the last one")
         errors = AssumedErrors().of_frame(later)
@@ -121,8 +113,8 @@ class VisualOdometry:
         axes = self._camera.enu_from_camera(begin), self._camera.enu_from_camera(end)
         expected = self._homography(*axes, moved_m / height_m)
         if self._velocity_mps is None:
-            expected = _shifted(last.gray, now.gray, expected)
-        points = track_corners(last.gray, now.gray, expected)
+            expected = _shifted(before, now, expected)
+        points = track_corners(before, now, expected)
         turn_deg = math.sqrt(2.0) * np.array([errors.tilt_deg, errors.tilt_deg, errors.heading_deg])  # of both
         if None in (earlier.roll_deg, earlier.pitch_deg, later.roll_deg, later.pitch_deg):
             turn_deg[:2] = _LEVEL_DEG
@@ -187,18 +179,6 @@ class VisualOdometry:
         return closer.center_m[:2], _POINTS_PER_ERROR * closer.covariance_center_m2[:2, :2]
 
 
-def odometry_of(matcher: object) -> VisualOdometry:
-    """Odometry with a matcher's camera.
-
-    Raises:
-        OptionError: the matcher has no camera.
-    """
-    camera = getattr(matcher, "camera", None)
-    if not isinstance(camera, Camera):
-        raise OptionError(f"odometry: expected a matcher with a `camera`, got {type(matcher).__name__} without")
-    return VisualOdometry(camera)
-
-
 def track_corners(earlier: Gray, later: Gray, expected: Array) -> tuple[Array, Array]:
     """Corners of one picture, and where another shows them, by Lucas-Kanade.
 
@@ -230,13 +210,12 @@ def track_corners(earlier: Gray, later: Gray, expected: Array) -> tuple[Array, A
 def _shifted(earlier: Gray, later: Gray, expected: Array) -> Array:
     """The expected homography and the shift that small pictures show beyond it, by phase correlation."""
     shown = cv2.warpPerspective(earlier, expected, later.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
-    (right, down), (width, height) = small_shift(shown, later)
     shift = np.eye(3)
-    shift[:2, 2] = right * later.shape[1] / width, down * later.shape[0] / height
+    shift[:2, 2] = picture_shift(shown, later)
     return np.asarray(shift @ expected)
 
 
-def small_shift(first: Gray, second: Gray) -> tuple[tuple[float, float], tuple[int, int]]:
+def picture_shift(first: Gray, second: Gray) -> tuple[float, float]:
     """The shift from one picture to another by phase correlation of both at a small size.
 
     Args:
@@ -244,9 +223,10 @@ def small_shift(first: Gray, second: Gray) -> tuple[tuple[float, float], tuple[i
         second: the same.
 
     Returns:
-        Pixels right and down at the small size; and its width and height.
+        Pixels right and down.
     """
-    size = (_SMALL_PX, max(8, round(second.shape[0] * _SMALL_PX / second.shape[1])))
+    height, width = second.shape
+    size = (_SMALL_PX, max(8, round(height * _SMALL_PX / width)))
     small = [cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32) for gray in (first, second)]
     (right, down), _ = cv2.phaseCorrelate(*small, cv2.createHanningWindow(size, cv2.CV_32F))
-    return (right, down), size
+    return right * width / size[0], down * height / size[1]

@@ -21,12 +21,12 @@ class Picture:
     Attributes:
         digest: of its pixels.
         since_s: time since then.
-        moved_m: (2,) way since then, east and north; None if it was not measured.
+        moved_m: (2,) way since then, east and north; NaN if it was not measured.
     """
 
     digest: tuple[object, ...]
     since_s: float
-    moved_m: Array | None
+    moved_m: Array
 
     @classmethod
     def of(cls, frame: Frame) -> Picture:
@@ -38,13 +38,13 @@ class Picture:
         new, step = Picture.of(frame), ways.told or ways.seen
         if new.digest != self.digest:
             return new
-        moved_m = None if step is None or self.moved_m is None else self.moved_m + step.moved_m
-        return Picture(self.digest, self.since_s + ways.interval_s, moved_m)
+        way_m = np.full(2, np.nan) if step is None else step.moved_m
+        return Picture(self.digest, self.since_s + ways.interval_s, self.moved_m + way_m)
 
     def refusal(self, frame: Frame) -> NoFix | None:
         """Refuse a frame that repeats it although the vehicle has moved since; else None."""
-        moved_m = 0.0 if self.moved_m is None else float(np.hypot(*self.moved_m))
-        if moved_m < _MIN_M:
+        moved_m = float(np.hypot(*self.moved_m))
+        if not moved_m >= _MIN_M:
             return None
         detail = f"the picture repeats the one {self.since_s:.1f} s and {moved_m:.1f} m ago"
         return NoFix(reason=Reason.FAILED, detail=detail, timestamp_ns=frame.timestamp_ns)

@@ -32,7 +32,6 @@ _WALK = np.array([0.2, 0.2, 0.5, 1e-3, 0.01])  # standard deviations of the stat
 _REFINED_DEG, _FEATURES_DEG = 0.6, 2.0  # standard deviations of a measured attitude, refined or by features alone
 _MAX_INTERVAL_S = 0.5  # between frames; over longer ones the turn rates are unknown
 _MAX_PITCH_DEG = 85.0  # beyond, roll and heading are hardly separate
-_MAX_LAG_DEG = 180.0  # timestamps in a wrong unit make rates of any size
 _MIN_SIGMAS = 2.0  # of an angle's error before it is corrected: every frame's matching allows for less
 
 
@@ -48,7 +47,7 @@ class Bias:
     roll_deg: float
     pitch_deg: float
     heading_deg: float
-    sigma_deg: tuple[float, float, float]
+    sigma_deg: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,27 +72,6 @@ class Calibration:
     height_sigma_m: float | None
 
 
-@dataclass(frozen=True, slots=True)
-class _Turn:
-    """A turn between two frames: (3,) of roll, pitch and heading in degrees, and how long it took."""
-
-    angles_deg: Array
-    interval_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """An attitude as a fix measured it.
-
-    Attributes:
-        off_deg: (3,) roll, pitch and heading less the telemetry's.
-        sigma_deg: standard deviation of each.
-    """
-
-    off_deg: Array
-    sigma_deg: float
-
-
 class TelemetryErrors:
     """Learns errors of the vehicle's telemetry and corrects them.
 
@@ -110,11 +88,11 @@ class TelemetryErrors:
         )
         self._mean, self._covariance = np.zeros(5), np.diag(self._first**2)
         self._attitudes = self._heights = 0  # fixes that measured it
-        self._time_s: float | None = None
+        self._time_s = 0.0
         self._stamp_ns: int | None = None
         self._angles_deg: Array | None = None  # of the newest frame, as they came
-        self._turn: _Turn | None = None  # from the frame before to the newest
-        self._seen: _Seen | None = None  # what the newest frame's fix measured
+        self._turn: Array | None = None  # (4,) to it from the frame before: its angles in degrees, and seconds
+        self._seen: tuple[Array, float] | None = None  # (3,) its fix's attitude less its own, and their sigma
         self._height_m: float | None = None
         self._settling = 0  # further fixes needed before a search's result is applied
         self._searched = False  # whether the newest frame is the first of a search
@@ -122,20 +100,14 @@ class TelemetryErrors:
     @property
     def calibration(self) -> Calibration:
         """All that was learnt."""
-        sigmas = np.sqrt(np.diag(self._covariance))
-        height_m, share = self._height_m if self._heights else None, float(self._mean[_HEIGHT])
-        return Calibration(
-            self._bias(sigmas) if self._attitudes else None,
-            float(self._mean[_LAG]),
-            math.hypot(float(sigmas[_LAG]), self._jitter_s),
-            None if height_m is None else share * height_m,
-            None if height_m is None else 1.0 + share,
-            None if height_m is None else float(sigmas[_HEIGHT]) * height_m,
-        )
-
-    def _bias(self, sigmas: Array) -> Bias:
-        (roll, pitch, heading), (a, b, c) = self._mean[_ANGLES].tolist(), sigmas[_ANGLES].tolist()
-        return Bias(roll, pitch, heading, (a, b, c))
+        sigmas, share = np.sqrt(np.diag(self._covariance)).tolist(), float(self._mean[_HEIGHT])
+        roll, pitch, heading = self._mean[_ANGLES].tolist()
+        attitude = Bias(roll, pitch, heading, tuple(sigmas[_ANGLES])) if self._attitudes else None
+        lag_s, lag_sigma_s = float(self._mean[_LAG]), math.hypot(sigmas[_LAG], self._jitter_s)
+        height_m = self._height_m if self._heights else None
+        if height_m is None:
+            return Calibration(attitude, lag_s, lag_sigma_s, None, None, None)
+        return Calibration(attitude, lag_s, lag_sigma_s, share * height_m, 1.0 + share, sigmas[_HEIGHT] * height_m)
 
     def corrected(self, frame: Frame, time_s: float, refusals: int = 0) -> Frame:
         """The frame with the attitude at its capture and the height that pictures measured.
@@ -149,8 +121,7 @@ class TelemetryErrors:
             refusals: number of refusals in a row before it.
         """
         self._follow(frame, time_s)
-        turn = self._turn
-        shown = self.without_errors(frame, _NO_RATES_DPS if turn is None else turn.angles_deg / turn.interval_s)
+        shown = self.without_errors(frame, _rates_dps(self._turn))
         if frame.heading_deg is None or self._height_m is None:
             return shown
         runs, rest = divmod(refusals, MIN_FRAMES)
@@ -186,26 +157,25 @@ class TelemetryErrors:
         angles = _angles_of(frame)
         if angles is None:
             return frame
-        variance = np.diag(self._covariance)
-        tilt_deg = frame.tilt_sigma_deg or self._assumed.tilt_deg
-        heading_deg = frame.heading_sigma_deg or self._assumed.heading_deg
-        off: Array = np.zeros(3)
+        assumed, variance = self._assumed.of_frame(frame), np.diag(self._covariance)
+        off = rates_dps * self._mean[_LAG]
         wider_deg2 = rates_dps**2 * (variance[_LAG] + self._jitter_s**2)
         if self._attitudes >= MIN_FRAMES:
-            is_off = np.abs(self._mean[_ANGLES]) > _MIN_SIGMAS * np.array([tilt_deg, tilt_deg, heading_deg])
-            off = is_off.astype(np.float64)
-            wider_deg2 = wider_deg2 + variance[_ANGLES] * off
-        wider_deg2 = np.minimum(wider_deg2, _MAX_LAG_DEG**2)
+            sigma_deg = np.array([assumed.tilt_deg, assumed.tilt_deg, assumed.heading_deg])
+            is_off = np.abs(self._mean[_ANGLES]) > _MIN_SIGMAS * sigma_deg
+            off = off + self._mean[_ANGLES] * is_off
+            wider_deg2 = wider_deg2 + variance[_ANGLES] * is_off
+        wider_deg2 = np.minimum(wider_deg2, 180.0**2)  # timestamps in a wrong unit make rates of any size
         if not wider_deg2.any():
             return frame
-        roll, pitch, heading = (angles + self._mean[_ANGLES] * off + rates_dps * self._mean[_LAG]).tolist()
+        roll, pitch, heading = (angles + off).tolist()
         return replace(
             frame,
             roll_deg=roll,
             pitch_deg=max(-90.0, min(pitch, 90.0)),
             heading_deg=wrap_heading_deg(heading),
-            tilt_sigma_deg=math.sqrt(tilt_deg**2 + float(wider_deg2[:2].max())),
-            heading_sigma_deg=math.sqrt(heading_deg**2 + float(wider_deg2[2])),
+            tilt_sigma_deg=math.sqrt(assumed.tilt_deg**2 + float(wider_deg2[:2].max())),
+            heading_sigma_deg=math.sqrt(assumed.heading_deg**2 + float(wider_deg2[2])),
         )
 
     def _at_its_height(self, frame: Frame) -> Frame:
@@ -217,49 +187,45 @@ class TelemetryErrors:
         least = SPREAD_SIGMAS * max(assumed, math.sqrt(self._covariance[_HEIGHT, _HEIGHT]))
         return frame if abs(share) <= least else replace(frame, height_agl_m=(1.0 + share) * height_m)
 
-    def note(self, fix: Fix, ground_m: float | None) -> None:
+    def note(self, fix: Fix, height_m: float | None) -> None:
         """Learn from an accepted fix of the newest frame.
 
         Args:
-            fix: an accepted fix. One without a height did not measure its attitude.
-            ground_m: height of the ground below it; None if the ground is assumed flat, where a slope looks like a
-                tilt: nothing is learnt then.
+            fix: an accepted fix.
+            height_m: that it measured above the ground. None if it measured none, and so no attitude, or if the
+                ground is assumed flat, where a slope looks like a tilt: nothing is learnt then.
         """
         self._settling = max(self._settling - 1, 0)
         if self._searched:  # earlier estimates were wrong
             self._searched = False
             self.forget()
         seen, known = fix.attitude, self._angles_deg
-        if fix.up_m is None or ground_m is None:
+        if height_m is None:
             return
         if seen is not None and known is not None and abs(seen.pitch_deg) <= _MAX_PITCH_DEG:
             apart = np.array([seen.roll_deg, seen.pitch_deg, seen.heading_deg]) - known
             off = np.array([math.remainder(angle, 360.0) for angle in apart.tolist()])
             sigma_deg = _REFINED_DEG if fix.stage in ("refined", "verified") else _FEATURES_DEG
-            self._seen = _Seen(off, sigma_deg)
+            self._seen = off, sigma_deg
         if self._height_m is not None:
-            share = (fix.up_m - ground_m) / self._height_m - 1.0
+            share = height_m / self._height_m - 1.0
             noise_m2 = float(fix.covariance_m2[2, 2]) + self._assumed.height_sigma_m(self._height_m) ** 2
             self._update(np.array([share]), np.eye(5)[[_HEIGHT]], np.array([noise_m2 / self._height_m**2]))
             self._heights += 1
 
-    def _learn_attitude(self, after: _Turn | None) -> None:
+    def _learn_attitude(self, after: Array | None) -> None:
         """Learn from the attitude that the newest frame's fix measured, now that the turn after it is known.
 
         The turn rates are those from the frame before to the frame after: the noise of the frame's own angles is
         in the rates up to it, where it looks like a lag.
         """
-        seen, before = self._seen, self._turn
-        self._seen = None
-        if seen is None:
+        if self._seen is None:
             return
-        rates_dps = _NO_RATES_DPS
-        if before is not None and after is not None:
-            rates_dps = (before.angles_deg + after.angles_deg) / (before.interval_s + after.interval_s)
+        (off, sigma_deg), self._seen = self._seen, None
+        rates_dps = _rates_dps(None if self._turn is None or after is None else self._turn + after)
         design = np.zeros((3, 5))
         design[:, _ANGLES], design[:, _LAG] = np.eye(3), rates_dps
-        noise_deg2 = seen.sigma_deg**2 + (rates_dps * self._jitter_s) ** 2
-        self._update(seen.off_deg, design, noise_deg2)
+        self._update(off, design, sigma_deg**2 + (rates_dps * self._jitter_s) ** 2)
         self._attitudes += 1
 
     def forget(self) -> None:
@@ -273,14 +239,13 @@ class TelemetryErrors:
         """Take the newest frame: learn from the last one's fix, let the states walk, compute the turn."""
         turn = self._turn_to(frame)
         self._learn_attitude(turn)
-        elapsed_s = 0.0 if self._time_s is None else max(time_s - self._time_s, 0.0)
-        self._covariance = self._covariance + np.diag(_WALK**2 * elapsed_s)
+        self._covariance = self._covariance + np.diag(_WALK**2 * (time_s - self._time_s))
         narrower = np.minimum(self._first / np.sqrt(np.diag(self._covariance)), 1.0)  # no vaguer than at first
         self._covariance *= narrower[:, None] * narrower
         self._time_s, self._stamp_ns, self._turn = time_s, frame.timestamp_ns, turn
         self._angles_deg, self._height_m = _angles_of(frame), frame.height_agl_m
 
-    def _turn_to(self, frame: Frame) -> _Turn | None:
+    def _turn_to(self, frame: Frame) -> Array | None:
         """The turn from the newest frame to the next; None if it is unknown."""
         angles_deg, stamp_ns = _angles_of(frame), frame.timestamp_ns
         if self._stamp_ns is None or stamp_ns is None or self._angles_deg is None or angles_deg is None:
@@ -289,7 +254,7 @@ class TelemetryErrors:
         if not 0.0 < interval_s <= _MAX_INTERVAL_S:
             return None
         steps = [math.remainder(float(step), 360.0) for step in angles_deg - self._angles_deg]
-        return _Turn(np.array(steps), interval_s)
+        return np.array([*steps, interval_s])
 
     def _update(self, measured: Array, design: Array, noise: Array) -> None:
         """A Kalman update."""
@@ -327,3 +292,8 @@ def _angles_of(frame: Frame) -> Array | None:
     """Roll, pitch and heading, if all are known."""
     known = (frame.roll_deg, frame.pitch_deg, frame.heading_deg)
     return None if None in known else np.array(known, np.float64)
+
+
+def _rates_dps(turn: Array | None) -> Array:
+    """(3,) of roll, pitch and heading; 0 if the turn is unknown."""
+    return _NO_RATES_DPS if turn is None else turn[:3] / turn[3]

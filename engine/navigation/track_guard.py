@@ -90,7 +90,7 @@ class _Rival:
     course: _Course
     first: Fix
     parted: _Course
-    age_s: float = 0.0
+    age_s: float
 
     def followed(self, course: _Course) -> _Course:
         """The course that it contradicts, moved as its matches moved since: both are of one vehicle.
@@ -155,7 +155,6 @@ class TrackGuard:
         self._options = options or NavigatorOptions()
         self._newest_ns: int | None = None
         self._stated_mps: Array | None = None  # the newest one
-        self._sigma_mps = self._unknown_mps
         self._track = None if start is None else self._begun(start)
         self._before = self._track  # as last vague, propagated without the fixes since
         self._rival: _Rival | None = None
@@ -184,15 +183,13 @@ class TrackGuard:
         if elapsed_s < 0.0:
             return
         self._newest_ns, self._stated_mps, sent = time_ns, velocity_of(frame), self._track
-        self._sigma_mps = self._unknown_mps
-        if self._stated_mps is not None:
-            drifted_mps = 0.0 if sent is None else _DRIFT_MPS2 * sent.silent_s
-            assumed_mps = math.hypot(self._options.measured_velocity_sigma_mps, drifted_mps)
-            self._sigma_mps = frame.velocity_sigma_mps or assumed_mps
-        known = self._stated_mps, self._sigma_mps, elapsed_s, self._options
+        drifted_mps = 0.0 if sent is None else _DRIFT_MPS2 * sent.silent_s
+        assumed_mps = math.hypot(self._options.measured_velocity_sigma_mps, drifted_mps)
+        sigma_mps = frame.velocity_sigma_mps or assumed_mps
+        known = self._stated_mps, sigma_mps, elapsed_s, self._options
         if sent is not None:
-            sigma_mps = math.hypot(self._sigma_mps, sent.found_mps)
-            self._track = sent.carried(self._stated_mps, sigma_mps, elapsed_s, self._options)
+            found_mps = math.hypot(sigma_mps, sent.found_mps)
+            self._track = sent.carried(self._stated_mps, found_mps, elapsed_s, self._options)
         if self._before is not None:
             self._before = self._before.carried(*known)
         if self._rival is not None:
@@ -214,8 +211,8 @@ class TrackGuard:
             if self._rival is not None and continues:
                 self._rival = replace(self._rival, course=self._rival.course.continued(fix))
             else:
-                begun = self._begun(place_of(fix), fix, self._unknown_mps)
-                self._rival = _Rival(replace(begun, matches=1), fix, track)
+                begun = self._begun(place_of(fix), fix, 0.5 * self._options.max_speed_mps)
+                self._rival = _Rival(replace(begun, matches=1), fix, track, 0.0)
             if not self.is_disputed:
                 return False
             if not self._is_right(self._rival, track, fix):
@@ -233,11 +230,6 @@ class TrackGuard:
             self._before, track = self._track, replace(track, matches=0)
         self._track = track.continued(fix)
         return True
-
-    @property
-    def _unknown_mps(self) -> float:
-        """Standard deviation per axis of an unknown velocity."""
-        return 0.5 * self._options.max_speed_mps
 
     def _begun(self, place: PositionEstimate, fix: Fix | None = None, sigma_mps: float = 0.0) -> _Course:
         """A course that begins at a place with the stated velocity."""

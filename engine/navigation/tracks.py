@@ -202,9 +202,8 @@ class Match:
     Attributes:
         fix: the match.
         searched_m2: area that was searched.
+        ways: to the frame; a place that no track predicted begins with their velocity.
         height_m: above the ground; if it is unknown, all ground counts as seen before.
-        velocity: (2,) m/s told with the frame and its standard deviation; None if none came.
-        seen: the way to the frame by pictures; None if they were not followed.
         refusals: frames in a row before it without a fix.
         given: another source's position; it speaks for or against a place that no track predicted.
         is_about_given: whether it was searched about that position, so that the two agree and it has spoken.
@@ -212,12 +211,11 @@ class Match:
 
     fix: Fix
     searched_m2: float
-    height_m: float | None = None
-    velocity: tuple[Array, float] | None = None
-    seen: Step | None = None
-    refusals: int = 0
-    given: PositionEstimate | None = None
-    is_about_given: bool = False
+    ways: Ways
+    height_m: float | None
+    refusals: int
+    given: PositionEstimate | None
+    is_about_given: bool
 
     @property
     def support(self) -> float:
@@ -283,17 +281,9 @@ class Tracks:
         """The more probable track of an account."""
         return next((each for each in self.known if each.number == number), None)
 
-    def begun(self, start: PositionEstimate, velocity: tuple[Array, float] | None) -> Tracks:
-        """With the flight's first account, at a position of another source.
-
-        Args:
-            start: the position.
-            velocity: (2,) m/s told with the first frame and its standard deviation; None if none came.
-
-        Returns:
-            Tracks: of this account alone.
-        """
-        return self._kept(self._born(start, RELIABLE, velocity), self.count + 1)
+    def begun(self, start: PositionEstimate, ways: Ways) -> Tracks:
+        """With the flight's first account, at a position of another source; the ways are those to its frame."""
+        return self._kept(self._born(start, RELIABLE, ways), self.count + 1)
 
     def carried(self, ways: Ways) -> Tracks:
         """At the next frame."""
@@ -326,7 +316,7 @@ class Tracks:
                 others.append(each.missed().at(wrong[-1]))
         count = self.count
         if all(each.log_odds < match.support for each in with_it):  # the vehicle is rather elsewhere, namely here
-            with_it += self._born(place, match.support, match.velocity, match.seen, fix)
+            with_it += self._born(place, match.support, match.ways, fix)
             right.append(match.support)
             count += 1
         odds = float(np.logaddexp.reduce(right)) - float(np.logaddexp.reduce(wrong))
@@ -346,20 +336,15 @@ class Tracks:
         taken = {id(each) for _, each in owners}
         return owners, [each.missed() for each in self.known if id(each) not in taken]
 
-    def _born(
-        self,
-        place: PositionEstimate,
-        support: float,
-        velocity: tuple[Array, float] | None,
-        seen: Step | None = None,
-        fix: Fix | None = None,
-    ) -> list[Track]:
+    def _born(self, place: PositionEstimate, support: float, ways: Ways, fix: Fix | None = None) -> list[Track]:
         """The two tracks of a new account, whose velocity is unknown but for the telemetry's or the pictures'."""
-        led = Track.begun(place, support, self.count, fix)
-        unknown_mps = 0.5 * self.options.max_speed_mps
-        led = led.with_velocity(*((np.zeros(2), unknown_mps) if seen is None else (seen.end_mps, seen.sigma_mps)))
-        free = replace(led, support=support - CERTAIN, trusts_velocity=False)
-        return [led if velocity is None else led.with_velocity(*velocity), free]
+        begun = Track.begun(place, support, self.count, fix)
+        led = free = begun.with_velocity(np.zeros(2), 0.5 * self.options.max_speed_mps)
+        if ways.seen is not None:
+            led = free = begun.with_velocity(ways.seen.end_mps, ways.seen.sigma_mps)
+        if ways.told is not None:
+            led = begun.with_velocity(ways.told.end_mps, ways.told.sigma_mps)
+        return [led, replace(free, support=support - CERTAIN, trusts_velocity=False)]
 
     def _kept(self, tracks: Iterable[Track], count: int | None = None) -> Tracks:
         """The most probable tracks of these; of those that share their newest match, one of each motion."""

@@ -23,8 +23,7 @@ from engine.geo import Array
 from engine.matching.for_reports import Explanation
 from engine.matching.matcher import SceneMatcher
 from engine.navigation.live import Answer
-from engine.navigation.navigator import Navigator
-from engine.navigation.state import NavigatorState
+from engine.navigation.navigator import Navigator, NavigatorState
 from engine.orthomap import OrthoMap
 from engine.values import Fix, Frame, NoFix, Window
 from scenematch.files.resampling import UTC_FROM_NS

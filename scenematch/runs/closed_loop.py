@@ -12,7 +12,7 @@ from engine.camera import NADIR_PITCH_DEG, Camera
 from engine.errors import OptionError
 from engine.matching import CLASSICAL
 from engine.matching.matcher import SceneMatcher
-from engine.navigation.state import NavigatorState
+from engine.navigation.navigator import NavigatorState
 from engine.orthomap import OrthoMap
 from engine.values import Frame, Truth
 from scenematch.files.track import TrackRow, track_row, write_notes, write_track

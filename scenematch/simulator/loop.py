@@ -23,8 +23,7 @@ from functools import partial
 import numpy as np
 
 from engine.geo import Array, attitude_from_rotation
-from engine.navigation.navigator import Matcher, Navigator
-from engine.navigation.state import NavigatorState
+from engine.navigation.navigator import Matcher, Navigator, NavigatorState
 from engine.values import Attitude, Fix, Frame, NoFix, Prior, Reason
 from scenematch.simulator import ekf
 from scenematch.simulator.faults import Fault, ShiftedMap

@@ -235,13 +235,12 @@ def test_a_prediction_that_is_too_uncertain_is_given_up():
 
 def test_its_state_and_age_are_told():
     navigator = Navigator(script(), START)
-    assert (navigator.state, navigator.tracking, navigator.healthy) == (NavigatorState.SEARCHING, False, False)
+    assert (navigator.state, navigator.healthy) == (NavigatorState.SEARCHING, False)
     assert navigator.anchor_age_s is None
     run = flown((10.0, 20.0), None, (10.0, 20.0), every_s=0.8)
     assert run.states == ["TRACKING", "COASTING", "TRACKING"]
     assert run.ages_s == pytest.approx([0.0, 0.8, 0.0])
     assert all(run.healthy)
-    assert run.navigator.tracking
 
 
 # Stamps

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine import Attitude, Budget, Camera, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, Reason
-from engine.navigation.motion import FrameClock, GroundMotion, PositionEstimate, Ways
+from engine.navigation.motion import GroundMotion, PositionEstimate, Ways, told_step
 from engine.navigation.odometry import NoMotion, VisualOdometry
 from engine.navigation.tracks import Track
 from scenematch.runs.settings import TrackSettings, load_settings
@@ -205,7 +205,7 @@ def test_motions_add_up_and_so_do_their_errors():
     """Four of 5 m: the share of height and heading lasts, the rest does not."""
     track = Track.begun(PositionEstimate(np.zeros(2), 0.0), 20.0, 0, None).with_velocity(MOTION.velocity_mps, 0.1)
     for _ in range(4):
-        track = track.carried(Ways(1.0, seen=MOTION.step(MOTION.velocity_mps)), NavigatorOptions())
+        track = track.carried(Ways(1.0, seen=MOTION.step(MOTION.step(None))), NavigatorOptions())
     assert track.en_m == pytest.approx([12.0, 16.0])
     assert track.estimate.sigma_m == pytest.approx(math.hypot(0.02 * 20.0, 0.2 * math.sqrt(4)))
 
@@ -223,9 +223,7 @@ def test_a_motion_counts_over_its_own_interval_only(monkeypatch):
 @pytest.mark.parametrize(("sigma_mps", "expected_mps"), [(None, 0.5), (0.1, 0.1), (2.0, 2.0)])
 def test_a_velocity_with_its_own_accuracy_is_taken_at_its_word(sigma_mps, expected_mps):
     stated = {"east_velocity_mps": 1.0, "north_velocity_mps": 0.0, "velocity_sigma_mps": sigma_mps}
-    clock = FrameClock(NavigatorOptions())
-    clock.append(still(0.0, **stated))
-    assert clock.told(still(1.0, **stated)).sigma_mps == expected_mps
+    assert told_step(None, still(1.0, **stated), 1.0, NavigatorOptions()).sigma_mps == expected_mps
 
 
 def test_a_navigator_follows_the_ground_where_it_is_asked_to():
@@ -264,10 +262,9 @@ def test_the_time_that_odometry_takes_is_the_frames(monkeypatch, total_ms, searc
 def test_odometry_flies_at_the_height_that_fixes_showed(monkeypatch):
     navigator = Navigator(blind(camera=CAMERA), START, options=NavigatorOptions(odometry=True))
     errors, flown = navigator._errors, frame(picture((0.0, 0.0)))
-    higher = a_fix(up_m=1.2 * HEIGHT_M)
     for _ in range(5):
         errors.corrected(flown, 0.0)
-        errors.note(higher, 0.0)
+        errors.note(a_fix(), 1.2 * HEIGHT_M)
     for k in range(2):
         navigator.update(frame(picture((5.0 * k, 0.0)), k * INTERVAL_S))
     assert navigator.ground_motion.moved_m[0] == pytest.approx(5.0 * 1.2, rel=0.05)

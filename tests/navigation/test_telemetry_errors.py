@@ -20,14 +20,14 @@ from tests.support.matchers import ScriptedMatcher, a_site, at
 from tests.support.towns import drawn_town
 
 IMAGE = np.zeros((4, 4), np.uint8)
-GROUND_M, HEIGHT_M, INTERVAL_S = 30.0, 150.0, 0.1
+HEIGHT_M, INTERVAL_S = 150.0, 0.1
 ASSUMED = AssumedErrors()
 CAMERA = Camera.from_fov(4, 4, 60.0)
 ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 CALM = Frame(IMAGE, None, HEIGHT_M, 40.0, 0.0, 0.0)
 
 
-def fix_of(attitude, up_m=GROUND_M + HEIGHT_M, stage="refined"):
+def fix_of(attitude, stage="refined", up_m=None):
     roll, pitch, heading = attitude
     return a_fix(up_m=up_m, attitude=Attitude(roll, pitch, heading % 360.0), stage=stage)
 
@@ -47,15 +47,16 @@ def errors_of(frame, truth):
     return np.array([math.remainder(float(v), 360.0) for v in known - truth])
 
 
-def flown(off=(0.0, 0.0, 0.0), *, lag_s=0.0, off_m=0.0, frames=100, seed=1, noise_deg=0.4, ground_m=GROUND_M,
-          measured=True, options=None, **changes):  # fmt: skip
+def flown(off=(0.0, 0.0, 0.0), *, lag_s=0.0, off_m=0.0, frames=100, seed=1, noise_deg=0.4, measured=True,
+          options=None, **changes):  # fmt: skip
     """What is learnt of a telemetry that reads too much by this, and the frames as they were corrected."""
     errors, rng, shown = TelemetryErrors(options or NavigatorOptions()), np.random.default_rng(seed), []
     for k in range(frames):
         time_s = k * INTERVAL_S
         shown.append(errors.corrected(frame_at(time_s, off, lag_s, off_m, **changes), time_s))
-        up_m = GROUND_M + HEIGHT_M + rng.normal(0.0, 0.5) if measured else None
-        errors.note(fix_of(angles(time_s) + rng.normal(0.0, noise_deg, 3), up_m), ground_m)
+        height_m = HEIGHT_M + rng.normal(0.0, 0.5)
+        fix = fix_of(angles(time_s) + rng.normal(0.0, noise_deg, 3))
+        errors.note(fix, height_m if measured else None)
     return errors, shown
 
 
@@ -64,7 +65,7 @@ def taught(frames, attitude_at):
     errors = TelemetryErrors(NavigatorOptions())
     for time_s, frame in frames:
         errors.corrected(frame, time_s)
-        errors.note(fix_of(attitude_at(time_s)), GROUND_M)
+        errors.note(fix_of(attitude_at(time_s)), HEIGHT_M)
     return errors.calibration
 
 
@@ -127,7 +128,7 @@ def test_a_calm_flight_is_as_it_was():
     for k in range(5):
         frame = replace(CALM, timestamp_ns=k * 100_000_000)
         assert errors.corrected(frame, 0.1 * k) is frame
-        errors.note(fix_of((0.0, 0.0, 40.0)), GROUND_M)
+        errors.note(fix_of((0.0, 0.0, 40.0)), HEIGHT_M)
 
 
 @pytest.mark.parametrize("changes", [{"timestamp_ns": None}, *({name: None} for name in ANGLES)])
@@ -142,8 +143,7 @@ def test_without_stamp_or_attitude_there_is_no_rate(changes):
     [
         *(({name: None}, False, True, 0.0) for name in ANGLES),
         ({"height_agl_m": None}, True, False, 0.1),
-        ({"measured": False}, False, False, 0.0),  # a fix that did not measure its height
-        ({"ground_m": None}, False, False, 0.0),  # over ground that is taken for flat
+        ({"measured": False}, False, False, 0.0),  # no height, or over ground that is taken for flat
     ],
 )
 def test_what_is_not_known_of_a_frame_or_its_fix_teaches_nothing(missing, attitude, height, lag_s):
@@ -181,7 +181,7 @@ def test_a_bias_that_changes_is_followed():
 def test_one_wild_attitude_moves_it_by_little():
     errors, _ = flown(noise_deg=0.0)
     errors.corrected(frame_at(10.0), 10.0)
-    errors.note(fix_of(angles(10.0) + np.array([20.0, -20.0, 90.0])), GROUND_M)
+    errors.note(fix_of(angles(10.0) + np.array([20.0, -20.0, 90.0])), HEIGHT_M)
     known = errors.calibration.attitude
     assert max(abs(known.roll_deg), abs(known.pitch_deg)) < 0.5
     assert abs(known.heading_deg) < 1.0
@@ -191,7 +191,7 @@ def test_one_wild_attitude_moves_it_by_little():
 def test_an_unsure_attitude_counts_less(stage, noise_deg):
     errors = TelemetryErrors(NavigatorOptions())
     errors.corrected(CALM, 0.0)
-    errors.note(fix_of((2.0, 0.0, 40.0), stage=stage), GROUND_M)
+    errors.note(fix_of((2.0, 0.0, 40.0), stage=stage), HEIGHT_M)
     errors.corrected(CALM, 0.0)
     assert errors.calibration.attitude.roll_deg == pytest.approx(2.0 / (1.0 + noise_deg**2), rel=1e-6)  # by hand
 
@@ -251,7 +251,7 @@ def test_after_a_fix_frames_are_doubted_until_three_fixes_settled_what_is_off():
     errors, _ = refused(4)
     doubted = []
     for k in range(6):
-        errors.note(fix_of((0.0, 0.0, 30.0)), GROUND_M)
+        errors.note(fix_of((0.0, 0.0, 30.0)), HEIGHT_M)
         shown = errors.corrected(CALM, 1.0 + 0.2 * k)
         doubted.append(is_doubted(shown))
     assert doubted == [True, True, False, False, False, False]
@@ -267,7 +267,7 @@ def test_nothing_is_known_before_a_fix_nor_after_a_jump():
 
 
 def test_the_navigator_takes_it_off_new_frames_and_forgets_it_when_it_leads_nowhere():
-    measured = fix_of((0.0, 0.0, -6.0), HEIGHT_M)
+    measured = fix_of((0.0, 0.0, -6.0), up_m=HEIGHT_M)
     matcher = ScriptedMatcher(*[measured] * 30, *[None] * 15, site=a_site(ground_at=lambda _: 0.0))
 
     def level_at(time_s):
@@ -282,6 +282,15 @@ def test_the_navigator_takes_it_off_new_frames_and_forgets_it_when_it_leads_nowh
         navigator.update(level_at(3.0 + 0.1 * k))
     assert navigator.calibration.attitude is None
     assert matcher.frames[-1].heading_deg == 0.0
+
+
+def test_over_ground_that_is_taken_for_flat_nothing_is_learnt():
+    measured = fix_of((0.0, 0.0, -6.0), up_m=HEIGHT_M)
+    site = a_site(ground_at=lambda _: 0.0, has_surface=False)
+    navigator = Navigator(ScriptedMatcher(*[measured] * 5, site=site), Prior(east_m=0.0, north_m=0.0, sigma_m=5.0))
+    for k in range(5):
+        navigator.update(replace(at(0.1 * k, (0.0, 0.0), HEIGHT_M), roll_deg=0.0, pitch_deg=0.0))
+    assert (navigator.calibration.attitude, navigator.calibration.height_m) == (None, None)
 
 
 @pytest.mark.slow

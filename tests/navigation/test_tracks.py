@@ -45,6 +45,12 @@ def position_and_velocity(track):
     return track.covariance[np.ix_([0, 2], [0, 2])]
 
 
+def match(fix, searched_m2=AREA_M2, *, told=None, seen=None, **known):
+    """A match a fifth of a second after the frame before."""
+    usual = {"height_m": None, "refusals": 0, "given": None, "is_about_given": False}
+    return Match(fix, searched_m2, Ways(0.2, told, seen), **(usual | known))
+
+
 # Motion
 
 
@@ -108,7 +114,7 @@ def test_matches_of_metres_tell_a_velocity_within_seconds():
 def test_a_new_account_moves_as_the_pictures_show():
     """Without a velocity of the telemetry."""
     seen = Step(np.array([2.0, 0.0]), np.array([10.0, 0.0]), np.array([10.0, 0.0]), 0.2, 0.01)
-    tracks = Tracks(OPTIONS).weighed(Match(fix_at(0.0), AREA_M2, seen=seen)).tracks
+    tracks = Tracks(OPTIONS).weighed(match(fix_at(0.0), seen=seen)).tracks
     for track in tracks.carried(Ways(0.2, seen=seen)).known:
         assert track.en_m == pytest.approx([2.0, 0.0])
         assert track.estimate.sigma_m < 1.1
@@ -162,7 +168,7 @@ def tracks_of(*known, options=LONG_AGO):
 def test_a_match_where_a_track_predicts_it_is_right_by_both():
     """The track: 20 nats. The match: 9.2 of its own, that it lies here, and that every second frame is empty."""
     track = a_track(covariance=((3.0, 0.0), (0.0, 1.0)))
-    weighed = tracks_of(track).weighed(Match(fix_at(0.0), AREA_M2))
+    weighed = tracks_of(track).weighed(match(fix_at(0.0)))
     own = CERTAIN + math.log(AREA_M2 / (2.0 * math.pi * 4.0)) + MISS
     grown = 20.0 + 0.5 * CERTAIN  # of the same ground
     right, wrong = grown - np.logaddexp(0.0, -own), np.logaddexp(grown - np.logaddexp(0.0, own), 0.0)
@@ -171,7 +177,7 @@ def test_a_match_where_a_track_predicts_it_is_right_by_both():
 
 
 def test_a_match_elsewhere_is_weighed_against_the_track():
-    weighed = tracks_of(a_track()).weighed(Match(fix_at(500.0), AREA_M2))
+    weighed = tracks_of(a_track()).weighed(match(fix_at(500.0)))
     assert weighed.log_odds == pytest.approx(CERTAIN - np.logaddexp(0.0, 20.0 - MISS))
     assert [each.number for each in weighed.tracks.known] == [0, 0, 1, 1]
     left = 20.0 - MISS
@@ -181,7 +187,7 @@ def test_a_match_elsewhere_is_weighed_against_the_track():
 @pytest.mark.parametrize(("moved_m", "share"), [(0.0, 0.0), (30.0, 0.25), (300.0, 1.0)])
 def test_a_match_of_the_same_ground_counts_half_and_its_agreement_nothing(moved_m, share):
     track = a_track(covariance=((3.0, 0.0), (0.0, 1.0)), en_m=np.array([moved_m, 0.0]))
-    weighed = tracks_of(track).weighed(Match(fix_at(moved_m), AREA_M2, height_m=120.0))
+    weighed = tracks_of(track).weighed(match(fix_at(moved_m), height_m=120.0))
     here = math.log(AREA_M2 / (2.0 * math.pi * 4.0))
     assert weighed.tracks.best.log_odds == pytest.approx(20.0 + (0.5 + 0.5 * share) * CERTAIN + share * here)
 
@@ -191,7 +197,7 @@ def test_of_two_motions_the_better_one_gains_whatever_the_ground():
         a_track(trusts_velocity=told, covariance=((v, 0.0), (0.0, 1.0)))
         for told, v in ((True, 3.0), (False, 15.0))
     )
-    weighed = tracks_of(near, far).weighed(Match(fix_at(0.0), AREA_M2))
+    weighed = tracks_of(near, far).weighed(match(fix_at(0.0)))
     first, second = weighed.tracks.known
     assert first.trusts_velocity
     assert first.log_odds - second.log_odds == pytest.approx(math.log(16.0 / 4.0))
@@ -200,7 +206,7 @@ def test_of_two_motions_the_better_one_gains_whatever_the_ground():
 def test_neither_motion_becomes_improbable_for_good():
     told = a_track(support=500.0)
     free = replace(told, trusts_velocity=False, support=20.0)
-    known = tracks_of(told, free).weighed(Match(fix_at(500.0), AREA_M2)).tracks.known[:2]
+    known = tracks_of(told, free).weighed(match(fix_at(500.0))).tracks.known[:2]
     assert [each.log_odds for each in known] == pytest.approx([500.0 - MISS, 500.0 - MISS - CERTAIN])
 
 
@@ -212,16 +218,16 @@ def test_a_frame_without_a_match_leaves_half_of_the_past_evidence():
 def test_a_match_of_little_evidence_far_from_the_prediction_leaves_a_track_without_it():
     """Right with probability 0.99: the next match decides between the two."""
     tracks = tracks_of(a_track(covariance=((3.0, 0.0), (0.0, 1.0))))
-    weighed = tracks.weighed(Match(fix_at(7.0, confidence=0.99), AREA_M2))
+    weighed = tracks.weighed(match(fix_at(7.0, confidence=0.99)))
     assert weighed.log_odds < math.log(999.0)
     assert sorted({each.en_m[0] for each in weighed.tracks.known}) == [0.0, 7.0]
-    assert weighed.tracks.weighed(Match(fix_at(-1.0), AREA_M2)).tracks.best.en_m[0] == -1.0
+    assert weighed.tracks.weighed(match(fix_at(-1.0))).tracks.best.en_m[0] == -1.0
 
 
 def test_a_match_belongs_to_the_account_that_predicts_it_best():
     vague = a_track(covariance=((900.0, 0.0), (0.0, 1.0)), support=40.0)
     rival = a_track(support=20.0, number=1, en_m=np.array([50.0, 0.0]))
-    weighed = tracks_of(vague, rival).weighed(Match(fix_at(50.0), AREA_M2))
+    weighed = tracks_of(vague, rival).weighed(match(fix_at(50.0)))
     assert weighed.number == 1
     assert [each.misses for each in weighed.tracks.known if each.number == 0] == [1, 1]
 
@@ -235,25 +241,24 @@ def test_tracks_that_share_their_newest_match_are_one_account():
 def test_another_source_speaks_for_or_against_a_new_place_by_its_reliability():
     """It is right 99 times in 100; where it is wrong, it says nothing."""
     at_odds = [
-        Match(fix_at(0.0, confidence=0.9), AREA_M2, given=PositionEstimate(np.array([e, 0.0]), 3.0))
-        for e in (0.0, 500.0)
+        match(fix_at(0.0, confidence=0.9), given=PositionEstimate(np.array([e, 0.0]), 3.0)) for e in (0.0, 500.0)
     ]
     assert at_odds[0].support > nats_of(0.9) + 3.0
     assert at_odds[1].support == pytest.approx(nats_of(0.9) + math.log(0.01))
     vague = PositionEstimate(np.zeros(2), 500.0)
-    assert Match(fix_at(0.0, confidence=0.9), 1.0, given=vague).support == pytest.approx(nats_of(0.9))
+    assert match(fix_at(0.0, confidence=0.9), 1.0, given=vague).support == pytest.approx(nats_of(0.9))
 
 
 def test_no_single_match_gives_a_place_more_than_was_tested():
-    assert Match(fix_at(0.0, confidence=1.0 - 1e-12), AREA_M2).support == pytest.approx(nats_of(0.9999))
+    assert match(fix_at(0.0, confidence=1.0 - 1e-12)).support == pytest.approx(nats_of(0.9999))
     assert stated_nats(fix_at(0.0, confidence=None)) == pytest.approx(math.log(999.0))
 
 
 def test_after_refusals_a_new_place_needs_more_evidence():
     """Two prior odds: one frame in two shows a place, and one in forty; and nothing adds more than was tested."""
-    supports = [Match(fix_at(0.0, confidence=0.9999), AREA_M2, refusals=each).support for each in (0, 38)]
+    supports = [match(fix_at(0.0, confidence=0.9999), refusals=each).support for each in (0, 38)]
     assert supports[0] - supports[1] == pytest.approx(math.log((38 + 1) / 1))
-    assert Match(fix_at(0.0, confidence=1.0 - 1e-9), AREA_M2, refusals=38).support == CERTAIN
+    assert match(fix_at(0.0, confidence=1.0 - 1e-9), refusals=38).support == CERTAIN
 
 
 @given(places=st.lists(st.tuples(st.floats(-500, 500), st.floats(-500, 500)), min_size=1, max_size=60))
@@ -261,8 +266,8 @@ def test_after_refusals_a_new_place_needs_more_evidence():
 def test_the_set_is_bounded_and_sorted_and_holds_two_motions_of_each_account(places):
     tracks = Tracks(OPTIONS)
     for place in places:
-        match = Match(fix_at(*place), AREA_M2, velocity=(np.zeros(2), 0.5))
-        tracks = tracks.carried(Ways(0.2)).weighed(match).tracks
+        told = Step(np.zeros(2), None, np.zeros(2), sigma_mps=0.5, noise_m2=0.0)
+        tracks = tracks.carried(Ways(0.2)).weighed(match(fix_at(*place), told=told)).tracks
         kinds = [(id(each.fix), each.trusts_velocity) for each in tracks.known]
         assert len(kinds) == len(set(kinds)) <= MAX_TRACKS
         firsts = [each.log_odds for each in tracks.known[::2]]
