@@ -48,7 +48,8 @@ def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradi
     points, shown, expected = np.zeros((3, samples)), np.zeros((3, samples)), np.zeros((3, samples))
     right, bottom, count = width - 1.0 - EDGE_PX, height - 1.0 - EDGE_PX, 0
     for n in range(samples):
-        e, north, up = _from_camera(offset_m, n, shift, slope)
+        e, north = offset_m[0, n] + shift[0], offset_m[1, n] + shift[1]
+        up = offset_m[2, n] + shift[2] + slope[0] * offset_m[0, n] + slope[1] * offset_m[1, n]
         points[0, n], points[1, n], points[2, n] = x, y, z = rotated(rotation, e, north, up)
         if known[n] <= 0.0 or z <= 1e-6:
             continue
@@ -62,13 +63,6 @@ def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradi
         cell[n] = int(v / bottom * CELLS) * CELLS + int(u / right * CELLS)
         weights[n], count = known[n], count + 1
     return levels, points, shown, expected, weights, cell, count
-
-
-@inlined
-def _from_camera(offset_m, n, shift, slope):
-    """East, north and up from the camera to a sample on the sloped ground."""
-    up = offset_m[2, n] + shift[2] + slope[0] * offset_m[0, n] + slope[1] * offset_m[1, n]
-    return offset_m[0, n] + shift[0], offset_m[1, n] + shift[1], up
 
 
 @inlined
