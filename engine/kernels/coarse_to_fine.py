@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.local import LocalScores
-from engine.kernels.peaks import FAR, NEAR, best_positions, fit_peak
+from engine.kernels.peaks import FAR, NEAR, best_outside, best_positions, fit_peak
 from engine.kernels.search_levels import COARSE_TEMPLATE_PX, MapRegion
 from engine.kernels.sums import halved, over_nodata
 from engine.values import Peak
@@ -218,11 +218,7 @@ def _coarse_rest(
     remaining, r = scores.copy(), _SEPARATION_PX
     for x, y, _ in rivals:
         remaining[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
-    down, across = (
-        np.square(np.arange(n) * scale - at) for n, at in zip(remaining.shape, (best.y, best.x), strict=True)
-    )
-    remaining[down[:, None] + across <= exclusion_px**2] = -1.0
-    return float(remaining.max())
+    return best_outside(remaining, best.x / scale, best.y / scale, exclusion_px / scale)
 
 
 def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak | None, bool]:

@@ -82,7 +82,7 @@ def peak_numbers(scores: Tensor, exclusion_px: float) -> list[float]:
     """The numbers that define a surface's peak, found on its device and copied at once.
 
     Args:
-        scores: (H', W'); NaN counts as -1.
+        scores: (H', W').
         exclusion_px: radius about the peak within which no rival is counted.
 
     Returns:
@@ -90,8 +90,7 @@ def peak_numbers(scores: Tensor, exclusion_px: float) -> list[float]:
         scores about the peak, those on the border repeated beyond it.
     """
     with torch.inference_mode():
-        scores = scores.float().nan_to_num(nan=-1.0).clamp_(-1.0, 1.0)
-        height, width = scores.shape
+        scores, (height, width) = scores.float(), scores.shape
         index = scores.flatten().argmax(dim=0, keepdim=True)
         row, column = index // width, index % width
         dy, dx = (torch.arange(n, device=index.device) - at for n, at in ((height, row), (width, column)))
