@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.kernels.scores import MIDDLE_GREY
+from engine.kernels.sums import MIDDLE_GREY
 from engine.runtime.jit import compiled, inlined
 
 

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.kernels.sums import MIDDLE_GREY
 
 FloatImage = NDArray[np.float32]
 
 RADIUS_PX = 8
 """Of the local normalisation: neighbourhoods are boxes of 2 x 8 + 1 pixels."""
-MIDDLE_GREY = 128
-"""Of uint8; levels are counted from it, so that sums of squares lose fewer digits."""
 MAX_RADIUS_PX = (math.isqrt(np.iinfo(np.int32).max // MIDDLE_GREY**2) - 1) // 2
 """Of the largest neighbourhood whose sum of squares fits into the compiled loop's int32."""
 # Added to the local variance, in squared grey levels, so that sensor noise on flat ground is not amplified.

@@ -15,6 +15,8 @@ Number = TypeVar("Number", np.float32, np.uint8)
 
 # Sums of squares about a mean below this share of the whole picture's are rounding: there a patch is flat.
 FLAT_SHARE = 1e-12
+MIDDLE_GREY = 128
+"""Of uint8; levels are counted from it, so that sums of squares lose fewer digits."""
 
 
 def halved(image: NDArray[Number]) -> NDArray[Number]:
