@@ -70,7 +70,17 @@ def find_peak(scores: Picture, *, exclusion_px: float) -> Peak:
 
 
 def best_outside(scores: NDArray[np.float32], x: float, y: float, radius_px: float) -> float:
-    """The best of (H, W) outside a disc about a place; -1 if nothing is."""
+    """The best score outside a disc.
+
+    Args:
+        scores: (H, W).
+        x: the disc's middle, which may lie between pixels.
+        y: likewise.
+        radius_px: of the disc.
+
+    Returns:
+        In [-1, 1]; -1 if no position is outside.
+    """
     rest, r = scores.copy(), math.ceil(radius_px)
     top, left = max(0, math.floor(y) - r), max(0, math.floor(x) - r)
     near = rest[top : math.ceil(y) + r + 1, left : math.ceil(x) + r + 1]
