@@ -24,16 +24,7 @@ from engine.values import Peak
 if TYPE_CHECKING:
     from engine.runtime.tensors import Tensor
 
-__all__ = [
-    "MapRegion",
-    "Peak",
-    "find_peak",
-    "match_template",
-    "ncc",
-    "prepare",
-    "surface",
-    "surfaces",
-]
+__all__ = ["MapRegion", "Peak", "find_peak", "match_template", "ncc", "prepare", "surface", "surfaces"]
 
 FloatImage = NDArray[np.float32]
 Given = TypeVar("Given", NDArray[Any], "Tensor")  # the result has the same kind as the inputs
@@ -42,12 +33,7 @@ _TYPES = ("uint8", "int16", "uint16", "int32", "float16", "float32", "float64")
 _DOUBLE = ("float64", "int32")  # float32 would round these
 
 
-def ncc(
-    search: Given,
-    templates: Given,
-    *,
-    zero_mean: bool = True,
-) -> Given:
+def ncc(search: Given, templates: Given, *, zero_mean: bool = True) -> Given:
     """Scores in [-1, 1]: normalised cross-correlation of templates with every position in a window.
 
     All arguments are tensors, or all are arrays. On the CPU torch is used only for float64.
@@ -84,9 +70,7 @@ def _check(search: Picture, templates: Picture) -> None:
         raise ShapeError(f"templates: expected (B, T, h, w) with no empty axis, got {tuple(templates.shape)}")
     if search.shape[0] != templates.shape[0]:
         raise ShapeError(f"templates: expected a batch of {search.shape[0]} (search), got {templates.shape[0]}")
-    (H, W), (h, w) = search.shape[-2:], templates.shape[-2:]
-    if h > H or w > W:
-        raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
+    _check_size(search, templates)
     for name, picture in (("search", search), ("templates", templates)):
         if element_type(picture) not in _TYPES:
             raise DtypeError(f"{name}: expected uint8, int16, uint16, int32 or a float, got {picture.dtype}")
@@ -120,14 +104,18 @@ def surface(search: MapRegion, templates: Given, *, min_overlap: float = 0.0) ->
     Raises:
         ShapeError: the templates are not (T, h, w), are empty, or are larger than the map.
     """
-    _check_fit(search, templates)
+    _check_prepared(search, templates)
     return next(surfaces(search, templates, group=templates.shape[0], min_overlap=min_overlap))
 
 
-def _check_fit(search: MapRegion, templates: Picture) -> None:
+def _check_prepared(search: MapRegion, templates: Picture) -> None:
     if templates.ndim != 3 or 0 in templates.shape:
         raise ShapeError(f"templates: expected (T, h, w) with no empty axis, got {tuple(templates.shape)}")
-    (H, W), (h, w) = search.image.shape, templates.shape[-2:]
+    _check_size(search.image, templates)
+
+
+def _check_size(search: Picture, templates: Picture) -> None:
+    (H, W), (h, w) = search.shape[-2:], templates.shape[-2:]
     if h > H or w > W:
         raise ShapeError(f"templates: expected at most {H} x {W} (search), got {h} x {w}")
 
@@ -181,7 +169,7 @@ def match_template(
     Raises:
         ShapeError: the template is not (h, w), is empty, or is larger than the map.
     """
-    _check_fit(search, template[None])
+    _check_prepared(search, template[None])
     if isinstance(search.image, np.ndarray) and not exhaustive:
         own = same_kind_as(search.image, template)
         found = coarse_to_fine.peak(search, own, exclusion_px, min_overlap=min_overlap)

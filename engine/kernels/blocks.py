@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -119,7 +118,7 @@ def correlate(
     kinds = {spectrum.dtype for _, spectrum in blocks}
 
     def one_template(t: int) -> None:
-        spectra = {kind: spectrum_of(models[t], np.empty(size, kind)) for kind in kinds}
+        spectra = {kind: _model_spectrum(models[t], size, kind) for kind in kinds}
 
         def one_block(block: _Block) -> None:
             part, spectrum = block
@@ -157,21 +156,12 @@ def _window_spectrum(
     return values
 
 
-def spectrum_of(values: NDArray[Any], out: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The transform of a picture with zeros beyond it.
-
-    Args:
-        values: (h, w).
-        out: (rows, columns) takes the transform, in the packed order of OpenCV's real transforms.
-
-    Returns:
-        ``out``.
-    """
-    height, width = values.shape
-    out[:height, :width] = values
-    out[:height, width:], out[height:] = 0.0, 0.0
-    transform(out, 0, height)
-    return out
+def _model_spectrum(model: FloatImage, size: tuple[int, int], kind: np.dtype[np.floating]) -> NDArray[np.floating]:
+    """The transform of a template with zeros beyond it, in the packed order of OpenCV's real transforms."""
+    values = np.zeros(size, kind)
+    values[: model.shape[0], : model.shape[1]] = model
+    transform(values, 0, len(model))
+    return values
 
 
 def _write_scores(

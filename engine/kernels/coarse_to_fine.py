@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.local import LocalScores
-from engine.kernels.peaks import FAR, NEAR, best_positions, fit_peak
+from engine.kernels.peaks import FAR, NEAR, best_outside, best_positions, fit_peak
 from engine.kernels.search_levels import COARSE_TEMPLATE_PX, MapRegion
 from engine.kernels.sums import halved, over_nodata
 from engine.values import Peak
 
 FloatImage = NDArray[np.float32]
+Candidate = tuple[int, int, float]  # x, y and score on the coarsest level
 
 WIDE_PX = 2_000_000
 """Windows of more pixels are wide: every position at full resolution takes a tenth of a second and more."""
@@ -40,21 +41,6 @@ class EarlyStop:
 
     is_clear: Callable[[Peak], bool]
     is_hopeless: Callable[[Peak], bool]
-
-
-@dataclass(frozen=True, slots=True)
-class _Refined:
-    """Candidates at full resolution.
-
-    Attributes:
-        found: each refined position with its candidate (x, y, score) of the coarsest level.
-        is_certain: whether they exclude every other position.
-        unresolved: the best coarse score of those that lie at the window's edge, and were not refined.
-    """
-
-    found: list[tuple[Peak, tuple[int, int, float]]]
-    is_certain: bool
-    unresolved: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,21 +101,17 @@ def peak(
     scores = _coarse_scores(levels)
     count = _CANDIDATES_WIDE if wide else _CANDIDATES
     candidates = best_positions(scores, _SEPARATION_PX, count + 1)
-    refinement = _refined_candidates(levels, scores, candidates, count, stops=not wide)
-    if not refinement.found:
+    found, is_certain, unresolved = _refined_candidates(levels, scores, candidates, count, stops=not wide)
+    if not found:
         return None
-    best, origin = max(refinement.found, key=lambda pair: pair[0].score)
-    rivals = [
-        (refined, candidate)
-        for refined, candidate in refinement.found
-        if math.hypot(refined.x - best.x, refined.y - best.y) > exclusion_px
-    ]
+    best, origin = max(found, key=lambda pair: pair[0].score)
+    rivals = [pair for pair in found if math.hypot(pair[0].x - best.x, pair[0].y - best.y) > exclusion_px]
     second = max((refined.score for refined, _ in rivals), default=-1.0)
     rest = _coarse_rest(scores, [candidate for _, candidate in rivals], levels.scale, best, exclusion_px)
     by_coarse_scores = replace(best, second_score=max(rest, second))
-    if refinement.is_certain:
+    if is_certain:
         return by_coarse_scores
-    if stop is None or not wide or refinement.unresolved >= origin[2]:
+    if stop is None or not wide or unresolved >= origin[2]:
         return None
     # A place between coarse pixels has more at full resolution than the coarse score shows.
     pessimistic = replace(best, second_score=max(min(rest / (1.0 - levels.loss), 1.0), second))
@@ -180,16 +162,15 @@ def _share_on_map(
 ) -> FloatImage:
     """Share of a template's pixels (h, w) that are valid, at every ``step``-th position of the finest level."""
     (h, w), (rows, columns) = model, counts.shape
-    y = np.minimum(np.arange(shape[0]) * step, rows - 1 - h)
+    y = np.minimum(np.arange(shape[0]) * step, rows - 1 - h)[:, None]
     x = np.minimum(np.arange(shape[1]) * step, columns - 1 - w)
-    inside = counts[np.ix_(y + h, x + w)] - counts[np.ix_(y, x + w)]
-    inside += counts[np.ix_(y, x)] - counts[np.ix_(y + h, x)]
+    inside = counts[y + h, x + w] - counts[y, x + w] + counts[y, x] - counts[y + h, x]
     return np.asarray(inside / np.float32(h * w), np.float32)
 
 
 def _refined_candidates(
-    levels: _Levels, scores: FloatImage, candidates: list[tuple[int, int, float]], count: int, *, stops: bool
-) -> _Refined:
+    levels: _Levels, scores: FloatImage, candidates: list[Candidate], count: int, *, stops: bool
+) -> tuple[list[tuple[Peak, Candidate]], bool, float]:
     """Refine candidates until they exclude every other position.
 
     Args:
@@ -198,9 +179,13 @@ def _refined_candidates(
         candidates: in falling order, one more than ``count`` if available.
         count: upper bound on the refined candidates.
         stops: return nothing as soon as it is known that they do not exclude every other position.
+
+    Returns:
+        Each refined position with its candidate; whether these exclude every other position; and the best coarse
+        score of those that lie at the window's edge, and were not refined.
     """
     loss = levels.loss
-    found: list[tuple[Peak, tuple[int, int, float]]] = []
+    found: list[tuple[Peak, Candidate]] = []
     best, error, unresolved, is_certain = -math.inf, 0.0, -1.0, True
     for index, candidate in enumerate(candidates):
         if found and is_certain and candidate[2] + error < best:
@@ -208,14 +193,14 @@ def _refined_candidates(
         refined, is_peak = _refined(levels, scores, *candidate[:2]) if index < count else (None, False)
         is_certain = is_certain and is_peak
         if stops and not is_certain:
-            return _Refined([], False, unresolved)
+            return [], False, unresolved
         if refined is None:
             unresolved = max(unresolved, candidate[2]) if index < count else unresolved
             continue
         found.append((refined, candidate))
         best = max(best, refined.score)
         error = max(error, 2.0 * abs(refined.score - candidate[2]) + 0.01, loss * best + 0.01)
-    return _Refined(found, is_certain, unresolved)
+    return found, is_certain, unresolved
 
 
 def _phase_loss(fine: FloatImage, coarse: FloatImage) -> float:
@@ -227,17 +212,13 @@ def _phase_loss(fine: FloatImage, coarse: FloatImage) -> float:
 
 
 def _coarse_rest(
-    scores: FloatImage, rivals: list[tuple[int, int, float]], scale: int, best: Peak, exclusion_px: float
+    scores: FloatImage, rivals: list[Candidate], scale: int, best: Peak, exclusion_px: float
 ) -> float:
     """The best coarse score outside the peak's exclusion zone and away from the refined rivals."""
     remaining, r = scores.copy(), _SEPARATION_PX
     for x, y, _ in rivals:
         remaining[max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1] = -1.0
-    down, across = (
-        np.square(np.arange(n) * scale - at) for n, at in zip(remaining.shape, (best.y, best.x), strict=True)
-    )
-    remaining[down[:, None] + across <= exclusion_px**2] = -1.0
-    return float(remaining.max())
+    return best_outside(remaining, best.x / scale, best.y / scale, exclusion_px / scale)
 
 
 def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak | None, bool]:

@@ -48,7 +48,8 @@ def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradi
     points, shown, expected = np.zeros((3, samples)), np.zeros((3, samples)), np.zeros((3, samples))
     right, bottom, count = width - 1.0 - EDGE_PX, height - 1.0 - EDGE_PX, 0
     for n in range(samples):
-        e, north, up = _from_camera(offset_m, n, shift, slope)
+        e, north = offset_m[0, n] + shift[0], offset_m[1, n] + shift[1]
+        up = offset_m[2, n] + shift[2] + slope[0] * offset_m[0, n] + slope[1] * offset_m[1, n]
         points[0, n], points[1, n], points[2, n] = x, y, z = rotated(rotation, e, north, up)
         if known[n] <= 0.0 or z <= 1e-6:
             continue
@@ -57,18 +58,13 @@ def project(picture, matrix, rotation, center_m, slope, offset_m, pivot_m, gradi
         if not (EDGE_PX < u < right and EDGE_PX < v < bottom):
             continue
         levels[n], by_u, by_v = _bilinear(picture, u, v)
-        shown[0, n], shown[1, n], shown[2, n] = _by_point(matrix, by_u, by_v, across, down, z)
+        shown[0, n] = (matrix[0, 0] * by_u + matrix[1, 0] * by_v) / z
+        shown[1, n] = (matrix[0, 1] * by_u + matrix[1, 1] * by_v) / z
+        shown[2, n] = -(shown[0, n] * across + shown[1, n] * down)
         _from_map(expected, rotation, gradients, n, e, north, up)
         cell[n] = int(v / bottom * CELLS) * CELLS + int(u / right * CELLS)
         weights[n], count = known[n], count + 1
     return levels, points, shown, expected, weights, cell, count
-
-
-@inlined
-def _from_camera(offset_m, n, shift, slope):
-    """East, north and up from the camera to a sample on the sloped ground."""
-    up = offset_m[2, n] + shift[2] + slope[0] * offset_m[0, n] + slope[1] * offset_m[1, n]
-    return offset_m[0, n] + shift[0], offset_m[1, n] + shift[1], up
 
 
 @inlined
@@ -78,14 +74,6 @@ def _from_map(expected, rotation, gradients, n, e, north, up):
     by_up = -(by_e * e + by_n * north) / min(up, -1e-6)
     for k in range(3):
         expected[k, n] = rotation[k, 0] * by_e + rotation[k, 1] * by_n + rotation[k, 2] * by_up
-
-
-@inlined
-def _by_point(matrix, by_u, by_v, across, down, z):
-    """Derivatives by a point in the camera, from those by its pixel."""
-    by_x = (matrix[0, 0] * by_u + matrix[1, 0] * by_v) / z
-    by_y = (matrix[0, 1] * by_u + matrix[1, 1] * by_v) / z
-    return by_x, by_y, -(by_x * across + by_y * down)
 
 
 @inlined

@@ -42,14 +42,13 @@ def gauss_newton(picture, matrix, start, prior, precision, offset_m, values, gra
         last step.
     """
     rotation, center_m, slope = start[0].copy(), start[1].copy(), start[2].copy()
-    step, found, converged, at_first = np.zeros(_PARAMETERS), True, False, np.nan
+    step, converged, at_first = np.zeros(_PARAMETERS), False, np.nan
     for _ in range(MAX_STEPS):
         seen = rotation.copy()
         levels, points, shown, expected, weights, cell, count = project(
             picture, matrix, seen, center_m, slope, offset_m, prior[1], gradients, known
         )
-        if count < MIN_SAMPLES:
-            found = False
+        found = count >= MIN_SAMPLES
         differences, weights, correlation, gain = compare_levels(levels, values, weights)
         for k in range(3):
             for n in range(known.size):

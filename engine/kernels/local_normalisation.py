@@ -5,15 +5,10 @@ Sums of whole grey levels, counted from middle grey, are exact in int32.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from engine.kernels.sums import MIDDLE_GREY
 from engine.runtime.jit import compiled, inlined
-
-MAX_RADIUS_PX = (math.isqrt(np.iinfo(np.int32).max // MIDDLE_GREY**2) - 1) // 2
-"""Radius of the largest neighbourhood whose sum of squares fits into int32."""
 
 
 @compiled("(u1[:, ::1], i8, f8)")
@@ -22,7 +17,8 @@ def normalised(padded, radius_px, noise_variance):
 
     Args:
         padded: (H + 2 radius_px, W + 2 radius_px) uint8, the picture extended beyond its edges.
-        radius_px: neighbourhoods are boxes of 2 radius_px + 1 pixels, at most :data:`MAX_RADIUS_PX`.
+        radius_px: neighbourhoods are boxes of 2 radius_px + 1 pixels, at most
+            :data:`engine.kernels.scores.MAX_RADIUS_PX`.
         noise_variance: added to the variance.
 
     Returns:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,7 +54,7 @@ def find_peak(scores: Picture, *, exclusion_px: float) -> Peak:
     if device_of(scores).type == "cpu":
         around = on_host(scores)
         y, x = row, column = divmod(int(around.argmax()), width)
-        score, second = float(around[y, x]), _second_score(around, x, y, exclusion_px)
+        score, second = float(around[y, x]), best_outside(around, x, y, exclusion_px)
     else:
         from engine.kernels.tensors import peak_numbers
 
@@ -67,13 +69,23 @@ def find_peak(scores: Picture, *, exclusion_px: float) -> Peak:
     return Peak(x + dx, y + dy, score, second, curvature)
 
 
-def _second_score(scores: NDArray[np.float32], x: int, y: int, exclusion_px: float) -> float:
-    """The best of (H, W) outside a disc about the peak."""
-    rest, r = scores.copy(), int(exclusion_px)
-    top, left = max(0, y - r), max(0, x - r)
-    near = rest[top : y + r + 1, left : x + r + 1]
-    rows, columns = np.ogrid[top - y : top - y + near.shape[0], left - x : left - x + near.shape[1]]
-    near[rows * rows + columns * columns <= exclusion_px * exclusion_px] = -1.0
+def best_outside(scores: NDArray[np.float32], x: float, y: float, radius_px: float) -> float:
+    """The best score outside a disc.
+
+    Args:
+        scores: (H, W).
+        x: the disc's middle, which may lie between pixels.
+        y: likewise.
+        radius_px: of the disc.
+
+    Returns:
+        In [-1, 1]; -1 if no position is outside.
+    """
+    rest, r = scores.copy(), math.ceil(radius_px)
+    top, left = max(0, math.floor(y) - r), max(0, math.floor(x) - r)
+    near = rest[top : math.ceil(y) + r + 1, left : math.ceil(x) + r + 1]
+    down, across = np.arange(near.shape[0]) + (top - y), np.arange(near.shape[1]) + (left - x)
+    near[np.square(down)[:, None] + np.square(across) <= radius_px * radius_px] = -1.0
     return float(rest.max())
 
 

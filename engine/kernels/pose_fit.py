@@ -82,7 +82,7 @@ def fit_pose(points, pixels, matrix, weights, attitude, precision, tolerance_px,
     """
     square = tolerance_px * tolerance_px
     reach = slack * slack * square
-    variance, freedom, found = reach / 9.0, np.inf, True
+    variance, student, found = reach / 9.0, 1.0, True
     rotation, center = rotation.copy(), center.copy()
     delta, angles, covariance = np.empty(6), np.empty(3), np.empty((6, 6))
     inliers, information = np.empty(weights.size, np.bool_), np.zeros((6, 6))
@@ -93,7 +93,7 @@ def fit_pose(points, pixels, matrix, weights, attitude, precision, tolerance_px,
         if not found:
             break
         gain, noise = biweight_factors(0.5 * reach / variance)
-        scale = noise * student(freedom) * variance
+        scale = noise * student * variance
         normal, gradient = normal_equations(tangents, projected, squared, pixels, matrix, weights, reach, scale)
         found = _invert(normal, precision, covariance)
         if not found:
@@ -117,6 +117,7 @@ def fit_pose(points, pixels, matrix, weights, attitude, precision, tolerance_px,
         tangents, projected, squared = reproject(points, pixels, matrix, rotation, center)
         # The trace is the number of parameters that the matches determine; the prior determines the rest.
         freedom, mean = 2.0 * count - determined, 0.0
+        student = freedom / max(freedom - 2.0, 1.0)  # of the t's variance over a normal's: it is itself estimated
         for n in range(weights.size):
             if inliers[n]:
                 mean += weights[n] * squared[n]
@@ -213,9 +214,3 @@ def variance_px2(mean, tolerance_px):
         u = min(half / variance, 50.0)
         variance = min(mean / (1.0 - u / math.expm1(u)), half)
     return variance
-
-
-@compiled()
-def student(freedom):
-    """The variance of Student's t over a normal's, since the variance is itself estimated."""
-    return 1.0 if np.isinf(freedom) else freedom / max(freedom - 2.0, 1.0)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import OptionError
+from engine.kernels.sums import MIDDLE_GREY
 
 FloatImage = NDArray[np.float32]
 
 RADIUS_PX = 8
 """Of the local normalisation: neighbourhoods are boxes of 2 x 8 + 1 pixels."""
+MAX_RADIUS_PX = (math.isqrt(np.iinfo(np.int32).max // MIDDLE_GREY**2) - 1) // 2
+"""Of the largest neighbourhood whose sum of squares fits into the compiled loop's int32."""
 # Added to the local variance, in squared grey levels, so that sensor noise on flat ground is not amplified.
 _NOISE_VARIANCE = 4.0
 
@@ -29,26 +34,24 @@ def enhance(
 
     Args:
         gray: (H, W).
-        radius_px: neighbourhoods are boxes of 2 radius_px + 1 pixels.
+        radius_px: neighbourhoods are boxes of 2 radius_px + 1 pixels; at most :data:`MAX_RADIUS_PX`.
         valid: (H, W) bool; pixels where it is False are ignored and 0 in the result.
 
     Returns:
         (H, W) float32.
 
     Raises:
-        OptionError: the radius is below 1.
+        OptionError: the radius is out of range.
     """
-    if radius_px < 1:
-        raise OptionError(f"radius_px: expected 1 or more, got {radius_px}")
-    if valid is None:
-        from engine.kernels.local_normalisation import MAX_RADIUS_PX, normalised  # numba takes a while to import
+    if not 1 <= radius_px <= MAX_RADIUS_PX:
+        raise OptionError(f"radius_px: expected 1 to {MAX_RADIUS_PX}, got {radius_px}")
+    if valid is not None:
+        return _normalised(gray, valid.astype(np.float32), radius_px)
+    from engine.kernels.local_normalisation import normalised  # numba takes a while to import
 
-        if radius_px <= MAX_RADIUS_PX:
-            smooth = cv2.GaussianBlur(gray, (3, 3), 0)
-            padded = cv2.copyMakeBorder(smooth, *(radius_px,) * 4, cv2.BORDER_REFLECT_101)
-            return np.asarray(normalised(padded, radius_px, _NOISE_VARIANCE), np.float32)
-        valid = np.ones(gray.shape, np.bool_)
-    return _normalised(gray, valid.astype(np.float32), radius_px)
+    smooth = cv2.GaussianBlur(gray, (3, 3), 0)
+    padded = cv2.copyMakeBorder(smooth, *(radius_px,) * 4, cv2.BORDER_REFLECT_101)
+    return np.asarray(normalised(padded, radius_px, _NOISE_VARIANCE), np.float32)
 
 
 def orientation(gray: NDArray[np.uint8], *, valid: NDArray[np.bool_] | None = None) -> FloatImage:

@@ -38,7 +38,8 @@ def find_extrema(padded, filters, buffer, layout, rows, border, threshold):
     up, dogs = filters[0].shape[1], len(filters[1]) - 1
     low, high = max(rows[0] - 1, 0) // up, min(rows[1], height - 1) // up + 1  # rows of the source
     searched = max(rows[0], border), min(rows[1], height - border)
-    wide, flat, margin = padded.shape[1], padded.reshape(padded.size), filters[1].max() + TAPS
+    weights, reach = filters
+    wide, flat, margin = padded.shape[1], padded.reshape(padded.size), reach.max() + TAPS
     lines = np.empty((up, _STRIP // up * wide), np.float32)
     filtered = np.empty((2, _STRIP // up * wide), np.float32)
     sizes = np.zeros((dogs, (_STRIP + 2) * width), np.float32)  # |DoG| of a strip and of the two rows before it
@@ -48,7 +49,8 @@ def find_extrema(padded, filters, buffer, layout, rows, border, threshold):
         held = min(_STRIP // up, high - row)
         strip = up * row, min(up * (row + held), height)
         for level in range(dogs + 1):
-            _filter_down(lines, held * wide, flat, (margin + row) * wide, wide, level, filters)
+            start, taps = (margin + row - reach[level]) * wide, _taps(reach[level], up)
+            _slide_phases(lines, held * wide, flat, start, wide, weights[level], taps)
             _filter_across(buffer, lines, held * wide, filtered, wide, strip, level, filters, layout, margin)
         _differ(sizes, buffer, strip, layout)
         if width > 2 * border:
@@ -60,14 +62,6 @@ def find_extrema(padded, filters, buffer, layout, rows, border, threshold):
 def _taps(reach, up):
     """Taps of a filter with its padding; of two phases the second is one sample further on."""
     return (2 * reach + up + TAPS - 1) // TAPS * TAPS
-
-
-@inlined
-def _filter_down(lines, size, flat, at, wide, level, filters):
-    """Filter the columns about a strip of the source that begins at ``at``: its rows once for each phase."""
-    weights, reach = filters
-    start, taps = at - reach[level] * wide, _taps(reach[level], len(lines))
-    _slide_phases(lines, size, flat, start, wide, weights[level], taps)
 
 
 @inlined

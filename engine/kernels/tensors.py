@@ -82,7 +82,7 @@ def peak_numbers(scores: Tensor, exclusion_px: float) -> list[float]:
     """The numbers that define a surface's peak, found on its device and copied at once.
 
     Args:
-        scores: (H', W'); NaN counts as -1.
+        scores: (H', W').
         exclusion_px: radius about the peak within which no rival is counted.
 
     Returns:
@@ -90,8 +90,7 @@ def peak_numbers(scores: Tensor, exclusion_px: float) -> list[float]:
         scores about the peak, those on the border repeated beyond it.
     """
     with torch.inference_mode():
-        scores = scores.float().nan_to_num(nan=-1.0).clamp_(-1.0, 1.0)
-        height, width = scores.shape
+        scores, (height, width) = scores.float(), scores.shape
         index = scores.flatten().argmax(dim=0, keepdim=True)
         row, column = index // width, index % width
         dy, dx = (torch.arange(n, device=index.device) - at for n, at in ((height, row), (width, column)))
@@ -119,9 +118,12 @@ def inverse_norm(sums: Tensor, h: int, w: int) -> Tensor:
 
 def _inverse_norms(sums: Tensor, h: int, w: int, *, zero_mean: bool) -> Tensor:
     """The same in float64 of one picture or many, on request of the squares themselves."""
-    energy, squares = box_energy(sums, h, w) if zero_mean else box_sum(sums[1], h, w), sums[1]
+    (total, energy), squares = box_sum(sums, h, w), sums[1]
+    if zero_mean:
+        energy.addcmul_(total, total, value=-1.0 / (h * w))
     floor = FLAT_SHARE * (squares[..., -1:, -1:] - squares[..., :1, :1])  # no less than the window's own energy
-    return energy.masked_fill_(energy <= floor, torch.inf).rsqrt_()
+    inverse: Tensor = energy.masked_fill_(energy <= floor, torch.inf).rsqrt_()
+    return inverse
 
 
 def correlate(search: Tensor, templates: Tensor) -> Tensor:
@@ -165,19 +167,3 @@ def integrals(image: Tensor) -> Tensor:
     """
     wide = torch.nn.functional.pad(image.double(), (1, 0, 1, 0))
     return torch.stack([wide, wide.square()]).cumsum_(-1).cumsum_(-2)
-
-
-def box_energy(sums: Tensor, h: int, w: int) -> Tensor:
-    """Sum of squares about the mean of every patch.
-
-    Args:
-        sums: (2, ..., H+1, W+1) from :func:`integrals`, or a crop of a larger picture's.
-        h: rows of a patch.
-        w: columns of a patch.
-
-    Returns:
-        (..., H-h+1, W-w+1) float64.
-    """
-    total, square = box_sum(sums, h, w)
-    energy: Tensor = square.addcmul_(total, total, value=-1.0 / (h * w))
-    return energy

@@ -6,16 +6,13 @@ A weights file is opened as tensors only: a pickle that would run code is refuse
 
 from typing import TYPE_CHECKING
 
+from engine.learned.pairs import PairMatcher
 from engine.runtime.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
     from engine.learned.loading import load_matcher
-    from engine.learned.pairs import PairMatcher
 
 __all__ = ["PairMatcher", "load_matcher"]
 
-_NAMES = {"engine.learned.loading": "load_matcher", "engine.learned.pairs": "PairMatcher"}
-"""The public names by module. A module is imported when one of its names is used: networks need torch."""
-
-if not TYPE_CHECKING:  # type checkers see the names above and reject others
-    __getattr__ = imported_on_use(__name__, _NAMES)
+if not TYPE_CHECKING:  # type checkers see the name above and reject others; networks need torch
+    __getattr__ = imported_on_use(__name__, {"engine.learned.loading": "load_matcher"})

@@ -65,17 +65,14 @@ def fill(network: nn.Module, weights: Weights, device: torch.device) -> nn.Modul
         OptionError: they do not fit.
     """
     wanted, tensors = network.state_dict(), weights.tensors
-    lacking = [n for n in wanted if n not in tensors and not n.endswith(_DERIVED)]
-    unknown = [n for n in tensors if n not in wanted and not _UNUSED.fullmatch(n)]
-    misshapen = [n for n in wanted if n in tensors and tensors[n].shape != wanted[n].shape]
-    faults = [
-        f"{what} {_listed(names)}"
-        for what, names in (("lacks", lacking), ("has unknown", unknown), ("has other shapes of", misshapen))
-        if names
-    ]
+    named = {
+        "lacks": [n for n in wanted if n not in tensors and not n.endswith(_DERIVED)],
+        "has unknown": [n for n in tensors if n not in wanted and not _UNUSED.fullmatch(n)],
+        "has other shapes of": [n for n in wanted if n in tensors and tensors[n].shape != wanted[n].shape],
+    }
+    faults = "; ".join(f"{fault} {_listed(names)}" for fault, names in named.items() if names)
     if faults:
-        name = type(network).__name__
-        raise OptionError(f"weights: {weights.path} does not fit {name}: {'; '.join(faults)}")
+        raise OptionError(f"weights: {weights.path} does not fit {type(network).__name__}: {faults}")
     network.load_state_dict(dict(tensors), strict=False)
     return network.to(device).eval().requires_grad_(False)
 

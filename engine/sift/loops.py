@@ -14,7 +14,7 @@ from engine.kernels import sift_descriptors
 from engine.kernels.sift_extrema import TAPS, find_extrema
 from engine.kernels.sift_refinement import refine_extrema
 from engine.runtime import threads
-from engine.sift.descriptors import ORIENT_STEP, orientation_weights, tents
+from engine.sift.descriptors import ORIENT_STEP, ORIENT_WINDOW, SMOOTHING, TENTS
 from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, TRUNCATE, Octave, octaves_of
 from engine.sift.values import Features, SiftChoice
 
@@ -175,16 +175,15 @@ def describe(
     """
     table = np.array([octave.layout for octave in octaves])
     sigma = np.float32(FIRST_SIGMA_PX * octaves[0].up)  # of each octave's first level, in its pixels
-    window, smooth = orientation_weights()
 
     def described(part: tuple[int, int]) -> tuple[Floats, Floats]:
         own = keypoints[slice(*part)]
         if up_rad is None:
             step = np.float32(ORIENT_STEP) * sigma
-            angles = sift_descriptors.angles(gaussians, table, own, step, window, smooth)
+            angles = sift_descriptors.angles(gaussians, table, own, step, ORIENT_WINDOW, SMOOTHING)
         else:
             angles = np.full(len(own), up_rad, np.float32)
-        return angles, sift_descriptors.descriptors(gaussians, table, own, angles, sigma, tents())
+        return angles, sift_descriptors.descriptors(gaussians, table, own, angles, sigma, TENTS)
 
     parts = threads.in_parallel(described, threads.parts(len(keypoints), len(keypoints)))
     angle_rad, descriptors = map(np.concatenate, zip(*parts, strict=True))

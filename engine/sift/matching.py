@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from engine.errors import OptionError
 from engine.runtime.device import Picture, as_float, device_of, on_host, same_kind_as
-from engine.sift.values import ROUNDING, TRAIN_CHUNK, Features, Limits, Matches, fields_of
+from engine.sift.values import ROUNDING, TRAIN_CHUNK, Features, Limits, Matches
 
 Floats = NDArray[np.float32]
 AnyArray = NDArray[Any]
@@ -47,7 +47,7 @@ def match(
         raise OptionError(f"ratio: expected a number in (0, 1], got {ratio}")
     limits, given = (scale, max_scale_factor), query.descriptors
     if device_of(given).type == "cpu":
-        found: tuple[Picture, ...] = _nearest(_as_arrays(query), _as_arrays(train), limits)
+        found: tuple[Picture, ...] = _nearest(query, train, limits)
     else:
         from engine.sift.matching_tensors import nearest  # torch takes a while to import
 
@@ -70,35 +70,30 @@ def tested(nearest: tuple[Picture, ...], ratio: float) -> tuple[Picture, ...]:
     return index, distance, quotient, (distance < math.inf) & (quotient <= ratio) & is_mutual
 
 
-def _as_arrays(features: Features) -> Features:
-    *numbers, valid = fields_of(features)
-    xy_px, scale_px, angle_deg, descriptors = (on_host(as_float(each, "float32")) for each in numbers)
-    return Features(xy_px, scale_px, angle_deg, descriptors, on_host(valid))
-
-
 def _nearest(query: Features, train: Features, limits: Limits) -> tuple[AnyArray, ...]:
     """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best."""
     from engine.kernels import nearest  # numba takes a while to import
 
     scale, max_scale_factor = limits
-    count, slots = max(len(query.valid), len(train.valid)), query.valid.shape[1]
+    own, own_log = _described(query, scale, max_scale_factor is not None)
+    other, other_log = _described(train, 1.0, max_scale_factor is not None)
+    count, slots = max(len(own), len(other)), own.shape[1]
     first, second = np.full((2, count, slots), -np.inf, np.float32)
     index, is_mutual = np.zeros((count, slots), np.int64), np.zeros((count, slots), np.bool_)
     most_log = np.float32(math.inf if max_scale_factor is None else math.log(max_scale_factor))
-    own = _log_scales(query, scale, max_scale_factor is not None)
-    other = _log_scales(train, 1.0, max_scale_factor is not None)
     for n in range(count):
-        q, t = min(n, len(query.valid) - 1), min(n, len(train.valid) - 1)
+        q, t = min(n, len(own) - 1), min(n, len(other) - 1)
         out = (first[n], index[n], second[n], is_mutual[n])
-        for start in range(0, train.valid.shape[1], TRAIN_CHUNK):
+        for start in range(0, other.shape[1], TRAIN_CHUNK):
             end = start + TRAIN_CHUNK
-            cosine = train.descriptors[t, start:end] @ query.descriptors[q].T
-            nearest.two_nearest(cosine, own[q], other[t, start:end], most_log, start, *out)
+            cosine = other[t, start:end] @ own[q].T
+            nearest.two_nearest(cosine, own_log[q], other_log[t, start:end], most_log, start, *out)
     return first, index, second, is_mutual
 
 
-def _log_scales(features: Features, scale: float, is_limited: bool) -> Floats:
-    """(B, N) logarithm of scale if that is limited, else 0; NaN without a keypoint."""
-    sizes = features.scale_px if is_limited else np.ones(features.valid.shape, np.float32)
-    log = np.log(np.where(features.valid, np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
-    return log.astype(np.float32, copy=False)
+def _described(features: Features, scale: float, is_limited: bool) -> tuple[Floats, Floats]:
+    """Descriptors (B, N, 128); (B, N) logarithm of scale if that is limited, else 0, NaN without a keypoint."""
+    valid, descriptors = on_host(features.valid), on_host(as_float(features.descriptors, "float32"))
+    sizes = on_host(as_float(features.scale_px, "float32")) if is_limited else np.ones(valid.shape, np.float32)
+    log = np.log(np.where(valid, np.maximum(sizes * np.float32(scale), 1e-9), np.nan))
+    return descriptors, log.astype(np.float32, copy=False)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine.kernels import local_normalisation
-from engine.kernels.local_normalisation import MAX_RADIUS_PX
+from engine.kernels.scores import MAX_RADIUS_PX
 
 
 def normalised(picture: np.ndarray, radius_px: int, noise_variance: float) -> np.ndarray:

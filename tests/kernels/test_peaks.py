@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engine.kernels.peaks import best_positions, find_peak, fit_peak
-from engine.kernels.tensors import peak_numbers
 from engine.ncc_fft import match_template, prepare
 from tests.support.fields import fields_of
 from tests.support.pretended import DEVICE, pretended_device
@@ -141,14 +140,6 @@ def test_the_peak_on_a_device_is_that_on_the_host(size, exclusion_px):
         found = find_peak(wide.to(DEVICE)[part], exclusion_px=exclusion_px)
     for one, other in zip(fields_of(found), fields_of(expected), strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_nan_never_wins():
-    """And infinities are cut off."""
-    scores = draw((63, 65))[:63, :65]
-    scores[5, 6:9], scores[62, 64] = math.nan, math.inf
-    assert peak_numbers(scores, 5.0)[:2] == [62 * 65 + 64, 1.0]
-    assert peak_numbers(torch.full((63, 65), math.nan), 5.0)[:3] == [0.0, -1.0, -1.0]
 
 
 def test_the_peak_of_a_window_without_texture_is_finite():

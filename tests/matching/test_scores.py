@@ -44,7 +44,7 @@ def test_a_pixel_is_normalised_by_its_neighbourhood(masked):
 
 
 def test_a_neighbourhood_without_a_pixel_is_refused():
-    with pytest.raises(OptionError, match=r"^radius_px: expected 1 or more, got 0"):
+    with pytest.raises(OptionError, match=r"^radius_px: expected 1 to 180, got 0"):
         enhance(noise(), radius_px=0)
 
 
