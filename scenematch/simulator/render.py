@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import LocalFrame
-from engine.values import Attitude
+from engine.values import Attitude, check_positive
 from scenematch.simulator.light import Array, Float32, Image, Light
 from scenematch.simulator.rays import Rays, stretch
 
@@ -43,10 +43,16 @@ class Atmosphere:
     Attributes:
         visibility_m: distance at which 2 % of a contrast is left.
         rgb: the air's own colour in grey levels.
+
+    Raises:
+        OptionError: the visibility is not above 0.
     """
 
     visibility_m: float
-    rgb: tuple[float, float, float]
+    rgb: tuple[float, float, float] = (196.0, 202.0, 210.0)
+
+    def __post_init__(self) -> None:
+        check_positive(self, "visibility_m")
 
 
 @dataclass(frozen=True, eq=False)
