@@ -89,14 +89,12 @@ class LoopAnswer:
         truth: the vehicle's true state then.
         result: the engine's.
         state: the navigator's after it; None if the engine was killed.
-        arrives_s: when the vehicle receives the answer.
     """
 
     timestamp_ns: int
     truth: State
     result: Fix | NoFix
     state: NavigatorState | None
-    arrives_s: float
 
 
 @dataclass
@@ -255,7 +253,7 @@ class ClosedLoop:
             result = self._navigator.update(frame)
             self.flown.resets += self._navigator.reset_count - before
         state = None if self._navigator is None else self._navigator.state
-        answer = LoopAnswer(stamp_ns, self._state, result, state, time_s + self.latency_s)
+        answer = LoopAnswer(stamp_ns, self._state, result, state)
         self.flown.answers.append(answer)
         self._pending.append(answer)
         return frame
@@ -277,7 +275,8 @@ class ClosedLoop:
 
     def _receive(self) -> None:
         """Fuse the fixes that have arrived, each at its own time, if they pass the chi-square gate."""
-        while self._pending and self._pending[0].arrives_s <= self._state.time_s + 0.5 * STEP_S:
+        now_s = self._state.time_s + 0.5 * STEP_S
+        while self._pending and self._pending[0].truth.time_s + self.latency_s <= now_s:
             answer = self._pending.popleft()
             fix, captured_s = answer.result, answer.truth.time_s
             if isinstance(fix, NoFix):
