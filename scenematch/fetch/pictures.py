@@ -81,14 +81,18 @@ def fetch_pictures(
                 file.write_mask(valid * np.uint8(255), window=Window(x, y, *size))
                 known += int(valid.sum())
                 yield int(valid.sum())
-            if not known:
-                raise MapError(
-                    f"source: the server has no data there on level {grid.level!r}, {grid.gsd_m_per_px:.3g} m/px; "
-                    "it may have some with a larger `gsd_m_per_px`"
-                )
+            _check_known(known, grid)
             file.update_tags(**{name: str(value) for name, value in tags.items()})
     except (RasterioError, OSError) as error:
         raise MapError(f"{out}: cannot be written: {str(error).splitlines()[0]}") from None
+
+
+def _check_known(known: int, grid: Grid) -> None:
+    if known == 0:
+        raise MapError(
+            f"source: the server has no data there on level {grid.level!r}, {grid.gsd_m_per_px:.3g} m/px; "
+            "it may have some with a larger `gsd_m_per_px`"
+        )
 
 
 def _read(source: Any, window: Any, url: str, say: Callable[[str], None]) -> NDArray[np.uint8]:
