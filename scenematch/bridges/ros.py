@@ -152,10 +152,10 @@ class RosBridge:
         self._image_topic = topics.image
         handlers: dict[str, tuple[str, Handler]] = {
             topics.image: (topics.image_type, self.on_image),
-            topics.imu: (QUANTITIES["imu"].types[0], self.on_imu),
+            topics.imu: (QUANTITIES["imu"].type, self.on_imu),
         }
         for name in ("compass", "height", "range", "velocity", "odometry"):
-            handlers[getattr(topics, name)] = (QUANTITIES[name].types[0], partial(self._store, name))
+            handlers[getattr(topics, name)] = (QUANTITIES[name].type, partial(self._store, name))
         return {topic: handler for topic, handler in handlers.items() if topic}
 
     def _store(self, name: str, message: Any) -> None:

@@ -211,9 +211,13 @@ def _median_angle(angles_deg: Array) -> tuple[float, float]:
         return 0.0, math.inf
     middle = math.atan2(np.sin(known).sum(), np.cos(known).sum())
     off = wrap_difference_deg(np.degrees(known - middle))
-    spread = 1.4826 * float(np.median(np.abs(off - np.median(off))))
-    middle_deg = wrap_difference_deg(math.degrees(middle) + float(np.median(off)))
-    return middle_deg, max(spread, 0.3) * 1.25 / math.sqrt(known.size)
+    return wrap_difference_deg(math.degrees(middle) + float(np.median(off))), _sigma_of_median(off, 0.3)
+
+
+def _sigma_of_median(values: Array, min_spread: float) -> float:
+    """Standard deviation of the values' median, by their spread about it."""
+    spread = 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    return max(spread, min_spread) * 1.25 / math.sqrt(values.size)
 
 
 def _middle_rotation(turns: Sequence[Array]) -> Array:
@@ -245,8 +249,7 @@ def _height(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None
 
     off_m, factor = float(np.median(measured - height)), float(np.median(measured / height))
     by_offset, by_factor = cost(height + off_m), cost(height * factor)
-    spread_m = 1.4826 * float(np.median(np.abs(measured - height - off_m)))
-    sigma_m = max(spread_m, 0.5) * 1.25 / math.sqrt(known.sum())
+    sigma_m = _sigma_of_median(measured - height, 0.5)
     is_small = abs(off_m) < min(_LEAST_HEIGHT_SHARE * float(np.median(measured)), _LEAST_HEIGHT_SIGMAS * sigma_m)
     if cost(height) < MISFIT or (is_small and not _contradicted(series, seen, ("height",))):
         return None

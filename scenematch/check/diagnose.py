@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
@@ -25,40 +24,8 @@ _MAX_SIGMA_M = 300.0  # of a prior; beyond it the whole map is searched if possi
 _FROZEN_SHARE = 0.1
 
 
-class Telemetry(Protocol):
-    """What is read of one picture's telemetry: of a :class:`engine.values.Frame` or a row of telemetry.csv."""
-
-    @property
-    def timestamp_ns(self) -> int | None:
-        """Of its exposure."""
-
-    @property
-    def roll_deg(self) -> float | None:
-        """Right side down."""
-
-    @property
-    def pitch_deg(self) -> float | None:
-        """Nose up."""
-
-    @property
-    def heading_deg(self) -> float | None:
-        """Clockwise from true north."""
-
-    @property
-    def height_agl_m(self) -> float | None:
-        """Above the ground."""
-
-    @property
-    def east_velocity_mps(self) -> float | None:
-        """Over ground."""
-
-    @property
-    def north_velocity_mps(self) -> float | None:
-        """Over ground."""
-
-
 def diagnose(
-    telemetry: Sequence[Telemetry],
+    telemetry: Sequence[object],
     picture: Callable[[int], Frame],
     site: OrthoMap,
     camera: Camera,
@@ -70,7 +37,8 @@ def diagnose(
     """Compare a flight's telemetry with what its pictures show.
 
     Args:
-        telemetry: of every picture, in the order of capture.
+        telemetry: of every picture, in the order of capture: frames, or rows of telemetry.csv, which name what is
+            read of them alike.
         picture: reads the picture of an index; some thirty are read.
         site: the map.
         camera: the calibration.
@@ -89,12 +57,12 @@ def diagnose(
     static = _frozen(chosen, frames, picture, count)
     if start is not None:
         priors[0] = start
-    seen = sight(frames, [_searched(k, priors, series.time_s, site) for k in chosen], site, camera)
-    if seen.mirrored:
+    seen, are_mirrored = sight(frames, [_searched(k, priors, series.time_s, site) for k in chosen], site, camera)
+    if are_mirrored:
         cure = "take them from the camera before they are flipped"
         static.append(Finding("mirrored", "the pictures are mirrored", cure))
-        return Diagnosis(static, len(chosen), len(seen.sightings), ())
-    sightings = [replace(s, index=chosen[s.index]) for s in seen.sightings]
+        return Diagnosis(static, len(chosen), len(seen), ())
+    sightings = [replace(s, index=chosen[s.index]) for s in seen]
     found = findings(series, sightings, map_sigma_of(site))
     compared, contradicted = is_known(series, sightings), contradictions(series, sightings)
     return Diagnosis(static + found, len(chosen), len(sightings), compared, contradicted)
@@ -118,7 +86,7 @@ def _searched(k: int, priors: Sequence[Prior | None], time_s: Array, site: Ortho
 
 
 def _series(
-    telemetry: Sequence[Telemetry], reference: Sequence[Prior | None], site: OrthoMap, camera: Camera
+    telemetry: Sequence[object], reference: Sequence[Prior | None], site: OrthoMap, camera: Camera
 ) -> TelemetrySeries:
     def column(*names: str) -> Array:
         rows = [[getattr(row, name) for name in names] for row in telemetry]

@@ -133,7 +133,13 @@ def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding
         return None
     if size_m < _TURNING_SIGMAS * sigma_m or aside_deg < _TURNING_LEAST_DEG:
         return None
-    return _named(aside_m, sigma_m, height_m, series)
+    off_px = series.focal_px / height_m * (series.mount.T @ [*aside_m, 0.0])[:2]
+    text = (
+        f"places lie {aside_m[0]:+.1f} m forward and {aside_m[1]:+.1f} m right of their true place, whichever way "
+        "the vehicle heads: the optical centre is off, or the camera's mount and the attitude alike"
+    )
+    cure = f"look at the calibration: cx and cy would be {-off_px[0]:+.0f} and {-off_px[1]:+.0f} px other"
+    return Finding("mount", text, cure, aside_deg, math.degrees(sigma_m / height_m))
 
 
 def _turns_as_told(series: TelemetrySeries, leg: _Leg) -> bool:
@@ -155,18 +161,6 @@ def _common_offset(rows: Array, off: Array, turning: NDArray[np.bool_]) -> tuple
     design = rows[agreeing].reshape(-1, 2)
     information = design.T @ design
     return np.linalg.solve(information, design.T @ off[agreeing].ravel()), information
-
-
-def _named(aside_m: Array, sigma_m: float, height_m: float, series: TelemetrySeries) -> Finding:
-    size_m = float(np.hypot(*aside_m))
-    off_px = series.focal_px / height_m * (series.mount.T @ [*aside_m, 0.0])[:2]
-    text = (
-        f"places lie {aside_m[0]:+.1f} m forward and {aside_m[1]:+.1f} m right of their true place, whichever way "
-        "the vehicle heads: the optical centre is off, or the camera's mount and the attitude alike"
-    )
-    cure = f"look at the calibration: cx and cy would be {-off_px[0]:+.0f} and {-off_px[1]:+.0f} px other"
-    aside_deg, sigma_deg = math.degrees(math.atan2(size_m, height_m)), math.degrees(sigma_m / height_m)
-    return Finding("mount", text, cure, aside_deg, sigma_deg)
 
 
 def _leg(series: TelemetrySeries, a: Sighting, b: Sighting) -> _Leg | None:

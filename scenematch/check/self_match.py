@@ -89,12 +89,9 @@ def _measure(plan: AuditPlan, prepared: PreparedMap, noise: Pictures, center_px:
     site, level, (height, width) = plan.site, plan.level, plan.shape
     middle = site.level_from_full(center_px, level)
     x0, y0 = plan.corner_px(center_px)
-    nothing = SelfMatchStatistics(*[np.array(np.nan)] * len(fields(SelfMatchStatistics)))
-    if not plan.contains(center_px):
-        return nothing
     extent = Window(x0, y0, width, height)
-    if site.valid(extent, level).mean() < MIN_VALID_SHARE:
-        return nothing
+    if not plan.contains(center_px) or site.valid(extent, level).mean() < MIN_VALID_SHARE:
+        return SelfMatchStatistics(*[np.array(np.nan)] * len(fields(SelfMatchStatistics)))
     gray = site.gray(extent, level)
     region = prepared.cut(_window(plan, middle), level)
     scores = surface(region.search, _templates(gray, noise), min_overlap=MIN_VALID_SHARE)

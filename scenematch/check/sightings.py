@@ -41,20 +41,9 @@ class Sighting:
     en_m: Array
 
 
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """The sightings of a flight's pictures.
-
-    Attributes:
-        sightings: in the order of the pictures.
-        mirrored: whether only mirrored pictures gave them.
-    """
-
-    sightings: list[Sighting]
-    mirrored: bool
-
-
-def sight(frames: Sequence[Frame], priors: Sequence[Prior | None], site: OrthoMap, camera: Camera) -> Seen:
+def sight(
+    frames: Sequence[Frame], priors: Sequence[Prior | None], site: OrthoMap, camera: Camera
+) -> tuple[list[Sighting], bool]:
     """The poses of pictures by their features alone, else by correlation over headings and heights.
 
     Args:
@@ -62,6 +51,9 @@ def sight(frames: Sequence[Frame], priors: Sequence[Prior | None], site: OrthoMa
         priors: where each may be; None means anywhere on the map.
         site: the map.
         camera: the calibration.
+
+    Returns:
+        The sightings in the order of the pictures, and whether only mirrored pictures gave them.
     """
     mirrored = [_mirrored(frame) for frame in frames]
     most: list[Sighting] = []
@@ -69,12 +61,12 @@ def sight(frames: Sequence[Frame], priors: Sequence[Prior | None], site: OrthoMa
         matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions())
         found = locate(matcher, frames, priors)
         if _is_enough(found, frames):
-            return Seen(found, mirrored=False)
+            return found, False
         reflected = locate(matcher, mirrored, priors)
         if _is_enough(reflected, frames):
-            return Seen(reflected, mirrored=True)
+            return reflected, True
         most = max(most, found, key=len)
-    return Seen(most, mirrored=False)
+    return most, False
 
 
 def _is_enough(found: Sequence[Sighting], frames: Sequence[Frame]) -> bool:

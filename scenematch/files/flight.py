@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import Camera
-from engine.errors import TelemetryError
+from engine.errors import OptionError, TelemetryError
 from engine.values import Frame, Prior
 from scenematch.files.frames import VIDEO_SUFFIXES, FrameSource, VideoFile, open_frames
 from scenematch.files.logs.readers import is_log, open_log, stamp_frames
@@ -21,6 +21,9 @@ from scenematch.files.ros.bags import BagFrames, is_bag
 from scenematch.files.telemetry import TelemetryRow, open_telemetry
 
 __all__ = ["Flight", "FlightFrame", "camera_info", "open_flight"]
+
+MAX_OFFSET_S = 9e9
+"""Largest offset of the frames' stamps, within 64 bits of nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +84,7 @@ class Flight:
         return len(self.names)
 
     def __iter__(self) -> Iterator[FlightFrame]:
-        for index in range(len(self.names)):
-            yield self.read(index)
+        return map(self.read, range(len(self.names)))
 
     def read(self, index: int) -> FlightFrame:
         """Read one frame; in a video or bag this is fast for ascending indices.
@@ -135,9 +137,12 @@ def open_flight(
         The flight; only the first image has been read.
 
     Raises:
+        OptionError: the offset is not finite, or longer than 64 bits of nanoseconds.
         TelemetryError: a file cannot be read, or a row names a frame that does not exist.
         CalibrationError: the first image has another size than the calibration.
     """
+    if not abs(log_offset_s) <= MAX_OFFSET_S:  # NaN fails too
+        raise OptionError(f"log_offset_s: expected finite seconds, got {log_offset_s}")
     source = BagFrames(Path(frames), image_topic) if is_bag(frames) else open_frames(frames)
     if telemetry is None:
         telemetry = frames if isinstance(source, BagFrames) else subtitles_beside(frames)
@@ -146,7 +151,9 @@ def open_flight(
     of_gimbal = telemetry is None or Path(telemetry).suffix.lower() == ".srt"
     if telemetry is not None and is_log(telemetry):
         log = open_log(telemetry, odometry_topic)
-        rows, height_sources = rows_and_sources_at(log, *stamp_frames(source, log, frame_stamps, log_offset_s))
+        stamps_ns, names = stamp_frames(source, log, frame_stamps)
+        offset_ns = round(log_offset_s * 1e9)
+        rows, height_sources = rows_and_sources_at(log, [stamp_ns + offset_ns for stamp_ns in stamps_ns], names)
     elif telemetry is not None:
         _check_is_table(Path(telemetry))
         rows, remarks = open_telemetry(telemetry, source, source.description, columns)

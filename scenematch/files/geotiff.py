@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from engine.errors import DtypeError, MapError, OptionError, ShapeError
+from engine.errors import MapError
 from engine.runtime.cache_folder import replaced
 
 if TYPE_CHECKING:
     from pyproj import CRS
-
-_DTYPES = ("uint8", "uint16", "int16", "float32", "float64")
 
 
 def write_geotiff(
@@ -35,32 +33,20 @@ def write_geotiff(
 
     Args:
         path: the file, replaced in one step if it exists.
-        array: (H, W) or (H, W, 3) of uint8, uint16, int16, float32 or float64.
+        array: (H, W) or (H, W, 3) of numbers.
         pixel_to_crs: (2, 3) affine transform to units of the CRS.
         crs: EPSG code of the CRS, or the CRS.
         nodata: the value of pixels without data, or None.
         tags: metadata items, such as :data:`engine.maps.accuracy.GEOREFERENCE_TAG`.
 
     Raises:
-        ShapeError: an argument has the wrong shape.
-        DtypeError: the element type is not one of those above.
-        OptionError: the affine transform is not finite, or is singular.
         MapError: the EPSG code is unknown, or the file cannot be written.
     """
     import rasterio
     from rasterio.errors import RasterioError
 
-    array, affine = np.asarray(array), np.asarray(pixel_to_crs, dtype=np.float64)
-    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or 0 in array.shape:
-        raise ShapeError(f"array: expected (H, W) or (H, W, 3) with at least one pixel, got {array.shape}")
-    if array.dtype.name not in _DTYPES:
-        raise DtypeError(f"array: expected one of {', '.join(_DTYPES)}, got {array.dtype}")
-    if affine.shape != (2, 3):
-        raise ShapeError(f"pixel_to_crs: expected (2, 3), got {affine.shape}")
-    if not np.isfinite(affine).all() or np.linalg.det(affine[:, :2]) == 0.0:
-        raise OptionError(f"pixel_to_crs: expected a finite, invertible affine transform, got {affine.tolist()}")
-    corner = affine.copy()
-    corner[:, 2] -= 0.5 * (affine[:, 0] + affine[:, 1])
+    corner = np.array(pixel_to_crs, np.float64)
+    corner[:, 2] -= 0.5 * (corner[:, 0] + corner[:, 1])
     bands = array if array.ndim == 3 else array[:, :, None]
     try:
         profile = tiled_profile(bands.shape, bands.dtype.name, corner, crs)

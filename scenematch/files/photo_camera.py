@@ -73,7 +73,8 @@ def _camera_of(tags: PhotoTags) -> PhotoCamera:
     if zoom > 1.0:
         raise CalibrationError(f"{tags.path}: expected no digital zoom, got {zoom:g}; give `hfov_deg` or `camera`")
     plane, film = _plane_focal_px(tags), _film_focal_px(tags)
-    if plane is None and film is None:
+    focal_px = film if plane is None else plane
+    if focal_px is None:
         raise CalibrationError(
             f"{tags.path}: expected a focal length with the size of the sensor, or as 35 mm equivalent, in its "
             "EXIF, got neither; give `hfov_deg` or `camera`"
@@ -83,10 +84,8 @@ def _camera_of(tags: PhotoTags) -> PhotoCamera:
             f"{tags.path}: expected one focal length in its EXIF, got {plane:.0f} px by FocalPlaneXResolution and "
             f"{film:.0f} px by FocalLengthIn35mmFilm; give `hfov_deg` or `camera`"
         )
-    if plane is not None:
-        return _ideal(tags, plane), "FocalLength and FocalPlaneXResolution"
-    assert film is not None  # one of the two is known
-    return _ideal(tags, film), "FocalLengthIn35mmFilm"
+    source = "FocalLengthIn35mmFilm" if plane is None else "FocalLength and FocalPlaneXResolution"
+    return _ideal(tags, focal_px), source
 
 
 def _ideal(tags: PhotoTags, focal_px: float) -> Camera:

@@ -162,14 +162,13 @@ def _exif_row(tags: PhotoTags) -> TelemetryRow | None:
     if stamp_ns is None:
         return None
     height_m = tags.xmp.get("RelativeAltitude", 0.0)
-    height_known = height_m > 0.0
+    height = {"height_agl_m": height_m, "height_sigma_m": take_off_sigma_m(height_m)} if height_m > 0.0 else {}
     attitude = {} if tags.was_turned else gimbal_columns(tags.xmp, _GIMBAL) or _flight_heading(tags)
     return TelemetryRow(
         timestamp_ns=stamp_ns,
         frame=tags.path.name,
-        height_agl_m=height_m if height_known else None,
-        height_sigma_m=take_off_sigma_m(height_m) if height_known else None,
         alt_amsl_m=_altitude_m(tags.gps),
+        **height,
         **attitude,
         **_position(tags.gps),
     )
@@ -232,6 +231,11 @@ def _flight_heading(tags: PhotoTags) -> dict[str, float]:
 def gimbal_columns(values: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
     """Telemetry columns from a gimbal's angles; none if one is missing or all are zero, as without a gimbal.
 
+    They are the attitude of a body with the gimbal's camera mounted nadir, the image's top towards the nose. DJI's
+    angles rotate the camera's forward, right and down axes; a pitch of -90 degrees is nadir. The camera's forward
+    is the body's down, its up the body's forward. The result is the same with a roll of 180 degrees, as some
+    models write it.
+
     Args:
         values: numbers by name.
         names: of the gimbal's roll, its pitch, where -90 looks straight down, and its yaw from true north.
@@ -239,7 +243,8 @@ def gimbal_columns(values: Mapping[str, float], names: Sequence[str]) -> dict[st
     angles_deg = [values[name] for name in names if name in values]
     if len(angles_deg) < 3 or not any(angles_deg):
         return {}
-    roll_deg, pitch_deg, heading_deg = nadir_attitude(*angles_deg)
+    forward, right, down = enu_from_body(*angles_deg).T
+    roll_deg, pitch_deg, heading_deg = attitude_from_rotation(np.stack([-down, right, forward], axis=1))
     return {
         "roll_deg": roll_deg,
         "pitch_deg": pitch_deg,
@@ -247,24 +252,3 @@ def gimbal_columns(values: Mapping[str, float], names: Sequence[str]) -> dict[st
         "heading_sigma_deg": COMPASS_SIGMA_DEG,
         "tilt_sigma_deg": GIMBAL_SIGMA_DEG,
     }
-
-
-def nadir_attitude(
-    gimbal_roll_deg: float, gimbal_pitch_deg: float, gimbal_yaw_deg: float
-) -> tuple[float, float, float]:
-    """Attitude of a body with the gimbal's camera mounted nadir, the image's top towards the nose.
-
-    DJI's angles rotate the camera's forward, right and down axes; a pitch of -90 degrees is nadir. The camera's
-    forward is the body's down, its up the body's forward. The result is the same with a roll of 180 degrees, as
-    some models write it.
-
-    Args:
-        gimbal_roll_deg: roll in degrees.
-        gimbal_pitch_deg: pitch in degrees, -90 looks straight down.
-        gimbal_yaw_deg: yaw in degrees, clockwise from true north.
-
-    Returns:
-        Roll, pitch and heading in degrees.
-    """
-    forward, right, down = enu_from_body(gimbal_roll_deg, gimbal_pitch_deg, gimbal_yaw_deg).T
-    return attitude_from_rotation(np.stack([-down, right, forward], axis=1))

@@ -147,11 +147,10 @@ def _kinds(cls: type[Any]) -> dict[str, Any]:
     """Types, by name, of the fields that a file can express: scalars, lists and tables."""
     hints = typing.get_type_hints(cls)
     kinds = {field.name: hints[field.name] for field in fields(cls)}
-    return {name: kind for name, kind in kinds.items() if _is_expressible(kind)}
-
-
-def _is_expressible(kind: Any) -> bool:
-    return is_dataclass(kind) or _plain(kind) is not None or typing.get_origin(kind) in (tuple, dict)
+    return {
+        name: kind for name, kind in kinds.items()
+        if is_dataclass(kind) or _plain(kind) is not None or typing.get_origin(kind) in (tuple, dict)
+    }  # fmt: skip
 
 
 def _plain(kind: Any) -> type | None:

@@ -24,10 +24,7 @@ STAMP_COLUMNS = ("timestamp_ns", "timestamp_us", "timestamp_ms", "timestamp_s", 
 OTHER_STAMPS = {STAMP_COLUMNS[0]: STAMP_COLUMNS[1:]}
 """Columns that may replace ``timestamp_ns``."""
 _UNIT_NS = {"timestamp_ns": 1, "timestamp_us": 10**3, "timestamp_ms": 10**6, "timestamp_s": 10**9}
-_WORDS = {
-    "timestamp_ns": "nanoseconds", "timestamp_us": "microseconds", "timestamp_ms": "milliseconds",
-    "timestamp_s": "seconds",
-}  # fmt: skip
+_WORDS = dict(zip(_UNIT_NS, ("nanoseconds", "microseconds", "milliseconds", "seconds"), strict=True))
 _SHORTEST_NS = 10**6  # between two frames
 _USUAL_NS = (5 * 10**6, 20 * 10**9)  # between two frames, if the unit is unknown
 _UTC_NS = (10**18, 41 * 10**17)  # the years 2001 to 2099
@@ -108,10 +105,8 @@ def since_1970_ns(time: datetime, fraction: str) -> int:
 def _number(row: CsvRow, column: str) -> Decimal:
     text = row.values[column]
     if not text or not _NUMBER.fullmatch(text):
-        expected = (
-            f"whole {_WORDS[column]}" if column == "timestamp_ns" and not text else "a number or a date in UTC"
-        )
-        raise row.error(column, expected)
+        is_blank = column == "timestamp_ns" and not text
+        raise row.error(column, "whole nanoseconds" if is_blank else "a number or a date in UTC")
     return Decimal(text)
 
 

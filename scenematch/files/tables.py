@@ -19,7 +19,6 @@ from typing import Any, TextIO
 
 from engine.errors import TelemetryError
 from engine.geo import wrap_heading_deg
-from engine.values import MAX_SIGMA_M
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -43,14 +42,7 @@ class Bounds:
 
 ANY = Bounds(-math.inf, math.inf, "a finite number")
 HEADING = Bounds(-360.0, 360.0, "degrees from -360 to 360")
-HALF_TURN = Bounds(-180.0, 180.0, "degrees from -180 to 180")
-QUARTER_TURN = Bounds(-90.0, 90.0, "degrees from -90 to 90")
-LONGITUDE = Bounds(-180.0, 360.0, "degrees from -180 to 360")
-POSITIVE = Bounds(math.ulp(0.0), math.inf, "a finite number above 0")
-NOT_NEGATIVE = Bounds(0.0, math.inf, "a finite number of 0 or more")
-SIGMA = Bounds(0.0, MAX_SIGMA_M, f"a number from 0 to {MAX_SIGMA_M:g}")
-POSITIVE_SIGMA = Bounds(math.ulp(0.0), MAX_SIGMA_M, f"a number above 0 and at most {MAX_SIGMA_M:g}")
-"""Ranges of the columns of telemetry, truth and track."""
+"""Ranges of columns; others are given where the columns are."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,31 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import TelemetryError
-from engine.values import Prior
+from engine.values import MAX_SIGMA_M, Prior
 from scenematch.files.stamps import OTHER_STAMPS, STAMP_COLUMNS, read_stamps
-from scenematch.files.tables import (
-    ANY,
-    HALF_TURN,
-    HEADING,
-    LONGITUDE,
-    POSITIVE,
-    POSITIVE_SIGMA,
-    QUARTER_TURN,
-    SIGMA,
-    CsvRow,
-    read_table,
-    write_known,
-)
+from scenematch.files.tables import ANY, HEADING, Bounds, CsvRow, read_table, write_known
 
 __all__ = [
-    "COLUMNS",
-    "DEFAULT_PRIOR_SIGMA_M",
-    "TelemetryRow",
-    "ground_amsl_m",
-    "open_telemetry",
-    "read_telemetry",
+    "COLUMNS", "DEFAULT_PRIOR_SIGMA_M", "TelemetryRow", "ground_amsl_m", "open_telemetry", "read_telemetry",
     "write_telemetry",
-]
+]  # fmt: skip
 
 DEFAULT_PRIOR_SIGMA_M = 15.0
 """Standard deviation, per axis, of a prior whose ``sigma_m`` is blank: a poor single-frequency GPS position."""
@@ -102,21 +85,24 @@ def take_off_sigma_m(height_m: float) -> float:
 
 
 _TAKE_OFF_M, _TAKE_OFF_SHARE = 5.0, 0.05
+_ABOVE_0 = math.ulp(0.0)
+_QUARTER_TURN = Bounds(-90.0, 90.0, "degrees from -90 to 90")
+_SIGMA = Bounds(_ABOVE_0, MAX_SIGMA_M, f"a number above 0 and at most {MAX_SIGMA_M:g}")
 BOUNDS = {
-    "height_agl_m": POSITIVE,
-    "height_sigma_m": POSITIVE_SIGMA,
+    "height_agl_m": Bounds(_ABOVE_0, math.inf, "a finite number above 0"),
+    "height_sigma_m": _SIGMA,
     "alt_amsl_m": ANY,
     "heading_deg": HEADING,
-    "heading_sigma_deg": POSITIVE_SIGMA,
-    "roll_deg": HALF_TURN,
-    "pitch_deg": QUARTER_TURN,
-    "tilt_sigma_deg": POSITIVE_SIGMA,
+    "heading_sigma_deg": _SIGMA,
+    "roll_deg": Bounds(-180.0, 180.0, "degrees from -180 to 180"),
+    "pitch_deg": _QUARTER_TURN,
+    "tilt_sigma_deg": _SIGMA,
     "east_velocity_mps": ANY,
     "north_velocity_mps": ANY,
-    "velocity_sigma_mps": POSITIVE_SIGMA,
-    "lat_deg": QUARTER_TURN,
-    "lon_deg": LONGITUDE,
-    "sigma_m": SIGMA,
+    "velocity_sigma_mps": _SIGMA,
+    "lat_deg": _QUARTER_TURN,
+    "lon_deg": Bounds(-180.0, 360.0, "degrees from -180 to 360"),
+    "sigma_m": Bounds(0.0, MAX_SIGMA_M, f"a number from 0 to {MAX_SIGMA_M:g}"),
 }
 _DECIMALS = {"lat_deg": 9, "lon_deg": 9} | dict.fromkeys(
     ("height_agl_m", "height_sigma_m", "alt_amsl_m", "sigma_m"), 3

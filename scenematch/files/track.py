@@ -9,18 +9,11 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from engine.values import Fix, NoFix, Reason
-from scenematch.files.tables import (
-    LONGITUDE,
-    NOT_NEGATIVE,
-    QUARTER_TURN,
-    CsvRow,
-    cell_text,
-    cells_of,
-    read_table,
-    write_table,
-)
+from scenematch.files.tables import Bounds, CsvRow, cell_text, cells_of, read_table, write_table
+from scenematch.files.telemetry import BOUNDS
 
 __all__ = ["TrackRow", "read_track", "track_row", "with_notes", "write_notes", "write_track"]
 
@@ -114,10 +107,12 @@ COLUMNS = _NAMES[: _NAMES.index("state")]
 NOTE_COLUMNS = ("frame", *_NAMES[len(COLUMNS) : -1])
 """The header of notes.csv."""
 _LATER = NOTE_COLUMNS[NOTE_COLUMNS.index("sigma_up_m") :]  # columns of notes.csv that older runs lack
+_OF_A_FIX = ("lat_deg", "lon_deg", "east_m", "north_m", "up_m", "confidence")  # columns that a Fix has by name
+_ANGLE_SIGMAS = ("roll_sigma_deg", "pitch_sigma_deg", "heading_sigma_deg")
 _POSITION = ("lat_deg", "lon_deg", "east_m", "north_m", "sigma_east_m", "sigma_north_m", "covariance_en_m2")
-_BOUNDS = {"lat_deg": QUARTER_TURN, "lon_deg": LONGITUDE} | dict.fromkeys(
-    ("sigma_east_m", "sigma_north_m", "latency_ms"), NOT_NEGATIVE
-)
+_NOT_NEGATIVE = Bounds(0.0, math.inf, "a finite number of 0 or more")
+_BOUNDS = {name: BOUNDS[name] for name in ("lat_deg", "lon_deg")}
+_BOUNDS |= dict.fromkeys(("sigma_east_m", "sigma_north_m", "latency_ms"), _NOT_NEGATIVE)
 _DECIMALS = {"lat_deg": 9, "lon_deg": 9, "covariance_en_m2": 6} | dict.fromkeys(
     ("east_m", "north_m", "up_m", "latency_ms"), 3
 )
@@ -145,7 +140,7 @@ def track_row(
         timestamp_ns=result.timestamp_ns,
         frame=name,
         status="no_fix" if isinstance(result, NoFix) else "fix",
-        score=None if result.score is None else float(result.score),
+        score=_number(result.score),
         method=result.method,
         window_width_px=None if window is None else window.width_px,
         window_height_px=None if window is None else window.height_px,
@@ -160,31 +155,30 @@ def track_row(
     return _with_fix(row, result)
 
 
+def _number(value: float | None) -> float | None:
+    """A number of NumPy's as Python's."""
+    return None if value is None else float(value)
+
+
 def _with_fix(row: TrackRow, result: Fix) -> TrackRow:
     """The row with what only a fix has."""
     covariance, level_m = result.covariance_m2, result.protection_level_m()
     # If no height was measured, roll and pitch are the telemetry's or unknown.
     tilt = None if result.up_m is None else result.attitude
-    roll_sigma_deg, pitch_sigma_deg, heading_sigma_deg = result.attitude_sigma_deg or (None, None, None)
+    numbers: dict[str, Any] = {name: _number(getattr(result, name)) for name in _OF_A_FIX}
+    if result.attitude_sigma_deg is not None:
+        numbers |= zip(_ANGLE_SIGMAS, result.attitude_sigma_deg, strict=True)
     return replace(
         row,
-        lat_deg=float(result.lat_deg),
-        lon_deg=float(result.lon_deg),
-        east_m=float(result.east_m),
-        north_m=float(result.north_m),
-        up_m=None if result.up_m is None else float(result.up_m),
+        **numbers,
         sigma_east_m=math.sqrt(covariance[0, 0]),
         sigma_north_m=math.sqrt(covariance[1, 1]),
         covariance_en_m2=float(covariance[0, 1]),
         heading_deg=None if result.attitude is None else float(result.attitude.heading_deg),
         stage=result.stage,
-        confidence=None if result.confidence is None else float(result.confidence),
         sigma_up_m=None if result.up_m is None else math.sqrt(covariance[2, 2]),
         roll_deg=None if tilt is None else float(tilt.roll_deg),
         pitch_deg=None if tilt is None else float(tilt.pitch_deg),
-        roll_sigma_deg=roll_sigma_deg,
-        pitch_sigma_deg=pitch_sigma_deg,
-        heading_sigma_deg=heading_sigma_deg,
         protection_level_m=level_m if math.isfinite(level_m) else None,
     )
 

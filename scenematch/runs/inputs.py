@@ -14,9 +14,9 @@ from engine.errors import CalibrationError, OptionError, TelemetryError
 from engine.orthomap import OrthoMap
 from engine.values import Prior, Truth
 from scenematch.files.corrections import Corrections
-from scenematch.files.flight import Flight, open_flight, subtitles_beside
+from scenematch.files.flight import MAX_OFFSET_S, Flight, open_flight, subtitles_beside
 from scenematch.files.frames import VIDEO_SUFFIXES, PictureFolder, opened_picture
-from scenematch.files.logs.readers import MAX_OFFSET_S, is_log, is_photographs, open_truth
+from scenematch.files.logs.readers import is_log, is_photographs, open_truth
 from scenematch.files.ros.bags import is_bag
 from scenematch.files.telemetry import TelemetryRow
 from scenematch.files.track import TrackRow

@@ -35,8 +35,7 @@ class Condition:
         leaves: density of the trees' crowns; the rest shows the ground between branches.
         turned: share of the foliage in autumn colours.
         dry: 0 green to 1 withered lawns and crops.
-        visibility_m: distance at which 2 % of a contrast remains (Koschmieder); inf is perfectly clear.
-        air_rgb: colour of the air, in grey levels.
+        air: between camera and ground; None is perfectly clear.
         lamps: strength of the street lamps.
         noise: the sensor's noise as a multiple of its own.
 
@@ -50,21 +49,14 @@ class Condition:
     leaves: float = 1.0
     turned: float = 0.0
     dry: float = 0.0
-    visibility_m: float = math.inf
-    air_rgb: tuple[float, float, float] = (196.0, 202.0, 210.0)
+    air: Atmosphere | None = None
     lamps: float = 0.0
     noise: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("shade", "snow", "leaves", "turned", "dry", "lamps"):
             check(self, name, "0 to 1", lambda share: 0.0 <= share <= 1.0)
-        for name in ("visibility_m", "noise"):
-            check(self, name, "above 0", lambda value: value > 0.0)
-
-    @property
-    def air(self) -> Atmosphere | None:
-        """The air between camera and ground, None if perfectly clear."""
-        return None if math.isinf(self.visibility_m) else Atmosphere(self.visibility_m, self.air_rgb)
+        check(self, "noise", "above 0", lambda factor: factor > 0.0)
 
     def sensor(self, sensor: Sensor) -> Sensor:
         """The camera's sensor on this day."""
@@ -72,9 +64,8 @@ class Condition:
 
 
 def _light(azimuth_deg: float, elevation_deg: float, sun: Array, sky: Array) -> Light:
-    r, g, b = (float(v) for v in sun)
-    x, y, z = (float(v) for v in sky)
-    return Light(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, sun_rgb=(r, g, b), sky_rgb=(x, y, z))
+    colours = {"sun_rgb": tuple(sun.tolist()), "sky_rgb": tuple(sky.tolist())}
+    return Light(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, **colours)
 
 
 _WARM, _PALE = np.array([1.0, 0.86, 0.66]), np.array([1.0, 0.96, 0.9])
@@ -84,11 +75,11 @@ CONDITIONS = {
     "noon": Condition(light=LIGHTS["noon"]),
     "evening": Condition(light=LIGHTS["evening"]),
     "morning": Condition(
-        light=_light(96.0, 19.0, 1.45 * _WARM, 0.33 * _BLUE), shade=0.4, visibility_m=4000.0
+        light=_light(96.0, 19.0, 1.45 * _WARM, 0.33 * _BLUE), shade=0.4, air=Atmosphere(4000.0)
     ),
     "overcast": Condition(light=_light(180.0, 50.0, 0.0 * _GREY, 0.84 * _GREY), shade=0.75),
     "haze": Condition(
-        light=_light(170.0, 50.0, 0.5 * _PALE, 0.5 * _GREY), shade=0.4, visibility_m=900.0, air_rgb=(188, 194, 202)
+        light=_light(170.0, 50.0, 0.5 * _PALE, 0.5 * _GREY), shade=0.4, air=Atmosphere(900.0, (188, 194, 202))
     ),
     "autumn": Condition(
         light=_light(205.0, 29.0, 1.25 * _PALE, 0.38 * _BLUE), shade=0.4, leaves=0.8, turned=0.85, dry=0.4

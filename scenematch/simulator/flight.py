@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.camera import NADIR_PITCH_DEG, Camera
 from engine.errors import OptionError
 from engine.geo import Array, LocalFrame
 from engine.values import Attitude, Frame, Truth
 from scenematch.simulator.light import Float32, Image
-from scenematch.simulator.optics import Sensor, take_picture
+from scenematch.simulator.optics import Sensor, through_lens
 from scenematch.simulator.render import transformer
 from scenematch.simulator.town import Town, build_town, generator
 from scenematch.simulator.vehicle import (
@@ -79,7 +78,7 @@ def picture_at(
         east_north_up_m: (3,) the camera's position in it, up above the world's height 0.
         attitude: of the body, about true north.
         rng: of the sensor's noise and exposure.
-        moments: of the exposure, see :func:`scenematch.simulator.optics.take_picture`.
+        moments: of the exposure, see :func:`scenematch.simulator.optics.through_lens`.
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -88,8 +87,8 @@ def picture_at(
         OptionError: the camera looks above the horizon, or is not above the highest roof.
     """
     grid, up = grid_at(town, origin, east_north_up_m), float(east_north_up_m[2])
-    sensor = town.condition.sensor(DRONE_SENSOR)
-    return take_picture(town.world, camera, grid, up, attitude, rng, sensor=sensor, moments=moments)
+    seen = through_lens(town.world, camera, grid, up, attitude, moments)
+    return town.condition.sensor(DRONE_SENSOR).develop(seen, rng)
 
 
 def truth_at(town: Town, origin: LocalFrame, timestamp_ns: int, position_m: Array, attitude: Attitude) -> Truth:
@@ -159,7 +158,7 @@ class FlightPlan:
             k: index of the frame.
 
         Returns:
-            (H, W, 2) each, see :func:`scenematch.simulator.optics.take_picture`.
+            (H, W, 2) each, see :func:`scenematch.simulator.optics.through_lens`.
         """
         return ()
 
@@ -266,7 +265,8 @@ def plan_flight(
     style, camera = style or FlightStyle(), camera or paper_camera()
     town = town or build_town(seed, **town_options)
     motion, origin = _fly_over(town, camera, style, generator(seed, 0xF1))
-    stamps_ns = _stamps_ns(motion, frames, rate_hz)
+    count = int(motion.time_s[-1] * rate_hz) + 1
+    stamps_ns = np.rint(np.arange(min(count, frames or count)) * 1e9 / rate_hz).astype(np.int64)
     time_s = np.asarray(stamps_ns * 1e-9, np.float64)
     truth = motion.at(time_s)
     telemetry = simulate_telemetry(truth, noise or SensorNoise(), generator(seed, 0x5E))
@@ -284,9 +284,3 @@ def _fly_over(
     motion = fly_waypoints(_waypoints(town, camera, style.height_agl_m, rng), style, rng)
     motion.position_m[:, 2] += town.world.ground_at(grid_at(town, origin, motion.position_m[0]))
     return motion, origin
-
-
-def _stamps_ns(motion: Motion, frames: int | None, rate_hz: float) -> NDArray[np.int64]:
-    """Times (N,) of the frames since take-off in nanoseconds."""
-    count = int(motion.time_s[-1] * rate_hz) + 1
-    return np.asarray(np.rint(np.arange(min(count, frames or count)) * 1e9 / rate_hz), np.int64)

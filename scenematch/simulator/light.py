@@ -34,8 +34,8 @@ class Light:
 
     azimuth_deg: float
     elevation_deg: float
-    sun_rgb: tuple[float, float, float]
-    sky_rgb: tuple[float, float, float]
+    sun_rgb: tuple[float, ...]
+    sky_rgb: tuple[float, ...]
 
     @property
     def towards_sun(self) -> tuple[float, float, float]:

@@ -29,18 +29,11 @@ from scenematch.simulator import ekf
 from scenematch.simulator.faults import Fault, ShiftedMap
 from scenematch.simulator.light import Image
 from scenematch.simulator.pilot import Pilot, Route, Setpoint
-from scenematch.simulator.quadrotor import STEP_S, State, Wind, WindField, advance, hovering, shaken
+from scenematch.simulator.quadrotor import STEP_S, State, WindField, advance, hovering, shaken
 from scenematch.simulator.sensors import Instruments, SensorSuite, steps_between
 from scenematch.simulator.vehicle import START_NS
 
-__all__ = [
-    "ClosedLoop",
-    "Fault",
-    "LoopAnswer",
-    "LoopResult",
-    "LoopSample",
-    "Mode",
-]
+__all__ = ["ClosedLoop", "Fault", "LoopAnswer", "LoopResult", "LoopSample", "Mode"]
 
 FRAME_RATE_HZ, LATENCY_S = 5.0, 0.12
 """Of the camera, and from the capture of a frame to the arrival of its fix."""
@@ -95,14 +88,12 @@ class LoopAnswer:
         truth: the vehicle's true state then.
         result: the engine's.
         state: the navigator's after it; None if the engine was killed.
-        arrives_s: when the vehicle receives the answer.
     """
 
     timestamp_ns: int
     truth: State
     result: Fix | NoFix
     state: NavigatorState | None
-    arrives_s: float
 
 
 @dataclass
@@ -165,7 +156,7 @@ class ClosedLoop:
         self._route, self._camera, self.fault, self.latency_s = route, camera, fault or Fault(), latency_s
         self._suite = SensorSuite()
         self._map = ShiftedMap(matcher)
-        self._air, self._pilot = WindField(Wind(), air), Pilot()
+        self._air, self._pilot = WindField(air), Pilot()
         self._instruments = Instruments(self._suite, sensors)
         self._state = hovering(route.position_m[0], float(route.heading_deg[0]))
         self._history = ekf.History(self._initial_estimate(start), self._suite, 1.0 + latency_s)
@@ -261,7 +252,7 @@ class ClosedLoop:
             result = self._navigator.update(frame)
             self.flown.resets += self._navigator.reset_count - before
         state = None if self._navigator is None else self._navigator.state
-        answer = LoopAnswer(stamp_ns, self._state, result, state, time_s + self.latency_s)
+        answer = LoopAnswer(stamp_ns, self._state, result, state)
         self.flown.answers.append(answer)
         self._pending.append(answer)
         return frame
@@ -282,11 +273,20 @@ class ClosedLoop:
         )
 
     def _receive(self) -> None:
-        """Fuse the fixes that have arrived, each at its own time."""
-        while self._pending and self._pending[0].arrives_s <= self._state.time_s + 0.5 * STEP_S:
+        """Fuse the fixes that have arrived, each at its own time, if they pass the chi-square gate."""
+        now_s = self._state.time_s + 0.5 * STEP_S
+        while self._pending and self._pending[0].truth.time_s + self.latency_s <= now_s:
             answer = self._pending.popleft()
-            if isinstance(answer.result, Fix):
-                self._gate(answer.result, answer)
+            fix, captured_s = answer.result, answer.truth.time_s
+            if isinstance(fix, NoFix):
+                continue
+            self._last_fix_s = captured_s
+            if ekf.fix_chi_square(self._history.at(captured_s), fix) > _GATE:
+                self._contradictions += 1
+                continue
+            self._contradictions = 0
+            self._history.fuse(partial(ekf.fuse_fix, fix=fix), captured_s)
+            self.flown.used.append(answer.timestamp_ns)
 
     def _choose_mode(self) -> None:
         estimate = self._history.now
@@ -298,17 +298,6 @@ class ClosedLoop:
             self._mode = Mode.HOLD
         elif sigma_m < 0.5 * _HOLD_SIGMA_M and off_m < _RESUME_M:
             self._mode = Mode.FOLLOW
-
-    def _gate(self, fix: Fix, answer: LoopAnswer) -> None:
-        """Fuse a fix if it passes the chi-square gate; otherwise count it."""
-        captured_s = answer.truth.time_s
-        self._last_fix_s = captured_s
-        if ekf.fix_chi_square(self._history.at(captured_s), fix) > _GATE:
-            self._contradictions += 1
-            return
-        self._contradictions = 0
-        self._history.fuse(partial(ekf.fuse_fix, fix=fix), captured_s)
-        self.flown.used.append(answer.timestamp_ns)
 
     def _record(self) -> None:
         """Add a row to the record."""

@@ -65,18 +65,15 @@ class Sensor:
         return np.asarray(np.clip(np.rint(picture), 0, 255), dtype=np.uint8)
 
 
-def take_picture(
+def through_lens(
     world: World,
     camera: Camera,
     grid_m: tuple[float, float],
     up_m: float,
     attitude: Attitude,
-    rng: np.random.Generator,
-    *,
-    sensor: Sensor,
     moments: Sequence[Float32] = (),
 ) -> Image:
-    """The picture that a real camera delivers.
+    """What a real lens shows its sensor during an exposure.
 
     What each row sees at each time is resampled from one sharp pinhole picture via the ground plane. This
     misplaces a 20 m roof seen from 150 m by 13 % of the distance flown meanwhile: centimetres.
@@ -87,8 +84,6 @@ def take_picture(
         grid_m: its (easting, northing) in the world's CRS at the stamp.
         up_m: above the world's height 0.
         attitude: of the body, about true north.
-        rng: of noise and exposure.
-        sensor: how light becomes grey levels.
         moments: of the exposure, each as the rays (H, W, 2), x / z and y / z in the pose at the stamp, that the
             pixels then see; the picture is their mean. None freezes motion.
 
@@ -98,10 +93,23 @@ def take_picture(
     Raises:
         OptionError: the camera looks above the horizon, is too low, or its lens is too wide for a pinhole picture.
     """
-    view = world, camera, grid_m, up_m, attitude
-    if camera.distorts and not moments:
-        moments = [lens_rays(camera)[..., :2]]
-    return sensor.develop(_resampled(*view, moments) if moments else render_frame(*view), rng)
+    if not moments and not camera.distorts:
+        return render_frame(world, camera, grid_m, up_m, attitude)
+    fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
+    pixels = [ray * np.array([fx, fy], np.float32) for ray in moments or [lens_rays(camera)[..., :2]]]
+    low = np.floor(np.min([p.min(axis=(0, 1)) for p in pixels], axis=0)) - 2.0
+    high = np.ceil(np.max([p.max(axis=(0, 1)) for p in pixels], axis=0)) + 2.0
+    size = (high - low + 1.0).astype(int)
+    if not (size <= MAX_VIEW * max(camera.width_px, camera.height_px)).all():
+        raise OptionError(f"camera: expected a lens that fits a flat picture, got one that needs {size} px")
+    matrix = np.array([[fx, 0.0, -low[0]], [0.0, fy, -low[1]], [0.0, 0.0, 1.0]])
+    wide = Camera(int(size[0]), int(size[1]), matrix, mount=camera.mount)
+    sharp = render_frame(world, wide, grid_m, up_m, attitude)
+    total = np.zeros((camera.height_px, camera.width_px, 3), np.float32)
+    for at in pixels:
+        x, y = (np.ascontiguousarray(at[..., k] - np.float32(low[k])) for k in (0, 1))
+        total += cv2.remap(sharp, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(np.rint(total / len(pixels)), dtype=np.uint8)
 
 
 @lru_cache(maxsize=4)
@@ -122,29 +130,3 @@ def lens_rays(camera: Camera) -> Float32:
         many = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
         flat = cv2.undistortPoints(pixels, camera.matrix, camera.distortion, criteria=many)
     return np.dstack([flat.reshape(camera.height_px, camera.width_px, 2), np.ones(x.shape)]).astype(np.float32)
-
-
-def _resampled(
-    world: World,
-    camera: Camera,
-    grid_m: tuple[float, float],
-    up_m: float,
-    attitude: Attitude,
-    rays: Sequence[Float32],
-) -> Image:
-    """The mean of the pictures along all rays, resampled from one sharp pinhole picture that contains them all."""
-    fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
-    pixels = [ray * np.array([fx, fy], np.float32) for ray in rays]
-    low = np.floor(np.min([p.min(axis=(0, 1)) for p in pixels], axis=0)) - 2.0
-    high = np.ceil(np.max([p.max(axis=(0, 1)) for p in pixels], axis=0)) + 2.0
-    size = (high - low + 1.0).astype(int)
-    if not (size <= MAX_VIEW * max(camera.width_px, camera.height_px)).all():
-        raise OptionError(f"camera: expected a lens that fits a flat picture, got one that needs {size} px")
-    matrix = np.array([[fx, 0.0, -low[0]], [0.0, fy, -low[1]], [0.0, 0.0, 1.0]])
-    wide = Camera(int(size[0]), int(size[1]), matrix, mount=camera.mount)
-    sharp = render_frame(world, wide, grid_m, up_m, attitude)
-    total = np.zeros((camera.height_px, camera.width_px, 3), np.float32)
-    for at in pixels:
-        x, y = (np.ascontiguousarray(at[..., k] - np.float32(low[k])) for k in (0, 1))
-        total += cv2.remap(sharp, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(np.rint(total / len(pixels)), dtype=np.uint8)

@@ -80,17 +80,10 @@ def plan_route(waypoints_m: Array, style: FlightStyle | None = None) -> Route:
         Route: from the first waypoint to the last.
     """
     style = style or FlightStyle()
-    push, nose, kicks = course(waypoints_m, style)
-    speed = np.cumsum(push, axis=0) * COURSE_STEP_S
-    position = waypoints_m[0] + np.cumsum(speed, axis=0) * COURSE_STEP_S
+    position, velocity, push, nose, kicks = course(waypoints_m, style)
     flat = np.zeros((len(push), 1))
-    return Route(
-        np.hstack([position, flat + style.height_agl_m]),
-        np.hstack([speed, flat]),
-        np.hstack([push, flat]),
-        nose,
-        tuple(kicks),
-    )
+    level = np.hstack([position, flat + style.height_agl_m])
+    return Route(level, np.hstack([velocity, flat]), np.hstack([push, flat]), nose, tuple(kicks))
 
 
 def plan_rounds(half_m: tuple[float, float], seconds: float, style: FlightStyle | None = None) -> Route:

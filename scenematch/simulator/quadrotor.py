@@ -18,7 +18,7 @@ from engine.geo import Array, attitude_from_rotation, enu_from_body
 from engine.values import Attitude
 from scenematch.simulator.vehicle import GRAVITY_MPS2
 
-__all__ = ["IdealImu", "State", "Wind", "WindField", "advance", "hovering"]
+__all__ = ["IdealImu", "State", "WindField", "advance", "hovering"]
 
 
 STEP_S = 0.01
@@ -38,32 +38,27 @@ MAX_TILT_DEG, SHAKE_DEG = 25.0, 7.0
 """Largest tilt that the controller commands, and largest swing excited by a start or a stop."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Wind:
-    """Moving air: a mean and gusts.
+class WindField:
+    """Wind with gusts, one velocity per :data:`STEP_S`.
 
-    Attributes:
-        mean_east_mps: the air's mean velocity to the east.
-        mean_north_mps: the same to the north.
+    Args:
+        rng: of the gusts.
+        mean_mps: the air's mean velocity to the east and to the north.
         gust_sd_mps: standard deviation of each horizontal component; the vertical one has half of it.
         gust_time_s: how long a gust lasts: each component is a Gauss-Markov process, which has the spectrum of
             Dryden's longitudinal gusts (MIL-F-8785C).
     """
 
-    mean_east_mps: float = 2.5
-    mean_north_mps: float = 1.5
-    gust_sd_mps: float = 0.8
-    gust_time_s: float = 3.0
-
-
-class WindField:
-    """Wind with gusts, one velocity per :data:`STEP_S`."""
-
-    def __init__(self, wind: Wind, rng: np.random.Generator) -> None:
-        self._mean = np.array([wind.mean_east_mps, wind.mean_north_mps, 0.0])
-        self._sd = wind.gust_sd_mps * np.array([1.0, 1.0, 0.5])
-        self._keep = math.exp(-STEP_S / wind.gust_time_s)
-        self._rng = rng
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        mean_mps: tuple[float, float] = (2.5, 1.5),
+        gust_sd_mps: float = 0.8,
+        gust_time_s: float = 3.0,
+    ) -> None:
+        self._rng, self._mean = rng, np.array([*mean_mps, 0.0])
+        self._sd = gust_sd_mps * np.array([1.0, 1.0, 0.5])
+        self._keep = math.exp(-STEP_S / gust_time_s)
         self._gust = self._sd * rng.standard_normal(3)
 
     def next(self) -> Array:

@@ -17,7 +17,7 @@ from engine.maps.surface import read_surface
 from engine.values import Window
 from scenematch.simulator.canvas import ASPHALT, CANOPY, GRASS, ROOF
 from scenematch.simulator.conditions import CONDITIONS, Condition, apply_season, condition_by_name
-from scenematch.simulator.light import LIGHTS, Float32, Image, Light, illuminate
+from scenematch.simulator.light import LIGHTS, Float32, Image, illuminate
 from scenematch.simulator.render import World
 from scenematch.simulator.town import Town, generator
 
@@ -144,11 +144,6 @@ def _on_another_day(
     dressed, standing = apply_season(rgb, heights, _materials(rgb, above), ground, day, gsd, generator(seed, 0x77))
     noon = LIGHTS["noon"]
     level = [s * noon.towards_sun[2] + k for s, k in zip(noon.sun_rgb, noon.sky_rgb, strict=True)]
-    light: Light = replace(
-        day.light, sun_rgb=_over(day.light.sun_rgb, level), sky_rgb=_over(day.light.sky_rgb, level)
-    )
+    sun, sky = (np.divide(rgb, level).tolist() for rgb in (day.light.sun_rgb, day.light.sky_rgb))
+    light = replace(day.light, sun_rgb=tuple(sun), sky_rgb=tuple(sky))
     return illuminate(dressed, standing, gsd, light, shade=day.shade), standing
-
-
-def _over(rgb: tuple[float, float, float], level: list[float]) -> tuple[float, float, float]:
-    return rgb[0] / level[0], rgb[1] / level[1], rgb[2] / level[2]

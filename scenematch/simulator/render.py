@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from engine.camera import Camera
 from engine.errors import OptionError
 from engine.geo import LocalFrame
-from engine.values import Attitude
+from engine.values import Attitude, check_positive
 from scenematch.simulator.light import Array, Float32, Image, Light
 from scenematch.simulator.rays import Rays, stretch
 
@@ -43,10 +43,16 @@ class Atmosphere:
     Attributes:
         visibility_m: distance at which 2 % of a contrast is left.
         rgb: the air's own colour in grey levels.
+
+    Raises:
+        OptionError: the visibility is not above 0.
     """
 
     visibility_m: float
-    rgb: tuple[float, float, float]
+    rgb: tuple[float, float, float] = (196.0, 202.0, 210.0)
+
+    def __post_init__(self) -> None:
+        check_positive(self, "visibility_m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,13 +230,6 @@ def _add_glint(picture: Image, glint: Glint, x: Float32, y: Float32, toward: tup
     picture[where] = np.minimum(lit, 255.0).astype(np.uint8)
 
 
-def _seen_through(air: Atmosphere, picture: Image, slant_m: Float32) -> Image:
-    """The picture (H, W, 3) through air along slant ranges (H, W)."""
-    left = np.exp(np.float32(-3.912 / air.visibility_m) * slant_m)[..., None]
-    mixed: Float32 = picture * left + np.array(air.rgb, np.float32) * (np.float32(1.0) - left)
-    return mixed.astype(np.uint8)
-
-
 def _after_light(
     world: World, picture: Image, at: tuple[Float32, Float32], per_metre: tuple[Float32, Float32], drop: Float32
 ) -> Image:
@@ -241,7 +240,10 @@ def _after_light(
     if world.glint is not None:
         _add_glint(picture, world.glint, *at, (right, down))
     if world.air is not None:
-        picture = _seen_through(world.air, picture, drop * np.sqrt(1.0 + right**2 + down**2))
+        slant_m = drop * np.sqrt(1.0 + right**2 + down**2)
+        left = np.exp(np.float32(-3.912 / world.air.visibility_m) * slant_m)[..., None]
+        mixed: Float32 = picture * left + np.array(world.air.rgb, np.float32) * (np.float32(1.0) - left)
+        picture = mixed.astype(np.uint8)
     return picture
 
 

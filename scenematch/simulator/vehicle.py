@@ -195,7 +195,7 @@ def _scaled_to_peak(steady_deg: Array, swing: Array, peak_deg: float) -> Array:
     return steady_deg + low * swing
 
 
-def course(waypoints_m: Array, style: FlightStyle) -> tuple[Array, Array, list[float]]:
+def course(waypoints_m: Array, style: FlightStyle) -> tuple[Array, Array, Array, Array, list[float]]:
     """Legs from stop to stop through waypoints, every :data:`COURSE_STEP_S`.
 
     Args:
@@ -203,8 +203,8 @@ def course(waypoints_m: Array, style: FlightStyle) -> tuple[Array, Array, list[f
         style: speed, acceleration and pauses.
 
     Returns:
-        Acceleration (N, 2) to the east and north in m/s^2, heading (N,) unwrapped in degrees, and the times in
-        seconds at which speeding up, braking and stopping shake the vehicle.
+        Position, velocity and acceleration (N, 2) to the east and north, heading (N,) unwrapped in degrees, and
+        the times in seconds at which speeding up, braking and stopping shake the vehicle.
     """
     pause = round(style.pause_s / COURSE_STEP_S)
     turn = 0.5 - 0.5 * np.cos(math.pi * np.clip(np.linspace(-0.25, 1.25, pause), 0.0, 1.0))
@@ -224,7 +224,10 @@ def course(waypoints_m: Array, style: FlightStyle) -> tuple[Array, Array, list[f
         count += pause + push.size
     pushes.append(np.zeros((pause, 2)))
     noses.append(np.full(pause, nose))
-    return np.concatenate(pushes), np.concatenate(noses), kicks
+    push = np.concatenate(pushes)
+    velocity = np.cumsum(push, axis=0) * COURSE_STEP_S
+    position = waypoints_m[0] + np.cumsum(velocity, axis=0) * COURSE_STEP_S
+    return position, velocity, push, np.concatenate(noses), kicks
 
 
 def fly_waypoints(waypoints_m: Array, style: FlightStyle, rng: np.random.Generator) -> Motion:
@@ -238,10 +241,8 @@ def fly_waypoints(waypoints_m: Array, style: FlightStyle, rng: np.random.Generat
     Returns:
         The motion every :data:`COURSE_STEP_S`, up above the flat ground.
     """
-    push, nose, kicks = course(waypoints_m, style)
+    position, _, push, nose, kicks = course(waypoints_m, style)
     time = np.arange(len(push), dtype=np.float64) * COURSE_STEP_S
-    velocity = np.cumsum(push, axis=0) * COURSE_STEP_S
-    position = waypoints_m[0] + np.cumsum(velocity, axis=0) * COURSE_STEP_S
     nose = nose + 0.4 * _wander(rng, time, 3.0)
     sin, cos = np.sin(np.radians(nose)), np.cos(np.radians(nose))
     forward, right = push[:, 0] * sin + push[:, 1] * cos, push[:, 0] * cos - push[:, 1] * sin

@@ -324,8 +324,8 @@ def test_exif_times_stamp_photographs(monkeypatch, pictures, tmp_path):
     rows = [SimpleNamespace(timestamp_ns=UTC_NS + k * S, frame=f"{k}.png") for k in (1, 2)]
     monkeypatch.setattr("scenematch.files.logs.readers.photo_telemetry", lambda _: (rows, []))
     source = SimpleNamespace(path=pictures, names=["1.png", "2.png"])
-    stamps_ns, names = stamp_frames(source, log, offset_s=-0.5)
-    assert (stamps_ns, names) == ([UTC_NS + S // 2, UTC_NS + 3 * S // 2], ["1.png", "2.png"])
+    stamps_ns, names = stamp_frames(source, log)
+    assert (stamps_ns, names) == ([UTC_NS + S, UTC_NS + 2 * S], ["1.png", "2.png"])
 
 
 # -------------------------------------------------------------------------------------------------- bad files

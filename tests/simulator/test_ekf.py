@@ -14,7 +14,6 @@ from scenematch.simulator.ekf import STATES, FilterState, History, fuse_fix, fus
 from scenematch.simulator.quadrotor import (
     STEP_S,
     IdealImu,
-    Wind,
     WindField,
     advance,
     hovering,
@@ -131,7 +130,7 @@ def test_a_fix_pulls_by_its_covariance_and_without_height_leaves_the_height():
 def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
     state, rng = hovering(np.array([0.0, 0.0, 100.0]), 200.0), np.random.default_rng(9)
     estimate = ekf.initial_state(state.position_m, 1.0, Attitude(0.0, 0.0, 200.0), SUITE)
-    air = WindField(Wind(), rng)
+    air = WindField(rng)
     for k in range(500):
         if k % 250 == 0:
             state = shaken(state, rng)
@@ -148,7 +147,7 @@ def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
 def fly(seed, seconds, fixes_until_s=math.inf):
     """A flight of turns: every second the filter's error (17,), covariance, and the sigma of the position."""
     winds, sensors, start, shakes = np.random.default_rng(seed).spawn(4)
-    air, carried = WindField(Wind(), winds), Instruments(SUITE, sensors)
+    air, carried = WindField(winds), Instruments(SUITE, sensors)
     state, off = hovering(np.array([0.0, 0.0, 150.0]), 0.0), start.standard_normal(8)
     state = replace(state, velocity_mps=0.1 * off[:3])
     believed = Attitude(0.5 * off[3], 0.5 * off[4], carried.heading_deg(state))

@@ -12,7 +12,6 @@ from scenematch.simulator.quadrotor import (
     SHAKE_DEG,
     STEP_S,
     IdealImu,
-    Wind,
     WindField,
     advance,
     aim,
@@ -93,8 +92,7 @@ def test_a_shake_swings_to_its_size_and_dies_away():
 
 
 def test_gusts_have_their_size_and_their_length():
-    wind = Wind(mean_east_mps=3.0, mean_north_mps=-1.0, gust_sd_mps=2.0, gust_time_s=0.5)
-    air = WindField(wind, np.random.default_rng(1))
+    air = WindField(np.random.default_rng(1), mean_mps=(3.0, -1.0), gust_sd_mps=2.0, gust_time_s=0.5)
     blown = np.array([air.next() for _ in range(60000)])
     np.testing.assert_allclose(blown.mean(axis=0), [3.0, -1.0, 0.0], atol=0.3)
     np.testing.assert_allclose(blown.std(axis=0), [2.0, 2.0, 1.0], rtol=0.12)
@@ -141,7 +139,7 @@ def test_beyond_its_ends_a_route_hovers(clock_s):
 @pytest.mark.slow
 def test_the_pilot_keeps_the_route_in_gusts_and_shakes():
     route, rng = plan_route(SQUARE), np.random.default_rng(5)
-    state, air, pilot = hovering(route.position_m[0], float(route.heading_deg[0])), WindField(Wind(), rng), Pilot()
+    state, air, pilot = hovering(route.position_m[0], float(route.heading_deg[0])), WindField(rng), Pilot()
     off, tilts, kicks = [], [], list(route.kicks_s)
     for k in range(round(route.duration_s / STEP_S)):
         target = route.at(k * STEP_S)

@@ -10,7 +10,7 @@ from engine import Attitude, Camera
 from scenematch.runs.simulation import WorldSettings
 from scenematch.simulator import Town, World, plan_flight, render_frame
 from scenematch.simulator.flight import DRONE_SENSOR, paper_camera
-from scenematch.simulator.optics import Sensor, take_picture
+from scenematch.simulator.optics import Sensor, through_lens
 from scenematch.simulator.rays import FAR_DEG
 from scenematch.simulator.render import SKY_RGB
 from tests.support import patches
@@ -25,8 +25,7 @@ FISHEYE = Camera(300, 300, CAMERA.matrix, "equidistant", np.array([0.03, -0.012,
 
 
 def snap(world, camera=CAMERA, moments=(), attitude=LEVEL, sensor=IDEAL, grid=ORIGIN):
-    rng = np.random.default_rng(1)
-    return take_picture(world, camera, grid, 150.0, attitude, rng, sensor=sensor, moments=moments)
+    return sensor.develop(through_lens(world, camera, grid, 150.0, attitude, moments), np.random.default_rng(1))
 
 
 def test_an_ideal_camera_changes_nothing(sim_town):

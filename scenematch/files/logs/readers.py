@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.errors import OptionError, TelemetryError
+from engine.errors import TelemetryError
 from engine.values import Truth
 from scenematch.files.frames import FrameSource, VideoFile
 from scenematch.files.logs.dataflash import read_dataflash
@@ -23,10 +23,6 @@ from scenematch.files.truth import read_truth
 _READERS = {".bin": read_dataflash, ".ulg": read_ulog, ".srt": read_srt}
 LOG_SUFFIXES = tuple(_READERS)
 """Suffixes of flight logs, in lower or upper case."""
-
-
-MAX_OFFSET_S = 9e9
-"""Largest offset of the frames' stamps, within 64 bits of nanoseconds."""
 # Of a video's frames: if fewer are numbered without a gap, they were extracted at another rate.
 _SHARE_OF_ALL = 0.9
 
@@ -66,9 +62,7 @@ def open_log(path: str | Path, odometry_topic: str | None = None) -> FlightLog:
         raise TelemetryError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def stamp_frames(
-    source: FrameSource, log: FlightLog, stamps: Path | None = None, offset_s: float = 0.0
-) -> tuple[list[int], list[str]]:
+def stamp_frames(source: FrameSource, log: FlightLog, stamps: Path | None = None) -> tuple[list[int], list[str]]:
     """Capture time and name of each frame, in the order of time.
 
     Args:
@@ -76,23 +70,13 @@ def stamp_frames(
         log: the flight log.
         stamps: CSV file with ``timestamp_ns`` and ``frame``; None uses the times of the video or bag, the numbers
             of a video's frames in the pictures' names, the log's camera messages, or the photographs' EXIF.
-        offset_s: added to every frame's stamp.
 
     Returns:
         Stamps in nanoseconds, on the log's clock or in UTC, and names.
 
     Raises:
-        OptionError: the offset is not finite, or longer than 64 bits of nanoseconds.
         TelemetryError: there are no capture times, or the number of camera messages differs from that of images.
     """
-    if not abs(offset_s) <= MAX_OFFSET_S:  # NaN fails too
-        raise OptionError(f"log_offset_s: expected finite seconds, got {offset_s}")
-    stamps_ns, names = _unshifted_stamps(source, log, stamps)
-    offset_ns = round(offset_s * 1e9)
-    return [stamp_ns + offset_ns for stamp_ns in stamps_ns], names
-
-
-def _unshifted_stamps(source: FrameSource, log: FlightLog, stamps: Path | None) -> tuple[list[int], list[str]]:
     if stamps is not None:
         rows = read_telemetry(stamps, source, source.description)
         return [row.timestamp_ns for row in rows], [row.frame for row in rows]

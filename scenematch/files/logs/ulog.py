@@ -22,22 +22,13 @@ from scenematch.files.resampling import FlightLog, TimeSeries, make_position_ser
 
 HEAD = b"ULog\x01\x12\x35"
 """The first bytes of a ULog file."""
-_TOPICS = (
-    "vehicle_attitude",
-    "vehicle_local_position",
-    "vehicle_global_position",
-    "vehicle_gps_position",
-    "distance_sensor",
-    "home_position",
-    "camera_capture",
-    "camera_trigger",
-)
 _FALLBACKS = {  # topics with the same fields, for logs with few topics or several estimators
     "vehicle_attitude": "estimator_attitude",
     "vehicle_local_position": "estimator_local_position",
     "vehicle_global_position": "estimator_global_position",
     "vehicle_gps_position": "sensor_gps",
 }
+_OTHER_TOPICS = ("distance_sensor", "home_position", "camera_capture", "camera_trigger")
 _DOWN, _FIX_3D = 25, 3
 _MAX_ENDS = 16  # reads at the end of the file; after more the parser is in a loop
 
@@ -87,7 +78,7 @@ def _topics(path: Path) -> dict[str, Columns]:
     quiet = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
     with _LoopGuard(io.FileIO(path)) as file, quiet[0], quiet[1]:
         try:
-            log: Any = pyulog.ULog(file, [*_TOPICS, *_FALLBACKS.values()])
+            log: Any = pyulog.ULog(file, [*_FALLBACKS, *_FALLBACKS.values(), *_OTHER_TOPICS])
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise TelemetryError(f"{path}: expected a ULog that can be read: {reason}") from None

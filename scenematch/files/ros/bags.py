@@ -30,15 +30,7 @@ from scenematch.files.resampling import (
     make_position_series,
     make_series,
 )
-from scenematch.files.ros.messages import (
-    attitude_from_message,
-    body_velocity_from_message,
-    camera_from_message,
-    image_from_message,
-    position_from_message,
-    range_from_message,
-    stamp_ns,
-)
+from scenematch.files.ros import messages
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """Suffixes of bag files, in lower or upper case; a folder is a bag if it contains metadata.yaml."""
@@ -51,7 +43,7 @@ TRUTH_HEIGHT, TRUTH_ALTITUDE = "/truth/height_agl", "/truth/alt_amsl"
 """Topics to write, preferred if a bag has several of a type."""
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_FLOAT, _CALIBRATION = ("std_msgs/msg/Float64",), ("sensor_msgs/msg/CameraInfo",)
+_FLOAT, _CALIBRATION = "std_msgs/msg/Float64", ("sensor_msgs/msg/CameraInfo",)
 
 Sample = tuple[int, tuple[float | None, ...]]
 """Stamp in nanoseconds, and values; None if one is unknown."""
@@ -68,23 +60,35 @@ class Quantity:
     """A quantity of the telemetry.
 
     Attributes:
-        types: message types that may state it.
+        type: message type that states it.
         values: extracts the values; None if a message has none, and for a value that it lacks.
+        topics: what the names of a bag's topics with it end in, best first; empty is any but truth.
+        truth: the same if the bag's ``/truth`` topics replace them.
     """
 
-    types: tuple[str, ...]
+    type: str
     values: Callable[[Any], tuple[Any, ...] | None]
+    topics: tuple[str, ...] = ()
+    truth: tuple[str, ...] = ()
+
+
+def _data(message: Any) -> tuple[float]:
+    return (message.data,)
 
 
 QUANTITIES = {
-    "imu": Quantity(("sensor_msgs/msg/Imu",), attitude_from_message),
-    "compass": Quantity(_FLOAT, lambda message: (message.data,)),
-    "range": Quantity(("sensor_msgs/msg/Range",), lambda message: (range_from_message(message),)),
-    "height": Quantity(_FLOAT, lambda message: (message.data,)),
-    "altitude": Quantity(_FLOAT, lambda message: (message.data,)),
-    "velocity": Quantity(("geometry_msgs/msg/TwistStamped",), lambda m: (m.twist.linear.x, m.twist.linear.y)),
-    "place": Quantity(("sensor_msgs/msg/NavSatFix",), position_from_message),
-    "odometry": Quantity(("nav_msgs/msg/Odometry",), body_velocity_from_message),
+    "imu": Quantity("sensor_msgs/msg/Imu", messages.attitude_from_message, ("/imu/data", ""), (TRUTH_ATTITUDE,)),
+    "compass": Quantity(_FLOAT, _data, ("/compass_hdg",)),
+    "range": Quantity(
+        "sensor_msgs/msg/Range", lambda message: (messages.range_from_message(message),), (RANGE, "")
+    ),
+    "height": Quantity(_FLOAT, _data, ("/rel_alt",), (TRUTH_HEIGHT,)),
+    "altitude": Quantity(_FLOAT, _data, (), (TRUTH_ALTITUDE,)),
+    "velocity": Quantity(
+        "geometry_msgs/msg/TwistStamped", lambda m: (m.twist.linear.x, m.twist.linear.y), ("/velocity_local",)
+    ),
+    "place": Quantity("sensor_msgs/msg/NavSatFix", messages.position_from_message, (POSITION, ""), (TRUTH,)),
+    "odometry": Quantity("nav_msgs/msg/Odometry", messages.body_velocity_from_message),
 }
 """The quantities of a bag's and of a live vehicle's telemetry, by name."""
 
@@ -142,7 +146,7 @@ class BagFrames(ForwardFrames):
         if message is None:
             raise TelemetryError(f"{self.path}: {self.topic}: frame {index} has vanished since the bag was opened")
         try:
-            image = image_from_message(message)
+            image = messages.image_from_message(message)
         except TelemetryError as error:
             raise TelemetryError(f"{self.path}: {self.topic}: frame {index}: {error}") from None
         return np.repeat(image[:, :, None], 3, axis=2) if image.ndim == 2 else image
@@ -174,7 +178,7 @@ def read_bag_camera(path: str | Path, topic: str | None = None) -> Camera:
     if first is None:
         raise TelemetryError(f"{path}: expected a sensor_msgs/CameraInfo, got none; name a file with `camera`")
     try:
-        return camera_from_message(first[2])
+        return messages.camera_from_message(first[2])
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
 
@@ -201,14 +205,16 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
         TelemetryError: the bag cannot be read, or has no usable series, or no usable velocity on that topic.
     """
     with _opened(path) as reader:
-        has_truth = truth and _topic(reader, QUANTITIES["place"].types, (TRUTH,)) is not None
-        suffixes = _TRUTH_SUFFIXES if has_truth else _SUFFIXES
-        found = {name: _topic(reader, QUANTITIES[name].types, options) for name, options in suffixes.items()}
+        has_truth = truth and _topic(reader, (QUANTITIES["place"].type,), (TRUTH,)) is not None
+        found = {
+            name: _topic(reader, (each.type,), each.truth if has_truth else each.topics)
+            for name, each in QUANTITIES.items()
+        }
         if odometry_topic is not None:
             found["odometry"] = _odometry_topic(path, reader, odometry_topic)
         names = {topic: name for name, topic in found.items() if topic is not None}
         known: dict[str, list[Sample]] = {name: [] for name in names.values()}
-        kinds = {kind for name in known for kind in QUANTITIES[name].types}
+        kinds = {QUANTITIES[name].type for name in known}
         for topic, time_ns, message in _messages(path, reader, set(names), kinds) if names else ():
             numbers = QUANTITIES[names[topic]].values(message)
             if numbers is not None:
@@ -235,27 +241,11 @@ def read_bag(path: Path, *, truth: bool = False, odometry_topic: str | None = No
     return FlightLog(path, series, heights)
 
 
-_SUFFIXES = {
-    "imu": ("/imu/data", ""),
-    "compass": ("/compass_hdg",),
-    "range": (RANGE, ""),
-    "height": ("/rel_alt",),
-    "velocity": ("/velocity_local",),
-    "place": (POSITION, ""),
-}
-_TRUTH_SUFFIXES = {
-    "imu": (TRUTH_ATTITUDE,),
-    "height": (TRUTH_HEIGHT,),
-    "altitude": (TRUTH_ALTITUDE,),
-    "place": (TRUTH,),
-}
-
-
 def _odometry_topic(path: Path, reader: Any, topic: str) -> str:
-    kinds = QUANTITIES["odometry"].types
-    names = _topic_names(reader, kinds)
+    kind = QUANTITIES["odometry"].type
+    names = _topic_names(reader, (kind,))
     if topic not in names:
-        raise TelemetryError(f"{path}: expected {kinds[0]} on {topic}, got {', '.join(names) or 'none'}")
+        raise TelemetryError(f"{path}: expected {kind} on {topic}, got {', '.join(names) or 'none'}")
     return topic
 
 
@@ -302,7 +292,7 @@ def _column(known: Mapping[str, list[Sample]], name: str, index: int = 0) -> tup
 
 def stamp_or(message: Any, otherwise_ns: int) -> int:
     """The stamp of a message's header, or another time if there is none or it is not set."""
-    return (stamp_ns(message) if hasattr(message, "header") else 0) or otherwise_ns
+    return (messages.stamp_ns(message) if hasattr(message, "header") else 0) or otherwise_ns
 
 
 def _image_topic(path: Path, reader: Any, topic: str | None) -> str:
