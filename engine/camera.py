@@ -18,10 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import CalibrationError
-from engine.geo import enu_from_body
+from engine.geo import Array, enu_from_body
 from engine.values import Attitude
-
-Array = NDArray[np.float64]
 
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
 """Names of ROS camera_info, and the valid numbers of coefficients of each."""
@@ -235,10 +233,9 @@ class Camera:
     @cached_property
     def border_rays(self) -> Array:
         """(N, 3) optical rays through the border of the frame; the last goes through its middle."""
-        share = np.linspace(0.0, 1.0, SIDE_STEPS, endpoint=False)
-        zero, one = np.zeros_like(share), np.ones_like(share)
-        sides = [(share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share)]
-        xy = np.concatenate([np.stack(side, axis=1) for side in sides] + [np.array([[0.5, 0.5]])])
+        corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        sides = np.linspace(corners, np.roll(corners, -1, axis=0), SIDE_STEPS, endpoint=False, axis=1)
+        xy = np.vstack([*sides, [0.5, 0.5]])
         return self._rays(xy * [self.width_px - 1, self.height_px - 1])
 
     def _rays(self, xy_px: Array) -> Array:

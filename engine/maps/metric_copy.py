@@ -58,13 +58,6 @@ def _metric_grid(source: Grid) -> Grid:
     return Grid(math.ceil(size[0] - 1e-6), math.ceil(size[1] - 1e-6), matrix, utm)
 
 
-def _needs_copy(source: Source) -> bool:
-    """Whether a map needs a copy: its grid is not metric, or even its smallest overview is large."""
-    return not source.grid.is_metric or is_large(
-        source.grid.area_px // max([1, *source.dataset.overviews(1)]) ** 2
-    )
-
-
 def _copied(reader: GrayReader, source: Grid, grid: Grid) -> Iterator[_Block]:
     """The copy block by block, as (2, h, w) grey and alpha."""
     whole = Window(0, 0, grid.width_px, grid.height_px)
@@ -110,7 +103,8 @@ def open_readable(
         MapError: the file cannot be read.
     """
     original = None if is_large(source.grid.area_px) else GrayReader(source)
-    if _needs_copy(source):
+    smallest_px = source.grid.area_px // max([1, *source.dataset.overviews(1)]) ** 2
+    if not source.grid.is_metric or is_large(smallest_px):
         used = open_metric_copy(source, original, cache_dir, on_copy)
         reader = GrayReader(used, find_collar=False)
     else:

@@ -216,9 +216,9 @@ class GrayReader:
     def __init__(self, source: Source, *, find_collar: bool = True) -> None:
         self._source, self._lock = source, threading.Lock()
         dataset, grid = source.dataset, source.grid  # a copy's file is padded beyond its grid
-        self.dtype = dataset.dtypes[0]
-        if self.dtype not in DTYPES:
-            raise MapError(f"map: expected pixels of {', '.join(DTYPES)}, got {self.dtype} in {source.path}")
+        dtype = dataset.dtypes[0]
+        if dtype not in DTYPES:
+            raise MapError(f"map: expected pixels of {', '.join(DTYPES)}, got {dtype} in {source.path}")
         self._bands = [1, 2, 3] if dataset.count >= 3 else [1]
         self._palette = palette_of(dataset)
         shrink = max(1.0, max(grid.width_px, grid.height_px) / OVERVIEW_PX)

@@ -72,7 +72,7 @@ class SurfaceModel:
     """Heights on their own grid.
 
     Args:
-        heights_m: (H, W), NaN where unknown.
+        heights_m: (H, W) float32, contiguous, NaN where unknown.
         from_map: from pixels of the map to those of the heights.
         decimated: the same surface with fewer pixels, if it is too large to be sampled as a whole.
     """
@@ -80,8 +80,6 @@ class SurfaceModel:
     def __init__(
         self, heights_m: Heights | HeightTiles, from_map: Warp, decimated: SurfaceModel | None = None
     ) -> None:
-        if isinstance(heights_m, np.ndarray):  # the loops are compiled for one type
-            heights_m = np.ascontiguousarray(heights_m, np.float32)
         self._heights_m, self._from_map, self._decimated = heights_m, from_map, decimated
 
     @property
@@ -224,14 +222,9 @@ def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> Height
     """
     from rasterio.enums import Resampling
 
-    whole = shape == (part.height_px, part.width_px)
     with map_errors("surface", source.path):
         data = source.dataset.read(
-            1,
-            window=part.slices,
-            out_shape=shape,
-            masked=True,
-            resampling=Resampling.nearest if whole else Resampling.average,
+            1, window=part.slices, out_shape=shape, masked=True, resampling=Resampling.average
         )
     heights = data.astype(np.float32).filled(np.nan) * source.dataset.scales[0] + source.dataset.offsets[0]
     heights[~((heights > HEIGHT_RANGE_M[0]) & (heights < HEIGHT_RANGE_M[1]))] = np.nan
