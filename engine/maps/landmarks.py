@@ -129,9 +129,7 @@ class LandmarkMap:
         rows, columns = self._site.level_shape(level)
         whole = Window(0, 0, columns, rows)
         keys = self._keys(whole, level, upright)
-        if all(key in self.tiles for key in keys):
-            return
-        if self._site.open_file is None:
+        if self._site.open_file is None or all(key in self.tiles for key in keys):
             self.tiles.get(*keys)
             return
         settings = (self._backend, DETECTOR_VERSION, TILE_PX, HALO_PX, CELL_PX, MAX_PER_CELL, upright)
