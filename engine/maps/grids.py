@@ -289,9 +289,8 @@ def metric_grid(shape: tuple[int, ...], matrix: Array, crs: Any) -> Grid:
 
 def warp_between(grid: Grid, other: Grid) -> Warp:
     """The transform from pixels of a grid to pixels of another, to a hundredth of a pixel."""
-    to_crs = grid.pixels_of(other.crs)[0]
-    to_pixel = invert_affine(other.pixel_to_crs)
-    return Warp(lambda xy: apply_affine(to_pixel, to_crs(xy)), grid.box(WARP_MARGIN), tolerance=0.01)
+    to_other = other.pixels_of(grid.crs)[1]
+    return Warp(lambda xy: to_other(apply_affine(grid.pixel_to_crs, xy)), grid.box(WARP_MARGIN), tolerance=0.01)
 
 
 def window_about(points: Array, shape: tuple[int, ...], margin_px: int) -> Window | None:
