@@ -78,7 +78,7 @@ class Camera:
         height_px: rows of a frame.
         matrix: (3, 3) pinhole matrix K.
         distortion_model: a key of :data:`DISTORTION_MODELS`.
-        distortion: its coefficients, in OpenCV's order.
+        distortion: its coefficients, in OpenCV's order; none, or any number of zeros, if there is no distortion.
         mount: (3, 3) rotation, v_body = mount @ v_camera.
 
     Raises:
@@ -89,7 +89,7 @@ class Camera:
     height_px: int
     matrix: Array
     distortion_model: str = "plumb_bob"
-    distortion: Array = field(default_factory=lambda: np.zeros(5))
+    distortion: Array = field(default_factory=lambda: np.zeros(0))
     mount: Array = field(default_factory=mount_rotation)
 
     def __post_init__(self) -> None:
@@ -111,6 +111,8 @@ class Camera:
             known = ", ".join(DISTORTION_MODELS)
             raise CalibrationError(f"distortion_model: expected one of {known}, got {self.distortion_model!r}")
         lengths = DISTORTION_MODELS[self.distortion_model]
+        if not self.distortion.any():  # ROS writes an ideal camera as none, four or five zeros
+            object.__setattr__(self, "distortion", np.zeros(lengths[-1]))
         if self.distortion.shape not in [(n,) for n in lengths] or not np.isfinite(self.distortion).all():
             raise CalibrationError(
                 f"distortion_coefficients: {self.distortion_model} takes {' or '.join(map(str, lengths))} "
@@ -173,8 +175,6 @@ class Camera:
 
         pinhole, model = numbers("camera_matrix", 9), str(info.get("distortion_model", "plumb_bob"))
         distortion = numbers("distortion_coefficients") if "distortion_coefficients" in info else np.zeros(0)
-        if not distortion.any():  # ROS writes an ideal camera as none, four or five zeros
-            distortion = np.zeros(DISTORTION_MODELS.get(model, (5,))[-1])
         named, pitch_deg = info.get("mount", "nadir"), info.get("camera_pitch_deg")
         if not isinstance(named, str) and pitch_deg is not None:
             raise CalibrationError("camera_pitch_deg: expected a mount by name, got one of numbers")
