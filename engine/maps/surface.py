@@ -45,7 +45,14 @@ class HeightTiles:
         self._from_map = warp_between(grid, part_grid(source.grid, part, self._shape))
 
     def sample(self, map_xy: Array) -> Array:
-        """Bilinear heights, as :meth:`SurfaceModel.sample`."""
+        """Bilinear heights.
+
+        Args:
+            map_xy: (..., 2) pixels of the map.
+
+        Returns:
+            (...,) metres, NaN outside and next to nodata.
+        """
         at = self._from_map(map_xy.reshape(-1, 2))
         out, last = np.full(len(at), np.nan), np.array(self._shape[::-1]) - 1
         inside = np.flatnonzero(((at >= -0.5) & (at <= last + 0.5)).all(axis=1))
