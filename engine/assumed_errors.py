@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from engine.errors import OptionError
 from engine.values import MAX_SIGMA_M, Frame, GridPose, check, check_positive
 
 if TYPE_CHECKING:
@@ -41,11 +40,11 @@ class AssumedErrors:
     unknown_slope_deg: float = 2.0
 
     def __post_init__(self) -> None:
-        check_positive(self, *(name for name in self.__dataclass_fields__ if name != "height_share"))
+        sigmas = [name for name in self.__dataclass_fields__ if name != "height_share"]
+        check_positive(self, *sigmas)
+        for name in sigmas:
+            check(self, name, f"at most {MAX_SIGMA_M:g}", lambda sigma: sigma <= MAX_SIGMA_M)
         check(self, "height_share", "a number from 0 up", lambda share: 0.0 <= share < math.inf)
-        for name in self.__dataclass_fields__:
-            if getattr(self, name) > MAX_SIGMA_M:
-                raise OptionError(f"{name}: expected at most {MAX_SIGMA_M:g}, got {getattr(self, name):g}")
 
     def height_sigma_m(self, height_m: float) -> float:
         """Standard deviation of a height, in metres."""

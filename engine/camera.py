@@ -18,10 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import CalibrationError
-from engine.geo import enu_from_body
+from engine.geo import Array, enu_from_body
 from engine.values import Attitude
-
-Array = NDArray[np.float64]
 
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
 """Names of ROS camera_info, and the valid numbers of coefficients of each."""
@@ -80,7 +78,7 @@ class Camera:
         height_px: rows of a frame.
         matrix: (3, 3) pinhole matrix K.
         distortion_model: a key of :data:`DISTORTION_MODELS`.
-        distortion: its coefficients, in OpenCV's order.
+        distortion: its coefficients, in OpenCV's order; none, or any number of zeros, if there is no distortion.
         mount: (3, 3) rotation, v_body = mount @ v_camera.
 
     Raises:
@@ -91,7 +89,7 @@ class Camera:
     height_px: int
     matrix: Array
     distortion_model: str = "plumb_bob"
-    distortion: Array = field(default_factory=lambda: np.zeros(5))
+    distortion: Array = field(default_factory=lambda: np.zeros(0))
     mount: Array = field(default_factory=mount_rotation)
 
     def __post_init__(self) -> None:
@@ -113,6 +111,8 @@ class Camera:
             known = ", ".join(DISTORTION_MODELS)
             raise CalibrationError(f"distortion_model: expected one of {known}, got {self.distortion_model!r}")
         lengths = DISTORTION_MODELS[self.distortion_model]
+        if not self.distortion.any():  # ROS writes an ideal camera as none, four or five zeros
+            object.__setattr__(self, "distortion", np.zeros(lengths[-1]))
         if self.distortion.shape not in [(n,) for n in lengths] or not np.isfinite(self.distortion).all():
             raise CalibrationError(
                 f"distortion_coefficients: {self.distortion_model} takes {' or '.join(map(str, lengths))} "
@@ -175,8 +175,6 @@ class Camera:
 
         pinhole, model = numbers("camera_matrix", 9), str(info.get("distortion_model", "plumb_bob"))
         distortion = numbers("distortion_coefficients") if "distortion_coefficients" in info else np.zeros(0)
-        if not distortion.any():  # ROS writes an ideal camera as none, four or five zeros
-            distortion = np.zeros(DISTORTION_MODELS.get(model, (5,))[-1])
         named, pitch_deg = info.get("mount", "nadir"), info.get("camera_pitch_deg")
         if not isinstance(named, str) and pitch_deg is not None:
             raise CalibrationError("camera_pitch_deg: expected a mount by name, got one of numbers")
@@ -235,10 +233,9 @@ class Camera:
     @cached_property
     def border_rays(self) -> Array:
         """(N, 3) optical rays through the border of the frame; the last goes through its middle."""
-        share = np.linspace(0.0, 1.0, SIDE_STEPS, endpoint=False)
-        zero, one = np.zeros_like(share), np.ones_like(share)
-        sides = [(share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share)]
-        xy = np.concatenate([np.stack(side, axis=1) for side in sides] + [np.array([[0.5, 0.5]])])
+        corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        sides = np.linspace(corners, np.roll(corners, -1, axis=0), SIDE_STEPS, endpoint=False, axis=1)
+        xy = np.vstack([*sides, [0.5, 0.5]])
         return self._rays(xy * [self.width_px - 1, self.height_px - 1])
 
     def _rays(self, xy_px: Array) -> Array:

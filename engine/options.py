@@ -36,8 +36,7 @@ class PoseOptions:
     distinct_px: float = 16.0
 
     def __post_init__(self) -> None:
-        for name in ("reprojection_px", "distinct_px"):
-            check(self, name, "a positive number", lambda pixels: 0 < pixels < math.inf)
+        check_positive(self, "reprojection_px", "distinct_px")
 
     @property
     def min_spread_px(self) -> float:
@@ -105,12 +104,10 @@ class SiftOptions:
     errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
-        for name in ("max_height_m", "tolerance_px"):
-            check(self, name, "a finite number", lambda value: not math.isinf(value))
+        check_positive(self, "keypoints_per_px", "tolerance_px")
         check(self, "scale", "above 0 and at most 1", lambda scale: 0.0 < scale <= 1.0)
-        check(self, "max_height_m", f"above {MIN_HEIGHT_M:g}", lambda height: height > MIN_HEIGHT_M)
-        for name in ("keypoints_per_px", "tolerance_px"):
-            check(self, name, "above 0", lambda value: value > 0.0)
+        heights = f"a finite number above {MIN_HEIGHT_M:g}"
+        check(self, "max_height_m", heights, lambda height_m: MIN_HEIGHT_M < height_m < math.inf)
         check(self, "upsample", "1 or 2", lambda factor: factor in (1, 2))
         check_choice(self, "backend", BACKENDS)
         check(self, "max_keypoints", "4 or more", lambda count: count >= 4)
@@ -138,7 +135,7 @@ class LearnedOptions:
         for name in ("max_picture_px", "max_window_px"):
             check(self, name, "4096 or more", lambda pixels: pixels >= 4096)
         check(self, "max_keypoints", "4 or more", lambda count: count >= 4)
-        check(self, "tolerance_px", "a positive number", lambda pixels: 0.0 < pixels < math.inf)
+        check_positive(self, "tolerance_px")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -51,6 +51,7 @@ class OrthoMap(Georeference):
         ground_m: ground level in the surface's datum: the 20th percentile of the surface over the valid map, below
             most roofs and crowns; 0.0 without a surface.
         levels: number of levels of the pyramid.
+        open_file: opens the map's file again, such as for its colours; None for a map of arrays.
         georeference_sigma_m: georeferencing accuracy, one standard deviation per axis; None if unknown.
         surface_datum: vertical system of a surface in metres above the sea, by its file; None if unknown.
         slope_sigma_deg: slope accuracy of the surface under a frame, one standard deviation; None if unknown.
@@ -66,7 +67,7 @@ class OrthoMap(Georeference):
     ) -> None:
         super().__init__(grid)
         self.name, self.source_crs, self._facts = name, source_crs, facts or {}
-        self._open: Callable[[], Source] | None = None
+        self.open_file: Callable[[], Source] | None = None
         self._surface: SurfaceModel | None = None
         self.has_surface, self.ground_m = False, 0.0
         self.surface_datum: str | None = None
@@ -114,7 +115,7 @@ class OrthoMap(Georeference):
         facts["surface_path"] = None if surface is None else os.fspath(surface)
         site = cls(original.path.name, used.grid, reader, original.grid.crs, facts)
         heights_file = None if surface is None else open_source(surface, "surface")
-        site._open = opened
+        site.open_file = opened
         site.georeference_sigma_m = stated_sigma(georeference_sigma_m, original, GEOREFERENCE_TAG)
         site.slope_sigma_deg = stated_sigma(slope_sigma_deg, heights_file, SLOPE_TAG)
         if heights_file is not None:
@@ -155,7 +156,7 @@ class OrthoMap(Georeference):
             MapError: the grid is not metric and north-up.
         """
         mask = np.ones(gray.shape, np.bool_) if valid is None else np.asarray(valid, np.bool_)
-        heights = None if surface_m is None else np.asarray(surface_m, np.float32)
+        heights = None if surface_m is None else np.ascontiguousarray(surface_m, np.float32)
         check_arrays(gray, mask, heights)
         grid = metric_grid(gray.shape, np.asarray(pixel_to_crs, np.float64), crs)
         site = cls("arrays", grid, (gray, mask), grid.crs)
@@ -196,7 +197,7 @@ class OrthoMap(Georeference):
     @property
     def is_searchable(self) -> bool:
         """Whether it is small enough to be searched as a whole."""
-        return self.width_px * self.height_px <= SEARCH_LIMIT_PX
+        return self.grid.area_px <= SEARCH_LIMIT_PX
 
     @property
     def size_km(self) -> str:
@@ -238,10 +239,6 @@ class OrthoMap(Georeference):
             OptionError: as :meth:`gray`.
         """
         return self._pyramid.crop(window, level)[1].copy()
-
-    def open_file(self) -> Source | None:
-        """The map's file opened again, such as for its colours; None if the map has none."""
-        return None if self._open is None else self._open()
 
     def level_shape(self, level: int) -> tuple[int, int]:
         """Rows and columns of a level."""
@@ -322,11 +319,6 @@ class OrthoMap(Georeference):
         about = reach_px * np.array([(0.0, 0.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
         heights = self.surface_at(xy[..., None, :] + about)
         return np.asarray(1.0 / (1.0 + np.ptp(heights, axis=-1) ** 2))
-
-    @property
-    def from_file(self) -> bool:
-        """Whether the map was opened from a file; one of arrays in memory was not."""
-        return self._open is not None
 
     def info(self) -> dict[str, Any]:
         """Facts about the map as JSON; ``convergence_deg`` is the true heading of the map's upward direction."""

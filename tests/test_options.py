@@ -40,11 +40,11 @@ def test_numbers_are_above_0(options, name, value):
         *((LiveOptions, name, 60_001, "at most 60000") for name in ("deadline_ms", "patience_ms")),
         (NccOptions, "exclusion_m", math.nan, "a number above 0"),
         (SiftOptions, "scale", 0.0, "above 0 and at most 1"),
-        (SiftOptions, "max_keypoints", 3, "4 or more"), (SiftOptions, "max_height_m", math.inf, "a finite number"),
-        (SiftOptions, "max_height_m", 0.5, "above 1"),
+        (SiftOptions, "max_keypoints", 3, "4 or more"),
+        *((SiftOptions, "max_height_m", value, "a finite number above 1") for value in (0.5, math.inf)),
         *((SiftOptions, "upsample", value, "1 or 2") for value in (0, 3)),
-        *((SiftOptions, name, -1, "above 0") for name in ("keypoints_per_px", "tolerance_px")),
-        *((PoseOptions, name, value, "a positive number") for name, value in (
+        *((SiftOptions, name, -1, "a number above 0") for name in ("keypoints_per_px", "tolerance_px")),
+        *((PoseOptions, name, value, "a number above 0") for name, value in (
             ("reprojection_px", 0), ("distinct_px", -1))),
         (LearnedOptions, "max_keypoints", 1, ".+"), (LearnedOptions, "max_picture_px", 10, ".+"),
         (LearnedOptions, "max_window_px", 10, ".+"), (MatcherOptions, "profile", "fast", "one of engine, paper"),

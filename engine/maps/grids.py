@@ -245,13 +245,11 @@ class Grid:
 
 def part_grid(own: Grid, part: Window, shape: tuple[int, int]) -> Grid:
     """The grid of a window of another grid, decimated to ``shape`` (rows, columns)."""
-    low, size = np.array([part.x0, part.y0]), np.array([part.width_px, part.height_px])
-    scale = size / np.array(shape[::-1])
-    # Pixel x of the decimated copy covers the file's pixels around low + (x + 0.5) * scale - 0.5.
-    crop_to_file = np.column_stack([np.diag(scale), low + 0.5 * scale - 0.5])
-    linear = own.pixel_to_crs[:, :2] @ crop_to_file[:, :2]
-    origin = apply_affine(own.pixel_to_crs, crop_to_file[:, 2])
-    return Grid(shape[1], shape[0], np.column_stack([linear, origin]), own.crs)
+    scale = np.array([part.width_px, part.height_px]) / shape[::-1]
+    # Pixel x of the decimated copy covers the other grid's pixels around corner + (x + 0.5) * scale - 0.5.
+    first = np.array([part.x0, part.y0]) + 0.5 * scale - 0.5
+    matrix = np.column_stack([own.pixel_to_crs[:, :2] * scale, apply_affine(own.pixel_to_crs, first)])
+    return Grid(shape[1], shape[0], matrix, own.crs)
 
 
 def by_corner(grid: Grid) -> Array:
@@ -291,9 +289,8 @@ def metric_grid(shape: tuple[int, ...], matrix: Array, crs: Any) -> Grid:
 
 def warp_between(grid: Grid, other: Grid) -> Warp:
     """The transform from pixels of a grid to pixels of another, to a hundredth of a pixel."""
-    to_crs = grid.pixels_of(other.crs)[0]
-    to_pixel = invert_affine(other.pixel_to_crs)
-    return Warp(lambda xy: apply_affine(to_pixel, to_crs(xy)), grid.box(WARP_MARGIN), tolerance=0.01)
+    to_other = other.pixels_of(grid.crs)[1]
+    return Warp(lambda xy: to_other(apply_affine(grid.pixel_to_crs, xy)), grid.box(WARP_MARGIN), tolerance=0.01)
 
 
 def window_about(points: Array, shape: tuple[int, ...], margin_px: int) -> Window | None:

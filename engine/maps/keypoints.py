@@ -28,8 +28,6 @@ TILE_PX = 512
 """Tiles begin on multiples of this in every level."""
 PX_PER_KEYPOINT = 64
 """A tile has at most one keypoint per this many pixels."""
-MAX_KEYPOINTS = MAX_LANDMARKS
-"""Keypoints kept in memory, besides those of the last window; one takes up to 520 bytes."""
 _NODATA_PX = 5  # a keypoint this near to a pixel without data may be its edge
 
 
@@ -46,7 +44,7 @@ class KeypointMap:
 
     def __init__(self, site: OrthoMap, matcher: KeypointMatcher) -> None:
         self._site, self._matcher = site, matcher
-        self.tiles = RecentlyUsed(self._describe, lambda _, tile: len(tile), MAX_KEYPOINTS)
+        self.tiles = RecentlyUsed(self._describe, lambda _, tile: len(tile), MAX_LANDMARKS)  # of up to 520 bytes
 
     def find(self, window: Window, level: int, count: int) -> Keypoints:
         """The strongest keypoints of a window.

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.features import Features, chosen_backend, sift
+from engine.geo import Array
 from engine.maps.landmark_cache import NamedArrays, cache_path, load_arrays, save_arrays
 from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
@@ -25,8 +26,6 @@ from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
     from engine.orthomap import OrthoMap
-
-Array = NDArray[np.float64]
 
 DETECTOR_VERSION = 4
 """Part of the key of cached landmarks; raise it with every change of detector or descriptor."""
@@ -102,9 +101,12 @@ class LandmarkMap:
         tiles = self.tiles.get(*self._keys(window, level, upright))
         max_rank = math.ceil(min(per_px * CELL_PX**2, MAX_PER_CELL))
         parts = [(tile, _inside(tile, window, max_rank)) for tile in tiles]
-        return self._to_landmarks(
-            {name: np.concatenate([part[name][i] for part, i in parts]) for name in tiles[0]}
-        )
+        found = {name: np.concatenate([part[name][i] for part, i in parts]) for name in tiles[0]}
+        columns = [found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors")]
+        xy, scale, angle, descriptors = (to_device(column[None], self.device) for column in columns)
+        valid = scale > 0.0  # of every landmark
+        features = Features(xy, scale, angle, as_float(descriptors, "float32"), valid)
+        return Landmarks(features, found["xy_px"], found["points_m"])
 
     def prepare(self, levels: Iterable[int] | None = None) -> None:
         """Describe whole levels, upright and not, and cache them in a file if the map comes from one.
@@ -127,9 +129,7 @@ class LandmarkMap:
         rows, columns = self._site.level_shape(level)
         whole = Window(0, 0, columns, rows)
         keys = self._keys(whole, level, upright)
-        if all(key in self.tiles for key in keys):
-            return
-        if not self._site.from_file:
+        if self._site.open_file is None or all(key in self.tiles for key in keys):
             self.tiles.get(*keys)
             return
         settings = (self._backend, DETECTOR_VERSION, TILE_PX, HALO_PX, CELL_PX, MAX_PER_CELL, upright)
@@ -180,13 +180,6 @@ class LandmarkMap:
         return tile | {
             "points_m": np.column_stack([self._site.enu_from_pixel(map_px), self._site.surface_at(map_px)])
         }
-
-    def _to_landmarks(self, found: NamedArrays) -> Landmarks:
-        columns = [found[name] for name in ("xy_px", "scale_px", "angle_deg", "descriptors")]
-        xy, scale, angle, descriptors = (to_device(column[None], self.device) for column in columns)
-        valid = scale > 0.0  # of every landmark
-        features = Features(xy, scale, angle, as_float(descriptors, "float32"), valid)
-        return Landmarks(features, found["xy_px"], found["points_m"])
 
 
 def _count(tile: NamedArrays) -> int:

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from engine.errors import MapError
-from engine.maps.grids import Grid, Warp, apply_affine, by_corner, wgs84, window_about
-from engine.maps.rasters import BLOCK_PX, Gray, GrayReader, Source, is_large, map_errors, open_source
+from engine.maps.grids import Grid, Warp, by_corner, warp_between, wgs84, window_about
+from engine.maps.rasters import BLOCK_PX, Gray, GrayReader, Mask, Source, is_large, map_errors, open_source
 from engine.maps.tiles import tiles_under
 from engine.runtime.cache_folder import cache_folder, replaced
 from engine.values import Window
@@ -58,47 +58,33 @@ def _metric_grid(source: Grid) -> Grid:
     return Grid(math.ceil(size[0] - 1e-6), math.ceil(size[1] - 1e-6), matrix, utm)
 
 
-def _needs_copy(source: Source) -> bool:
-    """Whether a map needs a copy: its grid is not metric, or even its smallest overview is large."""
-    return not source.grid.is_metric or is_large(
-        source.grid.area_px // max([1, *source.dataset.overviews(1)]) ** 2
-    )
-
-
 def _copied(reader: GrayReader, source: Grid, grid: Grid) -> Iterator[_Block]:
     """The copy block by block, as (2, h, w) grey and alpha."""
     whole = Window(0, 0, grid.width_px, grid.height_px)
-    windows = tiles_under(whole, BLOCK_PX, (grid.height_px, grid.width_px))
-    if grid is not source:
-        yield from _resampled(reader, source, grid, windows)
-        return
-    for window in windows:
-        gray, valid = reader.read(window)
+    warp = warp_between(grid, source)
+    for window in tiles_under(whole, BLOCK_PX, (grid.height_px, grid.width_px)):
+        gray, valid = reader.read(window) if grid is source else _resampled(reader, source, warp, window)
         yield window, np.stack([gray, valid.astype(np.uint8) * 255])
 
 
-def _resampled(reader: GrayReader, source: Grid, grid: Grid, windows: Iterable[Window]) -> Iterator[_Block]:
-    """Blocks of the copy, resampled: grey is cubic, alpha 255 where all of it is valid."""
+def _resampled(reader: GrayReader, source: Grid, warp: Warp, window: Window) -> tuple[Gray, Mask]:
+    """A block of the copy: grey is cubic, and valid if all pixels that it is made of are."""
     import cv2
 
-    to_source = source.pixels_of(grid.crs)[1]
-    warp = Warp(lambda xy: to_source(apply_affine(grid.pixel_to_crs, xy)), grid.box(), tolerance=0.005)
-    for window in windows:
-        columns = np.arange(window.x0, window.x1, dtype=np.float64)
-        rows = np.arange(window.y0, window.y1, dtype=np.float64)
-        at = np.nan_to_num(warp(np.stack(np.meshgrid(columns, rows), axis=-1)), nan=-9.0, posinf=-9.0, neginf=-9.0)
-        seen = window_about(at.reshape(-1, 2), (source.height_px, source.width_px), margin_px=3)
-        block = np.zeros((2, window.height_px, window.width_px), np.uint8)
-        if seen is not None:
-            gray, valid = reader.read(seen)
-            x, y = np.moveaxis((at - [seen.x0, seen.y0]).astype(np.float32), -1, 0)
-            # One pixel eroded plus the reach of bilinear make up the reach of cubic.
-            solid = cv2.erode(valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
-            block[0] = cv2.remap(gray, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            solid = cv2.remap(solid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            inside = ((at >= -0.5) & (at <= [source.width_px - 0.5, source.height_px - 0.5])).all(axis=-1)
-            block[1] = np.where((np.asarray(solid) == 255) & inside, 255, 0)
-        yield window, block
+    columns = np.arange(window.x0, window.x1, dtype=np.float64)
+    rows = np.arange(window.y0, window.y1, dtype=np.float64)
+    at = np.nan_to_num(warp(np.stack(np.meshgrid(columns, rows), axis=-1)), nan=-9.0, posinf=-9.0, neginf=-9.0)
+    seen = window_about(at.reshape(-1, 2), (source.height_px, source.width_px), margin_px=3)
+    if seen is None:
+        return np.zeros(at.shape[:2], np.uint8), np.zeros(at.shape[:2], np.bool_)
+    gray, valid = reader.read(seen)
+    x, y = np.moveaxis((at - [seen.x0, seen.y0]).astype(np.float32), -1, 0)
+    # One pixel eroded plus the reach of bilinear make up the reach of cubic.
+    solid = cv2.erode(valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
+    cubic = cv2.remap(gray, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    linear = cv2.remap(solid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside = ((at >= -0.5) & (at <= [source.width_px - 0.5, source.height_px - 0.5])).all(axis=-1)
+    return np.asarray(cubic, np.uint8), (np.asarray(linear) == 255) & inside
 
 
 def open_readable(
@@ -110,7 +96,8 @@ def open_readable(
         MapError: the file cannot be read.
     """
     original = None if is_large(source.grid.area_px) else GrayReader(source)
-    if _needs_copy(source):
+    smallest_px = source.grid.area_px // max([1, *source.dataset.overviews(1)]) ** 2
+    if not source.grid.is_metric or is_large(smallest_px):
         used = open_metric_copy(source, original, cache_dir, on_copy)
         reader = GrayReader(used, find_collar=False)
     else:

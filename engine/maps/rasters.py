@@ -187,14 +187,13 @@ def _from_degrees(bounds_deg: Bounds, crs: CRS, width: int, height: int) -> Boun
     if not (-180 <= west < east <= 540 and -90 <= south < north <= 90):  # NaN fails too
         raise MapError(f"bounds_deg: expected west < east and south < north in degrees, got {tuple(bounds_deg)}")
     to_crs = Transformer.from_crs(4326, crs, always_xy=True)
-    x, y = to_crs.transform(np.array([west, east, west, east]), np.array([north, south, south, north]))
-    step_x, step_y = (x[1] - x[0]) / width, (y[1] - y[0]) / height
-    slant_x, slant_y = np.abs([x[2] - x[0], x[3] - x[1]]).max(), np.abs([y[3] - y[0], y[2] - y[1]]).max()
-    if not (slant_x <= step_x / 2 and slant_y <= -step_y / 2):
+    x, y = to_crs.transform(*np.meshgrid([west, east], [north, south]))  # (2, 2) each, corners as in the picture
+    step_x, step_y = (x[0, 1] - x[0, 0]) / width, (y[0, 0] - y[1, 0]) / height
+    if not (np.ptp(x, axis=0).max() <= step_x / 2 and np.ptp(y, axis=1).max() <= step_y / 2):
         raise MapError(
             f"bounds_deg: expected a rectangle in crs {crs.name!r}, in its own units; the corners form none"
         )
-    return float(x[0]), float(y[1]), float(x[1]), float(y[0])
+    return float(x[0, 0]), float(y[1, 0]), float(x[0, 1]), float(y[0, 0])
 
 
 def _from_edges(bounds: Bounds, width: int, height: int) -> Array:
@@ -216,9 +215,9 @@ class GrayReader:
     def __init__(self, source: Source, *, find_collar: bool = True) -> None:
         self._source, self._lock = source, threading.Lock()
         dataset, grid = source.dataset, source.grid  # a copy's file is padded beyond its grid
-        self.dtype = dataset.dtypes[0]
-        if self.dtype not in DTYPES:
-            raise MapError(f"map: expected pixels of {', '.join(DTYPES)}, got {self.dtype} in {source.path}")
+        dtype = dataset.dtypes[0]
+        if dtype not in DTYPES:
+            raise MapError(f"map: expected pixels of {', '.join(DTYPES)}, got {dtype} in {source.path}")
         self._bands = [1, 2, 3] if dataset.count >= 3 else [1]
         self._palette = palette_of(dataset)
         shrink = max(1.0, max(grid.width_px, grid.height_px) / OVERVIEW_PX)

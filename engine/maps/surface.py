@@ -35,70 +35,14 @@ class HeightTiles:
     Args:
         source: the model.
         part: window of it, in its pixels, whose heights these are.
+        grid: of the map.
     """
 
-    def __init__(self, source: Source, part: Window) -> None:
+    def __init__(self, source: Source, part: Window, grid: Grid) -> None:
         self._source, self._part, self._lock = source, part, threading.Lock()
         self._tile = lru_cache(COARSE_LIMIT_PX // TILE_PX**2)(self._read)
-        self.shape = (part.height_px, part.width_px)
-
-    def sample(self, at: Array) -> Array:
-        """Bilinear heights.
-
-        Args:
-            at: (N, 2) places in pixels of the part.
-
-        Returns:
-            (N,) metres, NaN outside and next to nodata.
-        """
-        out, last = np.full(len(at), np.nan), np.array(self.shape[::-1]) - 1
-        inside = np.flatnonzero(((at >= -0.5) & (at <= last + 0.5)).all(axis=1))
-        column, row = (np.clip(at[inside], 0, last) // TILE_PX).astype(np.intp).T
-        for x, y in {*zip(column.tolist(), row.tolist(), strict=True)}:
-            here = inside[(column == x) & (row == y)]
-            out[here] = _bilinear(self._tile(x, y), at[here] - [x * TILE_PX, y * TILE_PX])
-        return out
-
-    def _read(self, column: int, row: int) -> Heights:
-        """The heights of a tile, with the first column and row of those behind it."""
-        x, y = column * TILE_PX, row * TILE_PX
-        size = min(TILE_PX + 1, self.shape[0] - y), min(TILE_PX + 1, self.shape[1] - x)
-        window = Window(self._part.x0 + x, self._part.y0 + y, size[1], size[0])
-        with self._lock:  # a GDAL dataset serves one thread at a time
-            return read_heights(self._source, window, size)
-
-
-class SurfaceModel:
-    """Heights on their own grid.
-
-    Args:
-        heights_m: (H, W), NaN where unknown.
-        from_map: from pixels of the map to those of the heights.
-        decimated: the same surface with fewer pixels, if it is too large to be sampled as a whole.
-    """
-
-    def __init__(
-        self, heights_m: Heights | HeightTiles, from_map: Warp, decimated: SurfaceModel | None = None
-    ) -> None:
-        if isinstance(heights_m, np.ndarray):  # the loops are compiled for one type
-            heights_m = np.ascontiguousarray(heights_m, np.float32)
-        self._heights_m, self._from_map, self._decimated = heights_m, from_map, decimated
-
-    @property
-    def reads_files(self) -> bool:
-        """Whether heights are read from the file whenever they are needed."""
-        return isinstance(self._heights_m, HeightTiles)
-
-    def overview(self, map_xy: Array) -> Array:
-        """Heights for samples spread over the whole map, from the decimated surface if there is one.
-
-        Args:
-            map_xy: (..., 2) pixels of the map.
-
-        Returns:
-            (...,) metres, as :meth:`sample`.
-        """
-        return (self._decimated or self).sample(map_xy)
+        self._shape = (part.height_px, part.width_px)
+        self._from_map = warp_between(grid, part_grid(source.grid, part, self._shape))
 
     def sample(self, map_xy: Array) -> Array:
         """Bilinear heights.
@@ -109,11 +53,63 @@ class SurfaceModel:
         Returns:
             (...,) metres, NaN outside and next to nodata.
         """
+        at = self._from_map(map_xy.reshape(-1, 2))
+        out, last = np.full(len(at), np.nan), np.array(self._shape[::-1]) - 1
+        inside = np.flatnonzero(((at >= -0.5) & (at <= last + 0.5)).all(axis=1))
+        column, row = (np.clip(at[inside], 0, last) // TILE_PX).astype(np.intp).T
+        for x, y in {*zip(column.tolist(), row.tolist(), strict=True)}:
+            here = inside[(column == x) & (row == y)]
+            out[here] = _bilinear(self._tile(x, y), at[here] - [x * TILE_PX, y * TILE_PX])
+        return out.reshape(map_xy.shape[:-1])
+
+    def _read(self, column: int, row: int) -> Heights:
+        """The heights of a tile, with the first column and row of those behind it."""
+        x, y = column * TILE_PX, row * TILE_PX
+        size = min(TILE_PX + 1, self._shape[0] - y), min(TILE_PX + 1, self._shape[1] - x)
+        window = Window(self._part.x0 + x, self._part.y0 + y, size[1], size[0])
+        with self._lock:  # a GDAL dataset serves one thread at a time
+            return read_heights(self._source, window, size)
+
+
+class SurfaceModel:
+    """Heights on their own grid.
+
+    Args:
+        heights_m: (H, W) float32, contiguous, NaN where unknown.
+        from_map: from pixels of the map to those of the heights.
+        tiles: the same surface with more pixels, if it is too large to be held in memory.
+    """
+
+    def __init__(self, heights_m: Heights, from_map: Warp, tiles: HeightTiles | None = None) -> None:
+        self._heights_m, self._from_map, self._tiles = heights_m, from_map, tiles
+
+    @property
+    def reads_files(self) -> bool:
+        """Whether heights are read from the file whenever they are needed."""
+        return self._tiles is not None
+
+    def overview(self, map_xy: Array) -> Array:
+        """Heights for samples spread over the whole map, from those in memory.
+
+        Args:
+            map_xy: (..., 2) pixels of the map.
+
+        Returns:
+            (...,) metres, as :meth:`sample`.
+        """
         at = self._from_map(map_xy)
-        flat = np.ascontiguousarray(at, np.float64).reshape(-1, 2)
-        heights = self._heights_m
-        found = _bilinear(heights, flat) if isinstance(heights, np.ndarray) else heights.sample(flat)
-        return found.reshape(at.shape[:-1])
+        return _bilinear(self._heights_m, at.reshape(-1, 2)).reshape(at.shape[:-1])
+
+    def sample(self, map_xy: Array) -> Array:
+        """Bilinear heights.
+
+        Args:
+            map_xy: (..., 2) pixels of the map.
+
+        Returns:
+            (...,) metres, NaN outside and next to nodata.
+        """
+        return self.overview(map_xy) if self._tiles is None else self._tiles.sample(map_xy)
 
     def ground_at(self, map_xy: Array, reach_px: float) -> float | None:
         """Level of the plane with a fifth of the surface below it in a square about one map pixel.
@@ -134,9 +130,7 @@ class SurfaceModel:
     @property
     def range_m(self) -> tuple[float, float]:
         """Lowest and highest known height; for a large surface those of its averages."""
-        heights = (self._decimated or self)._heights_m
-        assert isinstance(heights, np.ndarray)  # a surface read in tiles has a decimated one
-        return float(np.nanmin(heights)), float(np.nanmax(heights))
+        return float(np.nanmin(self._heights_m)), float(np.nanmax(self._heights_m))
 
 
 def _bilinear(heights_m: Heights, at: Array) -> Array:
@@ -144,7 +138,7 @@ def _bilinear(heights_m: Heights, at: Array) -> Array:
     from engine.kernels.map_points import bilinear_heights  # numba takes a while to import
 
     out = np.empty(len(at))
-    bilinear_heights(heights_m, at, out)
+    bilinear_heights(heights_m, np.ascontiguousarray(at, np.float64), out)
     return out
 
 
@@ -159,13 +153,9 @@ def open_surface(source: Source, grid: Grid) -> tuple[SurfaceModel, Grid]:
         MapError: it cannot be read, or does not overlap the map.
     """
     part = surface_part(source, grid)
-    large = part.area_px > SURFACE_LIMIT_PX
-    heights, surface_grid = read_surface(source, grid, COARSE_LIMIT_PX if large else SURFACE_LIMIT_PX)
-    surface = SurfaceModel(heights, warp_between(grid, surface_grid))
-    if large:
-        tiles = HeightTiles(source, part)
-        surface = SurfaceModel(tiles, warp_between(grid, part_grid(source.grid, part, tiles.shape)), surface)
-    return surface, surface_grid
+    tiles = HeightTiles(source, part, grid) if part.area_px > SURFACE_LIMIT_PX else None
+    heights, surface_grid = read_surface(source, grid, SURFACE_LIMIT_PX if tiles is None else COARSE_LIMIT_PX)
+    return SurfaceModel(heights, warp_between(grid, surface_grid), tiles), surface_grid
 
 
 def read_surface(source: Source, grid: Grid, limit_px: int = SURFACE_LIMIT_PX) -> tuple[Heights, Grid]:
@@ -224,14 +214,9 @@ def read_heights(source: Source, part: Window, shape: tuple[int, int]) -> Height
     """
     from rasterio.enums import Resampling
 
-    whole = shape == (part.height_px, part.width_px)
     with map_errors("surface", source.path):
         data = source.dataset.read(
-            1,
-            window=part.slices,
-            out_shape=shape,
-            masked=True,
-            resampling=Resampling.nearest if whole else Resampling.average,
+            1, window=part.slices, out_shape=shape, masked=True, resampling=Resampling.average
         )
     heights = data.astype(np.float32).filled(np.nan) * source.dataset.scales[0] + source.dataset.offsets[0]
     heights[~((heights > HEIGHT_RANGE_M[0]) & (heights < HEIGHT_RANGE_M[1]))] = np.nan

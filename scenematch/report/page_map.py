@@ -223,9 +223,9 @@ def map_colours(site: OrthoMap, window: Window, shape: tuple[int, int]) -> Image
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT
 
-    source = site.open_file()
-    if source is None:
+    if site.open_file is None:
         return None
+    source = site.open_file()
     palette = palette_of(source.dataset)
     if source.dataset.count < 3 and palette is None:
         return None

@@ -152,11 +152,14 @@ def test_features_lie_in_one_place_whatever_the_file_is_stored_in(tmp_path, crs)
 
 def test_geographic_maps_across_the_antimeridian_and_in_the_south(tmp_path):
     fiji = {"crs": "EPSG:4326", "transform": Affine(1e-5, 0, 179.9995, 0, -1e-5, -17.0)}
-    site = OrthoMap.open(write(tmp_path / "fiji.tif", noise(80, 100), **fiji), cache_dir=tmp_path)
+    slope = write(tmp_path / "dsm.tif", np.tile(np.arange(100, dtype=np.float32), (80, 1)), **fiji)
+    site = OrthoMap.open(write(tmp_path / "fiji.tif", noise(80, 100), **fiji), slope, cache_dir=tmp_path)
     assert site.crs.to_epsg() in (32701, 32760)
     assert site.info()["nodata_share"] < 0.1
     middle = np.array([site.width_px / 2, site.height_px / 2])
     assert np.allclose(site.pixel_from_geodetic(*site.geodetic_from_pixel(middle)), middle, atol=1e-5)
+    beside = site.pixel_from_geodetic(np.full(2, -17.0004), np.array([179.99975, -179.99975]))
+    assert np.allclose(site.surface_at(beside), [24.5, 74.5], atol=0.1)  # west of the antimeridian and east of it
 
 
 # --- grey values and nodata ---------------------------------------------------------------------------------
