@@ -37,12 +37,10 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
     first = next(iter(tracks.values()))
     track_map = map_of_tracks(list(tracks.values()))
     verdicts = {name: verdict_of(track.summary) for name, track in tracks.items()}
-    truths = [track.errors.truth_en_m for track in tracks.values()]
-    truth = next((truth for truth in truths if np.isfinite(truth).any()), None)
-    true_path = np.empty((0, 2)) if truth is None else connected(track_map, truth)
+    truth = next((t.errors.truth_en_m for t in tracks.values() if t.errors.has_truth), np.empty((0, 2)))
+    true_path = connected(track_map, truth)
     marks = [line(true_path, "halo"), *_run_marks(tracks, track_map), line(true_path, "truth")]
     label = f"Map with the tracks of {', '.join(tracks)}."
-    truth_mark = ("truth", '<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="truth"/>')
     grades = {verdict.grade for verdict in verdicts.values()}
     fill_page(
         path,
@@ -55,10 +53,10 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
         figures=_figures(tracks),
         drawn=draw_map(track_map, label, marks),
         extent_m=track_map.extent_m,
-        map_legend=[truth_mark] if len(true_path) else [],
+        has_truth=len(true_path) > 0,
         names=list(tracks),
         charts=_charts(tracks),
-        run_legend=[(name, f'<path class="dots r{i}" d="M11 7h0"/>') for i, name in enumerate(tracks)],
+        run_legend=[(True, name, f'<path class="dots r{i}" d="M11 7h0"/>') for i, name in enumerate(tracks)],
     )
 
 
