@@ -34,14 +34,7 @@ from scenematch.bridges.packets import AUTOPILOT_COMPONENT, PacketDecoder, Packe
 from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
-__all__ = [
-    "Connection",
-    "MavlinkBridge",
-    "MavlinkOptions",
-    "MavlinkStatus",
-    "NedOrigin",
-    "parse_connection",
-]
+__all__ = ["Connection", "MavlinkBridge", "MavlinkOptions", "MavlinkStatus", "NedOrigin", "parse_connection"]
 
 _log = logging.getLogger("scenematch")
 

@@ -109,9 +109,8 @@ def timesync_message(now_ns: int, request_ns: int | None = None) -> Any:
 
 def set_origin_message(system_id: int, origin: NedOrigin, now_ns: int) -> Any:
     """SET_GPS_GLOBAL_ORIGIN for an autopilot without an origin."""
-    lat_1e7, lon_1e7 = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7)
-    alt_mm = round(origin.alt_amsl_m * 1e3)
-    return mavlink.MAVLink_set_gps_global_origin_message(system_id, lat_1e7, lon_1e7, alt_mm, now_ns // 1000)
+    place = (*_degrees_1e7(origin), round(origin.alt_amsl_m * 1e3))
+    return mavlink.MAVLink_set_gps_global_origin_message(system_id, *place, now_ns // 1000)
 
 
 def command_message(system_id: int, command: int, *values: float) -> Any:
@@ -307,5 +306,5 @@ def _global_position_sensor(report: FixReport) -> Any:
     )
 
 
-def _degrees_1e7(fix: Fix | GnssFix) -> tuple[int, int]:
-    return round(fix.lat_deg * 1e7), round(math.remainder(fix.lon_deg, 360.0) * 1e7)
+def _degrees_1e7(place: Fix | GnssFix | NedOrigin) -> tuple[int, int]:
+    return round(place.lat_deg * 1e7), round(math.remainder(place.lon_deg, 360.0) * 1e7)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import OptionError
-from engine.values import check, check_choice, check_positive
+from engine.values import check, check_choice
 
 MAX_DELAY_MS = 250.0
 """Upper bound of ArduPilot's VISO_DELAY_MS."""
@@ -51,7 +51,8 @@ class MavlinkOptions:
     gps_id: int = 0
 
     def __post_init__(self) -> None:
-        check_positive(self, "max_sigma_m")
+        upto = "a number above 0 and at most 100 (ArduPilot clamps there)"
+        check(self, "max_sigma_m", upto, lambda sigma_m: 0.0 < sigma_m <= 100.0)
         check(self, "system_id", "1 to 255", lambda number: 1 <= number <= 255)
         check(self, "component_id", "2 to 255 (1 is the autopilot)", lambda number: 2 <= number <= 255)
         check_choice(self, "firmware", tuple(MESSAGES))
@@ -61,10 +62,6 @@ class MavlinkOptions:
         check(self, "gps_id", f"0 to {_MAX_GPS_ID}", lambda number: 0 <= number <= _MAX_GPS_ID)
         if self.gps_id and self.kind != "gps_input":
             raise OptionError(f"gps_id: expected with gps_input only, got {self.kind}")
-        if self.max_sigma_m > 100.0:
-            raise OptionError(
-                f"max_sigma_m: expected at most 100 (ArduPilot clamps there), got {self.max_sigma_m:g}"
-            )
 
     @property
     def kind(self) -> str:
