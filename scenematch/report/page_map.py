@@ -16,7 +16,7 @@ from engine.orthomap import OrthoMap
 from engine.values import Window
 from engine.window import level_crop
 from scenematch.report.charts import crosses, dots, line, ticks
-from scenematch.report.explain import Image, jpeg_data_uri, level_within
+from scenematch.report.explain import Image, evenly_spaced, jpeg_data_uri, level_within
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.loop_record import LoopRecord
 from scenematch.report.metrics import TrackErrors
@@ -181,8 +181,7 @@ def _ellipses(track_map: TrackMap, errors: TrackErrors) -> str:
         at = f"translate({x:.1f} {y:.1f}) rotate({angle_deg:.0f})"
         shape = f'rx="{a:.2f}" ry="{b:.2f}" transform="{at}"/>'
         parts.append(f'<ellipse class="rim" {shape}<ellipse class="ellipse" {shape}')
-    shown = np.unique(np.round(np.linspace(0, len(parts) - 1, min(len(parts), _MAX_ELLIPSES))).astype(int))
-    return "".join(parts[i] for i in shown)
+    return "".join(parts[i] for i in evenly_spaced(np.arange(len(parts)), _MAX_ELLIPSES))
 
 
 def map_colours(site: OrthoMap, window: Window, shape: tuple[int, int]) -> Image | None:
