@@ -191,20 +191,15 @@ def run_mavlink_bridge(
         check_supervision(matcher.device)
         become_worker(progress)
     resumed = _resumed(last_fix.prior(speed_mps), matcher.site, progress)
+    begin = resumed or start
     with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
         # Before the link: a bench autopilot takes off as soon as the bridge listens.
         pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat), settings.scheduling())
         with open_bridge(
-            link,
-            make_navigator,
-            start=resumed or start,
-            live=settings.live_options(MAX_DELAY_MS),
-            origin=link.origin(matcher.site, resumed or start),
-            site=matcher.site,
-            resumed=resumed is not None,
-            gimbal_mount=matcher.camera.mount if files.gimbal else None,
-            watch=_watch(last_fix, watcher),
-        ) as bridge:
+            link, make_navigator, start=begin, resumed=resumed is not None, site=matcher.site,
+            origin=link.origin(matcher.site, begin), live=settings.live_options(MAX_DELAY_MS),
+            gimbal_mount=matcher.camera.mount if files.gimbal else None, watch=_watch(last_fix, watcher),
+        ) as bridge:  # fmt: skip
             settings.schedule_this_thread()
             # Ctrl-C is the usual way to stop a camera's bridge and must keep the counts.
             with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
