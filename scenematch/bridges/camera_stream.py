@@ -58,12 +58,10 @@ class _OpenCvSource:
 
     def __init__(self, source: str) -> None:
         try:
-            if source.isdecimal():
-                self._camera = cv2.VideoCapture(int(source))
-            elif "://" in source or source.endswith(".sdp"):
+            if "://" in source or source.endswith(".sdp"):
                 self._camera = _open_stream(source)
             else:
-                self._camera = cv2.VideoCapture(source)
+                self._camera = cv2.VideoCapture(int(source) if source.isdecimal() else source)
             opened = self._camera.isOpened()
         except (cv2.error, ValueError):  # a number with more digits than OpenCV or Python accepts
             opened = False

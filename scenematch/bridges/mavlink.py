@@ -34,14 +34,7 @@ from scenematch.bridges.packets import AUTOPILOT_COMPONENT, PacketDecoder, Packe
 from scenematch.bridges.parameters import MavlinkOptions
 from scenematch.bridges.vehicle import NedOrigin
 
-__all__ = [
-    "Connection",
-    "MavlinkBridge",
-    "MavlinkOptions",
-    "MavlinkStatus",
-    "NedOrigin",
-    "parse_connection",
-]
+__all__ = ["Connection", "MavlinkBridge", "MavlinkOptions", "MavlinkStatus", "NedOrigin", "parse_connection"]
 
 _log = logging.getLogger("scenematch")
 
@@ -222,9 +215,8 @@ class MavlinkBridge:
     def _awaits_receiver(self) -> bool:
         """Whether the first fix must wait for the autopilot's report on its receiver, which is requested."""
         is_first = not (self._guard.has_fix or self._resumed)
-        checked = self._checked_on is not None and is_first
         recent = time.monotonic_ns() - self._connected_ns < _GNSS_STALE_NS
-        return checked and recent and self.telemetry.has_receiver is None
+        return self._checked_on is not None and is_first and recent and self.telemetry.has_receiver is None
 
     def _tell(self, notices: list[Notice]) -> None:
         for severity, text in notices:

@@ -21,14 +21,7 @@ from engine.geo import wrap_heading_deg
 from engine.values import Attitude
 from scenematch.bridges.gimbal import body_behind, from_device, from_mount
 from scenematch.bridges.packets import BRIDGE_COMPONENT
-from scenematch.bridges.vehicle import (
-    ANGLES,
-    NedOrigin,
-    RecentValues,
-    VehicleState,
-    height_above_ground_m,
-    scalar,
-)
+from scenematch.bridges.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, height_above_ground_m, scalar
 from scenematch.bridges.vision_in import has_failed, is_by_camera, vision_velocity
 
 MAV_AUTOPILOTS = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
@@ -41,12 +34,10 @@ _COMMON_RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 2,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1,
 }
+_COMMON_GIMBAL_RATES_HZ = {mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 50}
 GIMBAL_RATES_HZ = {
-    "ardupilot": {mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 50},
-    "px4": {
-        mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 50,
-        mavlink.MAVLINK_MSG_ID_MOUNT_ORIENTATION: 50,
-    },
+    "ardupilot": _COMMON_GIMBAL_RATES_HZ,
+    "px4": _COMMON_GIMBAL_RATES_HZ | {mavlink.MAVLINK_MSG_ID_MOUNT_ORIENTATION: 50},
 }
 """The same for messages needed only with a gimbal."""
 REQUESTED_RATES_HZ = {

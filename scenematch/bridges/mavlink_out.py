@@ -6,7 +6,7 @@ Converts to radians, NED and 1e-7 degrees. Stamps are capture times.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -77,7 +77,7 @@ def withhold_reason(report: FixReport, options: MavlinkOptions) -> str | None:
             return "no origin"
         if vehicle.down_m is None:
             return "no height"
-        if None in (vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg):
+        if vehicle.attitude is None:
             return "no attitude"
     # ArduPilot uses these velocities unconditionally: an unknown one would count as zero.
     reads_velocity = options.firmware == "ardupilot" and options.kind != "vision_position_estimate"
@@ -109,9 +109,8 @@ def timesync_message(now_ns: int, request_ns: int | None = None) -> Any:
 
 def set_origin_message(system_id: int, origin: NedOrigin, now_ns: int) -> Any:
     """SET_GPS_GLOBAL_ORIGIN for an autopilot without an origin."""
-    lat_1e7, lon_1e7 = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7)
-    alt_mm = round(origin.alt_amsl_m * 1e3)
-    return mavlink.MAVLink_set_gps_global_origin_message(system_id, lat_1e7, lon_1e7, alt_mm, now_ns // 1000)
+    place = (*_degrees_1e7(origin), round(origin.alt_amsl_m * 1e3))
+    return mavlink.MAVLink_set_gps_global_origin_message(system_id, *place, now_ns // 1000)
 
 
 def command_message(system_id: int, command: int, *values: float) -> Any:
@@ -184,16 +183,10 @@ def _measured_attitude(report: FixReport) -> Attitude | None:
 
 def _angles(report: FixReport) -> tuple[float, float, float]:
     """Roll, pitch and yaw in radians, yaw in [-pi, pi]: as measured by the fix, else the vehicle's."""
-    roll_deg, pitch_deg, heading_deg = _known_angles_deg(_measured_attitude(report) or report.vehicle)
-    yaw = math.remainder(math.radians(heading_deg), 2.0 * math.pi)
-    return math.radians(roll_deg), math.radians(pitch_deg), yaw
-
-
-def _known_angles_deg(source: Attitude | VehicleState) -> tuple[float, float, float]:
-    assert source.roll_deg is not None  # checked by withhold_reason
-    assert source.pitch_deg is not None
-    assert source.heading_deg is not None
-    return source.roll_deg, source.pitch_deg, source.heading_deg
+    attitude = _measured_attitude(report) or report.vehicle.attitude
+    assert attitude is not None  # checked by withhold_reason
+    roll, pitch, heading = map(math.radians, astuple(attitude))
+    return roll, pitch, math.remainder(heading, 2.0 * math.pi)
 
 
 def _ned(report: FixReport, firmware: str) -> tuple[float, float, float]:
@@ -241,8 +234,8 @@ def _odometry(report: FixReport, firmware: str) -> Any:
 def _body_velocity(velocity: GroundVelocity, vehicle: VehicleState) -> list[float]:
     """Velocity in m/s along the body's axes, by the autopilot's own attitude, which it uses to rotate it back."""
     enu_mps = np.array([velocity.east_mps, velocity.north_mps, vehicle.up_velocity_mps or 0.0])
-    rotation = enu_from_body(*_known_angles_deg(vehicle))
-    return [float(v) for v in rotation.T @ enu_mps]
+    assert vehicle.attitude is not None  # checked by withhold_reason
+    return [float(v) for v in enu_from_body(*astuple(vehicle.attitude)).T @ enu_mps]
 
 
 def receiver_message(
@@ -307,5 +300,5 @@ def _global_position_sensor(report: FixReport) -> Any:
     )
 
 
-def _degrees_1e7(fix: Fix | GnssFix) -> tuple[int, int]:
-    return round(fix.lat_deg * 1e7), round(math.remainder(fix.lon_deg, 360.0) * 1e7)
+def _degrees_1e7(place: Fix | GnssFix | NedOrigin) -> tuple[int, int]:
+    return round(place.lat_deg * 1e7), round(math.remainder(place.lon_deg, 360.0) * 1e7)

@@ -57,8 +57,7 @@ class AutopilotRequests:
         if self._origin is None or self._options.kind == "gps_input":
             return []
         receiver, uptime_ms = telemetry.has_receiver, telemetry.uptime_ms
-        on_ground = not telemetry.armed
-        seeks = on_ground and not receiver and uptime_ms is not None and uptime_ms < _RECEIVER_FOUND_MS
+        seeks = uptime_ms is not None and uptime_ms < _RECEIVER_FOUND_MS and not (receiver or telemetry.armed)
         waited_ns = _ORIGIN_TIMEOUT_GNSS_NS if receiver or seeks else _ORIGIN_TIMEOUT_NS
         if now_ns - self._without_origin_ns <= waited_ns:
             return []

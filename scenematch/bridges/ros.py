@@ -198,8 +198,7 @@ class RosBridge:
             submit()
 
     def _start_live(self) -> Live:
-        make, options = self._make_navigator, self._live_options
-        return Live(make, self.deliver, self._start, options, self._node.now_ns)
+        return Live(self._make_navigator, self.deliver, self._start, self._live_options, self._node.now_ns)
 
     def _restart(self) -> None:
         """Start over because time went back: a simulator or a bag was restarted."""

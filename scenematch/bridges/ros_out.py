@@ -108,12 +108,9 @@ def pose_covariance(
     """
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = fix.covariance_m2
-    if firmware != "none":
+    if firmware != "none" or not knows_up:
         covariance[2, :2] = covariance[:2, 2] = 0.0
-        covariance[2, 2] = fix.sigma_m**2
-    elif not knows_up:
-        covariance[2, :2] = covariance[:2, 2] = 0.0
-        covariance[2, 2] = _UNKNOWN_HEIGHT_M2
+        covariance[2, 2] = _UNKNOWN_HEIGHT_M2 if firmware == "none" else fix.sigma_m**2
     if fix.attitude is not None and fix.attitude_covariance_deg2 is not None:
         measured = fix.attitude.roll_deg, fix.attitude.pitch_deg, fix.attitude.heading_deg
         covariance[3:, 3:] = enu_turn_covariance_rad2(fix.attitude_covariance_deg2, measured)

@@ -68,6 +68,13 @@ class VehicleState:
     down_m: float | None = None
     holder: Attitude | None = None
 
+    @property
+    def attitude(self) -> Attitude | None:
+        """The vehicle's own attitude; None if an angle of it is unknown."""
+        if self.roll_deg is None or self.pitch_deg is None or self.heading_deg is None:
+            return None
+        return Attitude(self.roll_deg, self.pitch_deg, self.heading_deg)
+
     def frame(self, image: NDArray[np.uint8], captured_ns: int) -> Frame:
         """The frame for an image (H, W, 3) or (H, W) uint8 captured at this time."""
         body = self.holder or self

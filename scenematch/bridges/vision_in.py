@@ -11,7 +11,6 @@ from engine.geo import Array, enu_from_body
 from scenematch.bridges.packets import AUTOPILOT_COMPONENT
 from scenematch.files.velocities import velocity_sigma_mps
 
-_OVER_GROUND = (mavlink.MAV_FRAME_LOCAL_NED,)
 _OF_BODY = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)  # the latter is its former name
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FAILED = -1  # quality
@@ -69,7 +68,7 @@ def is_by_camera(message: Any, bridge_component: int) -> bool:
 
 def _turn(frame: int, attitude_deg: tuple[float, ...] | None) -> Array | None:
     """Rotation from a velocity's frame to east, north, up; None if unknown."""
-    if frame in _OVER_GROUND:
+    if frame == mavlink.MAV_FRAME_LOCAL_NED:
         return _ENU_FROM_NED
     if frame not in _OF_BODY or attitude_deg is None:
         return None

@@ -147,15 +147,12 @@ def _print(title: str, table: Table) -> None:
     from rich.text import Text
 
     console = Console(highlight=False)
-    if console.is_terminal:
+    if not console.is_terminal:
+        console.width = _PIPE_WIDTH
+    with console.capture() as capture:
         console.print(Text(title, style="bold"), soft_wrap=True)
         console.print(table)
-        return
-    wide = Console(highlight=False, width=_PIPE_WIDTH)
-    with wide.capture() as capture:
-        wide.print(table)
-    lines = (line.rstrip() for line in capture.get().splitlines())
-    print(title, *lines, sep="\n")
+    print(*(line.rstrip() for line in capture.get().splitlines()), sep="\n")
 
 
 def facts(values: Mapping[str, Any], title: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import Array
+from scenematch.report.page_parts import filled
 
 Limits = tuple[float, float]
 
@@ -69,14 +70,6 @@ class ChartArea:
             parts.append(f"M{_joined(there)}L{_joined(back[::-1])}Z")
         return f'<path class="{kind}" d="{"".join(parts)}"/>' if parts else ""
 
-    def horizontal(self, y: float, kind: str, text: str) -> str:
-        """A labelled horizontal line; empty if outside the limits."""
-        if not self.y_limits[0] <= y <= self.y_limits[1]:
-            return ""
-        at, right = float(self.y(y)), WIDTH - _RIGHT
-        label = _text(right, at + (-5 if at > _TOP + 24 else 17), "end", text, kind)
-        return _segment(self.left, at, right, at, kind) + label
-
     def overflow(self, x: Array, y: Array, kind: str) -> str:
         """A stroke at the upper edge for each value above it."""
         above = self.x(x[y > self.y_limits[1]])
@@ -101,10 +94,10 @@ class ChartArea:
         *,
         rows: Sequence[str] = (),
         timed: bool,
-        fixed: Sequence[str] = (),
+        limit: tuple[float, str] | None = None,
         period: float | None = None,
     ) -> str:
-        """The complete chart.
+        """The complete chart, by the template ``chart.svg``.
 
         Args:
             label: alternative text.
@@ -112,38 +105,17 @@ class ChartArea:
             marks: SVG elements, from bottom to top; the page's script stretches them along x.
             rows: labels of y = 0, 1, ... instead of numbers.
             timed: whether x is time, which shows the page's cursor and lets the axis zoom.
-            fixed: SVG elements that are never stretched, such as labelled lines.
+            limit: a value of y within the limits that a labelled line marks, and its label.
             period: period of y, which labels ticks from 0 to it; None without one.
         """
-        foot, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
-        x_grid = "".join(self._x_tick(v, t, i) for i, (v, t) in enumerate(ticks(*self.x_limits, 6)))
         y_ticks = list(enumerate(rows)) if rows else ticks(*self.y_limits, 4)
         if period is not None:
             y_ticks = [(value, f"{value % period:g}") for value, _ in y_ticks]
-        y_grid = "".join(self._y_tick(v, t) for v, t in y_ticks)
-        name = _text((self.left + right) / 2.0, HEIGHT - 4, "middle", x_label)
-        axis = _segment(self.left, foot, right, foot, "axis")
-        place = f"{self.left:g} {_TOP:g} {right - self.left:g} {foot - _TOP:g}".split()
-        at = " ".join(f'{key}="{v}"' for key, v in zip(("x", "y", "width", "height"), place, strict=True))
-        cursor = _segment(-999, _TOP, -999, foot, "cursor") if timed else ""
-        plot = f'<svg class="plot" {at} viewBox="{" ".join(place)}"><g class="data">{"".join(marks)}</g>'
-        plot += f"{cursor}</svg>"
-        data = ""
-        if timed:
-            limits = f'data-from="{self.x_limits[0]:.9g}" data-to="{self.x_limits[1]:.9g}"'
-            data = f' {limits} data-left="{self.left:g}" data-right="{right:g}"'
-        head = f'<svg class="chart" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img"'
-        head = f'{head} aria-label="{escape(label, quote=True)}"{data}><g class="x-grid">{x_grid}</g>'
-        return f"{head}{y_grid}{plot}{''.join(fixed)}{axis}{name}</svg>"
-
-    def _x_tick(self, value: float, text: str, index: int) -> str:
-        at, foot = float(self.x(value)), HEIGHT - _BOTTOM
-        label = _text(at, foot + 20, "middle", text, f"tick{index % 2}")
-        return _segment(at, _TOP, at, foot, "grid") + label
-
-    def _y_tick(self, value: float, text: str) -> str:
-        at = float(self.y(value))
-        return _segment(self.left, at, WIDTH - _RIGHT, at, "grid") + _text(self.left - 7, at + 5, "end", text)
+        return filled(
+            "chart.svg", area=self, label=label, x_label=x_label, x_ticks=ticks(*self.x_limits, 6),
+            y_ticks=y_ticks, marks=marks, timed=timed, limit=limit, size=(WIDTH, HEIGHT), top=_TOP,
+            right=WIDTH - _RIGHT, foot=HEIGHT - _BOTTOM,
+        )  # fmt: skip
 
 
 def ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
@@ -192,11 +164,3 @@ def _segments(known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
 
 def _joined(points: Array) -> str:
     return "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
-
-
-def _segment(x0: float, y0: float, x1: float, y1: float, kind: str) -> str:
-    return f'<line class="{kind}" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"/>'
-
-
-def _text(x: float, y: float, anchor: str, text: str, kind: str = "") -> str:
-    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'

@@ -85,11 +85,11 @@ def choose_frames(rows: Sequence[TrackRow], errors: TrackErrors) -> list[int]:
         (refused | beyond, MAX_FRAMES),
     ):
         left = np.setdiff1d(np.flatnonzero(kind), chosen)
-        chosen += _evenly_spaced(left, limit - len(chosen))
+        chosen += evenly_spaced(left, limit - len(chosen))
     return sorted(chosen)
 
 
-def _evenly_spaced(indices: NDArray[np.intp], count: int) -> list[int]:
+def evenly_spaced(indices: NDArray[np.intp], count: int) -> list[int]:
     """At most ``count`` of the indices, evenly spaced, with the first and the last."""
     if len(indices) > count:
         indices = indices[np.round(np.linspace(0, len(indices) - 1, count)).astype(int)]

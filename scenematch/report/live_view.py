@@ -343,9 +343,8 @@ def _outline(site: OrthoMap, corners_px: Array, colour: tuple[int, int, int]) ->
 
 def _corners(window: Window) -> Array:
     """Corners (4, 2) of a window in map pixels, at the outer edges of its pixels."""
-    width, height = window.width_px, window.height_px
-    sides = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float64)
-    return np.asarray(sides + np.array([window.x0, window.y0]) - 0.5, np.float64)
+    x0, y0, x1, y1 = window.x0, window.y0, window.x1, window.y1
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) - 0.5
 
 
 def _closed_polyline(points: Array) -> Array:

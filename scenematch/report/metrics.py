@@ -57,6 +57,11 @@ class TrackErrors:
     covariance_en_m2: Array
 
     @property
+    def has_truth(self) -> bool:
+        """Whether the truth is known at any row."""
+        return bool(np.isfinite(self.truth_en_m).any())
+
+    @property
     def distance_m(self) -> Array:
         """(N,) horizontal error in metres."""
         return np.asarray(np.hypot(self.error_en_m[:, 0], self.error_en_m[:, 1]), dtype=np.float64)

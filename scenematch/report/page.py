@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,8 @@ from scenematch.report.explain import SliderFrame, run_window
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.page_charts import draw_charts
 from scenematch.report.page_map import TrackMap, draw_map, loop_marks, map_of_tracks, track_marks
-from scenematch.report.page_parts import CROSS, Legend, fill_page
+from scenematch.report.page_parts import fill_page
 from scenematch.report.verdict import MEANINGS, key_figures, loop_sentence, metres, verdict_of
-
-_FACTS = {
-    "map": "map", "map_sigma_m": "map sigma (m)", "surface": "surface model", "camera": "camera",
-    "frames": "frames", "every": "one frame in", "image_topic": "image topic", "telemetry": "telemetry",
-    "odometry_topic": "velocity from", "frame_stamps": "frame stamps",
-    "log_offset_s": "log offset (s)", "truth": "truth", "method": "method", "profile": "profile",
-    "device": "device", "start": "start", "budget_ms": "budget (ms)",
-}  # fmt: skip
 
 
 def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = (), why_not: str = "") -> None:
@@ -53,15 +45,13 @@ def write_page(path: Path, track: FinishedTrack, shown: Sequence[SliderFrame] = 
         sentences=[verdict.accuracy, *([loop_sentence(track.loop)] if track.loop else []), verdict.latency],
         drawn=_map(track, track_map),
         extent_m=track_map.extent_m,
-        map_legend=_map_legend(track, bool(shown)),
         figures=key_figures(track.summary),
         charts=draw_charts(track),
-        chart_legend=_chart_legend(track),
         refusals=_refusals(track, shown),
         choice=_choice(track, shown) if shown else "",
         why_not=why_not or "No frames are shown.",
-        inputs=_inputs(track.settings),
-        changes=list((track.settings.get("changed") or {}).items()),
+        track=track,
+        has_sigmas=np.isfinite(track.errors.covariance_en_m2).any(),
         versions=_versions(),
     )
 
@@ -85,38 +75,6 @@ def _map(track: FinishedTrack, track_map: TrackMap) -> str:
     refused = len(track.rows) - fixes
     label = f"Map with {fixes} fixes, {beyond} of them beyond three sigmas; {refused} refused."
     return draw_map(track_map, label, marks)
-
-
-def _map_legend(track: FinishedTrack, slider: bool) -> Legend:
-    errors, is_loop = track.errors, track.loop is not None
-    has_truth = np.isfinite(errors.truth_en_m).any()
-    path, kind = ("truth", "truth") if has_truth else ("path of the fixes", "fix")
-    marks = [
-        (True, path, f'<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="{kind}"/>'),
-        (is_loop, "plan", '<path d="M0 7h22" class="line plan"/>'),
-        (is_loop, "estimate", '<path d="M0 7h22" class="line estimate"/>'),
-        (True, "fix", '<path class="dots fix" d="M11 7h0"/>'),
-        (np.isfinite(errors.covariance_en_m2).any(), "three stated sigmas, of some fixes",
-         '<circle cx="11" cy="7" r="6" class="fix"/>'),
-        (not track.fixed.all(), "refused", f'<path d="{CROSS}" class="refused"/>'),
-        (errors.beyond.any(), "fix beyond three of its sigmas", f'<path d="{CROSS}" class="beyond"/>'),
-        (slider, "frame shown below and its window", '<rect class="now" x="2" y="1" width="18" height="12"/>'),
-    ]  # fmt: skip
-    return [(name, mark) for is_shown, name, mark in marks if is_shown]
-
-
-def _chart_legend(track: FinishedTrack) -> Legend:
-    errors, states = track.errors, {row.state for row in track.rows}
-    marks = [
-        (True, "fix", '<path class="dots fix" d="M11 7h0"/>'),
-        (errors.beyond.any(), "fix beyond three of its sigmas", '<path class="dots beyond" d="M11 7h0"/>'),
-        (np.isfinite(errors.truth_en_m).any(), "truth", '<path d="M0 7h22" class="line truth"/>'),
-        (track.telemetry, "telemetry", '<path d="M0 7h22" class="line telemetry"/>'),
-        ("coasting" in states, "on dead reckoning", '<rect class="coasting" width="22" height="14"/>'),
-        ("searching" in states, "searching for a first fix", '<rect class="searching" width="22" height="14"/>'),
-        ("lost" in states, "lost", '<rect class="lost" width="22" height="14"/>'),
-    ]
-    return [(name, mark) for is_shown, name, mark in marks if is_shown]
 
 
 # ------------------------------------------------------------------------------------------------ frame by frame
@@ -203,15 +161,6 @@ def _refusals(track: FinishedTrack, shown: Sequence[SliderFrame]) -> list[tuple[
         example = f"{row.frame}: {row.detail or '-'}"
         rows.append((count, name.replace("_", " "), MEANINGS[Reason(name)], example, position))
     return rows
-
-
-def _inputs(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Inputs and settings of a run, in words."""
-    pairs = [(name, "-" if settings.get(key) is None else str(settings[key])) for key, name in _FACTS.items()]
-    if settings.get("heights"):
-        counts = ", ".join(f"{source} ({count})" for source, count in settings["heights"].items())
-        pairs.append(("heights from", counts))
-    return pairs
 
 
 def _versions() -> list[tuple[str, str]]:

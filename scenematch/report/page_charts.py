@@ -115,8 +115,8 @@ def _latency(track: FinishedTrack, latency_ms: Array, budget_ms: float | None) -
     most = min(_HEADROOM * float(known.max()), 1.6 * float(np.percentile(known, 97)))  # without a few outliers
     area = ChartArea(track.time_limits, (0.0, max(most, _HEADROOM * (budget_ms or 0.0), 0.1)))
     marks = [area.dots(track.time, latency_ms, "fix"), area.overflow(track.time, latency_ms, "over")]
-    fixed = [] if budget_ms is None else [area.horizontal(budget_ms, "limit", f"budget {budget_ms:g} ms")]
-    return "Latency (ms)", area.svg("Latency over time", track.time_label, marks, timed=True, fixed=fixed)
+    limit = None if budget_ms is None else (budget_ms, f"budget {budget_ms:g} ms")
+    return "Latency (ms)", area.svg("Latency over time", track.time_label, marks, timed=True, limit=limit)
 
 
 # -------------------------------------------------------------------------------------------------------- attitude

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 
 import cv2
 import numpy as np
@@ -17,10 +16,11 @@ from engine.orthomap import OrthoMap
 from engine.values import Window
 from engine.window import level_crop
 from scenematch.report.charts import crosses, dots, line, ticks
-from scenematch.report.explain import Image, jpeg_data_uri, level_within
+from scenematch.report.explain import Image, evenly_spaced, jpeg_data_uri, level_within
 from scenematch.report.finished_track import FinishedTrack
 from scenematch.report.loop_record import LoopRecord
 from scenematch.report.metrics import TrackErrors
+from scenematch.report.page_parts import filled
 
 _MAX_MAP_PX = 1500  # longer side as drawn
 _MAP_BYTES = 900_000
@@ -103,28 +103,29 @@ def draw_map(track_map: TrackMap, label: str, marks: Sequence[str]) -> str:
         label: alternative text.
         marks: SVG elements in units of the drawing.
     """
-    _, _, width, height = track_map.box
-    ground = (
-        f'<image href="{jpeg_data_uri(_ground(track_map), _MAP_BYTES)}" width="{width:g}" height="{height:g}" '
-    )
-    head = f'<svg class="map" id="map" viewBox="0 0 {width:g} {height:g}" role="img"'
-    head = f'{head} aria-label="{escape(label, quote=True)}">{ground}preserveAspectRatio="none" class="ground"/>'
-    return f"{head}{''.join(marks)}{_scale_bar(track_map)}</svg>"
+    unit_m = track_map.site.gsd_m_per_px * 2.0**track_map.level
+    length_m, text = ticks(0.0, track_map.box[2] * unit_m, 5)[1]  # about a fifth of the width
+    ground = jpeg_data_uri(_ground(track_map), _MAP_BYTES)
+    return filled(
+        "map.svg", size=track_map.box[2:], label=label, ground=ground, marks=marks, bar=length_m / unit_m,
+        length=text,
+    )  # fmt: skip
 
 
 def track_marks(track_map: TrackMap, track: FinishedTrack) -> list[str]:
     """The marks of one track: path, ellipses, fixes, refusals, fixes beyond three sigmas, the selected frame."""
-    fixes, beyond = track_map.drawing_xy(track.errors.fix_en_m), track.errors.beyond
+    errors = track.errors
+    fixes, beyond = track_map.drawing_xy(errors.fix_en_m), errors.beyond
     refused = track_map.drawing_xy(track.refused_en_m)
     _, _, width, height = track_map.box
     arm = max(width, height) / 170.0
-    kind, path = _path(track_map, track.errors)
+    path = connected(track_map, errors.truth_en_m if errors.has_truth else errors.fix_en_m)
     return [
         line(path, "halo"),
-        _ellipses(track_map, track.errors),
+        _ellipses(track_map, errors),
         dots(fixes, "under"),
         dots(fixes[~beyond], "fix"),
-        line(path, kind),
+        line(path, "truth" if errors.has_truth else "path"),
         crosses(refused, "refused", arm),
         crosses(fixes[beyond], "beyond", arm),
         '<rect class="now-window" id="now-window" width="0" height="0"/><path class="dots now" id="now" d=""/>',
@@ -160,13 +161,6 @@ def connected(track_map: TrackMap, positions_m: Array) -> Array:
     return points
 
 
-def _path(track_map: TrackMap, errors: TrackErrors) -> tuple[str, Array]:
-    """The true path, or the fixes' without truth: its class, and its points in units of the drawing."""
-    truth = errors.truth_en_m
-    kind, positions_m = ("truth", truth) if np.isfinite(truth).any() else ("path", errors.fix_en_m)
-    return kind, connected(track_map, positions_m)
-
-
 def _ellipses(track_map: TrackMap, errors: TrackErrors) -> str:
     """Outlines of three sigmas around some fixes, spaced to be readable."""
     known = np.flatnonzero(np.isfinite(errors.fix_en_m[:, 0]) & np.isfinite(errors.covariance_en_m2[:, 0, 0]))
@@ -187,22 +181,7 @@ def _ellipses(track_map: TrackMap, errors: TrackErrors) -> str:
         at = f"translate({x:.1f} {y:.1f}) rotate({angle_deg:.0f})"
         shape = f'rx="{a:.2f}" ry="{b:.2f}" transform="{at}"/>'
         parts.append(f'<ellipse class="rim" {shape}<ellipse class="ellipse" {shape}')
-    shown = np.unique(np.round(np.linspace(0, len(parts) - 1, min(len(parts), _MAX_ELLIPSES))).astype(int))
-    return "".join(parts[i] for i in shown)
-
-
-def _scale_bar(track_map: TrackMap) -> str:
-    """A scale bar of a round length, about a fifth of the width."""
-    _, _, width, height = track_map.box
-    unit_m = track_map.site.gsd_m_per_px * 2.0**track_map.level
-    length_m, text = ticks(0.0, width * unit_m, 5)[1]
-    x, y, end = 0.03 * width, height - 0.03 * width, 0.03 * width + length_m / unit_m
-    bar = f'd="M{x:.1f} {y:.1f}H{end:.1f}"'
-    name = f'<text x="{x:.1f}" y="{y - 0.014 * width:.1f}" '
-    return (
-        f'<path class="scale-under" {bar}/><path class="scale-bar" {bar}/>'
-        f'{name}style="--width: {width:g}">{text} m, north up</text>'
-    )
+    return "".join(parts[i] for i in evenly_spaced(np.arange(len(parts)), _MAX_ELLIPSES))
 
 
 def map_colours(site: OrthoMap, window: Window, shape: tuple[int, int]) -> Image | None:

@@ -11,7 +11,7 @@ from engine.errors import OptionError
 from engine.geo import Array
 from scenematch.report.charts import ChartArea, Limits, dots, line
 from scenematch.report.finished_track import FinishedTrack
-from scenematch.report.metrics import FALSE_SIGMAS, column, figures_in_words
+from scenematch.report.metrics import FALSE_SIGMAS, column, figures_in_words, percentiles
 from scenematch.report.page_charts import Chart
 from scenematch.report.page_map import TrackMap, connected, draw_map, map_of_tracks
 from scenematch.report.page_parts import fill_page
@@ -37,12 +37,10 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
     first = next(iter(tracks.values()))
     track_map = map_of_tracks(list(tracks.values()))
     verdicts = {name: verdict_of(track.summary) for name, track in tracks.items()}
-    truths = [track.errors.truth_en_m for track in tracks.values()]
-    truth = next((truth for truth in truths if np.isfinite(truth).any()), None)
-    true_path = np.empty((0, 2)) if truth is None else connected(track_map, truth)
+    truth = next((t.errors.truth_en_m for t in tracks.values() if t.errors.has_truth), np.empty((0, 2)))
+    true_path = connected(track_map, truth)
     marks = [line(true_path, "halo"), *_run_marks(tracks, track_map), line(true_path, "truth")]
     label = f"Map with the tracks of {', '.join(tracks)}."
-    truth_mark = ("truth", '<path d="M0 7h22" class="rim"/><path d="M0 7h22" class="truth"/>')
     grades = {verdict.grade for verdict in verdicts.values()}
     fill_page(
         path,
@@ -55,10 +53,10 @@ def write_runs_page(path: Path, tracks: Mapping[str, FinishedTrack]) -> None:
         figures=_figures(tracks),
         drawn=draw_map(track_map, label, marks),
         extent_m=track_map.extent_m,
-        map_legend=[truth_mark] if len(true_path) else [],
+        has_truth=len(true_path) > 0,
         names=list(tracks),
         charts=_charts(tracks),
-        run_legend=[(name, f'<path class="dots r{i}" d="M11 7h0"/>') for i, name in enumerate(tracks)],
+        run_legend=[(True, name, f'<path class="dots r{i}" d="M11 7h0"/>') for i, name in enumerate(tracks)],
     )
 
 
@@ -117,11 +115,10 @@ def _charts(tracks: Mapping[str, FinishedTrack]) -> list[Chart]:
 def _over_time(
     what: str, label: str, time: Limits, times: Sequence[Array], values: Sequence[Array]
 ) -> Chart | None:
-    known = np.concatenate(values)
-    known = known[np.isfinite(known)]
-    if not known.size:
+    high = percentiles(np.concatenate(values), {"p97": 97})["p97"]
+    if high is None:
         return None
-    area = ChartArea(time, (0.0, max(1.2 * float(np.percentile(known, 97)), 0.1)))
+    area = ChartArea(time, (0.0, max(1.2 * high, 0.1)))
     marks = [
         f'<g class="run{i}">{area.dots(t, v, f"r{i}")}{area.overflow(t, v, f"over r{i}")}</g>'
         for i, (t, v) in enumerate(zip(times, values, strict=True))
@@ -135,11 +132,10 @@ def _share_within(name: str, unit: str, values: Sequence[Array]) -> Chart | None
     A curve ends at the share that was answered: a method that answers few frames accurately ends low, one that
     answers inaccurately rises late.
     """
-    known = np.concatenate(values)
-    known = known[np.isfinite(known)]
-    if not known.size:
+    high = percentiles(np.concatenate(values), {"p99": 99})["p99"]
+    if high is None:
         return None
-    top = 1.2 * float(np.percentile(known, 99))
+    top = 1.2 * high
     area = ChartArea((0.0, top), (0.0, 1.02))
     marks = []
     for i, series in enumerate(values):

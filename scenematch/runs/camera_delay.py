@@ -86,9 +86,9 @@ def _recorded(
     for picture in pictures:
         now_ns = time.monotonic_ns()
         while next_ns < now_ns - _SETTLED_NS:
-            state = telemetry.vehicle(next_ns)
-            if state.roll_deg is not None and state.pitch_deg is not None and state.heading_deg is not None:
-                attitude.append((next_ns * 1e-9, state.roll_deg, state.pitch_deg, state.heading_deg))
+            known = telemetry.vehicle(next_ns).attitude
+            if known is not None:
+                attitude.append((next_ns * 1e-9, known.roll_deg, known.pitch_deg, known.heading_deg))
             next_ns += _SAMPLE_NS
         if picture is not None:
             gray = np.asarray(cv2.cvtColor(picture[0], cv2.COLOR_RGB2GRAY), np.uint8)

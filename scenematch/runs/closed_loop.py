@@ -121,9 +121,8 @@ def fly_closed_loop(
 def _write_results(out: Path, flight: ClosedLoop, record: RunRecord, progress: Progress) -> dict[str, Any]:
     """Write track, record, figures of merit and report of a finished flight."""
     flown, latency_ms = flight.flown, 1e3 * flight.latency_s
-    rows = [_row(k, answer, latency_ms) for k, answer in enumerate(flown.answers)]
-    write_track(out / TRACK, rows)
-    write_notes(out / NOTES, rows)
+    rows = (_row(k, answer, latency_ms) for k, answer in enumerate(flown.answers))
+    write_notes(out / NOTES, write_track(out / TRACK, rows))
     write_loop_csv(out / LOOP, flown)
     write_json(out / SUMMARY, {"settings": record.facts()})
     summary = evaluate(out, force=True, progress=progress)  # like any finished track

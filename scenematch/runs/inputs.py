@@ -270,19 +270,15 @@ def _check_gimbal(flight: Flight, camera: Camera) -> None:
         )
 
 
-def _needs(method: str, profile: str) -> list[str]:
-    """Telemetry that a method requires."""
-    needs = ["height_agl_m"] if profile == "paper" or method == "ncc" else []
-    return [*needs, "heading_deg"] if method == "ncc" else needs
-
-
 def _check_needs(flight: Flight, method: str, profile: str, progress: Progress) -> None:
     """Report how many frames the method will certainly refuse for lack of telemetry, and which method would not.
 
     Raises:
         TelemetryError: every frame would be refused.
     """
-    needs, other = _needs(method, profile), "" if profile == "paper" else "; sift and auto do not need it"
+    needs = ["height_agl_m"] if profile == "paper" or method == "ncc" else []
+    needs += ["heading_deg"] if method == "ncc" else []
+    other = "" if profile == "paper" else "; sift and auto do not need it"
     if needs and not any(all(getattr(row, name) is not None for name in needs) for row in flight.rows):
         asked, doubts = " and ".join(needs), "".join(f"; {remark}" for remark in flight.remarks)
         raise TelemetryError(f"telemetry: {method} needs {asked}, got no frame with a value there{other}{doubts}")

@@ -118,8 +118,7 @@ def _checked(settings: FetchSettings, folder: Path, progress: Progress) -> Wante
     check_above("timeout_s", settings.timeout_s, 0.0, 3600.0)
     check_above("map_sigma_m", settings.map_sigma_m, 0.0, MAX_SIGMA_M)
     check_above("surface_slope_sigma_deg", settings.surface_slope_sigma_deg, 0.0, 45.0)
-    if not 0.0 <= settings.pause_ms <= 60_000.0:
-        raise OptionError(f"pause_ms: expected milliseconds from 0 to 60000, got {settings.pause_ms:g}")
+    check_between("pause_ms", settings.pause_ms, 0, 60_000)
     check_between("tile_px", settings.tile_px, 16, 4096)
     if settings.surface is None:
         names = ("surface_datum", "surface_slope_sigma_deg")

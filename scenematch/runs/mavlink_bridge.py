@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -192,16 +191,20 @@ def run_mavlink_bridge(
         check_supervision(matcher.device)
         become_worker(progress)
     resumed = _resumed(last_fix.prior(speed_mps), matcher.site, progress)
-    flight: dict[str, Any] = {
-        "start": resumed or start, "resumed": resumed is not None, "site": matcher.site,
-        "origin": link.origin(matcher.site, resumed or start),
-        "gimbal_mount": matcher.camera.mount if files.gimbal else None,
-    }  # fmt: skip
+    begin = resumed or start
     with open_bridge_view(matcher, live_view, settings.navigator) as (make_navigator, watcher):
-        flight["live"], flight["watch"] = settings.live_options(MAX_DELAY_MS), _watch(last_fix, watcher)
-        return _fly(
-            partial(open_bridge, link, make_navigator, **flight), files, matcher.camera, settings, progress
-        )
+        # Before the link: a bench autopilot takes off as soon as the bridge listens.
+        pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat), settings.scheduling())
+        with open_bridge(
+            link, make_navigator, start=begin, resumed=resumed is not None, site=matcher.site,
+            origin=link.origin(matcher.site, begin), live=settings.live_options(MAX_DELAY_MS),
+            gimbal_mount=matcher.camera.mount if files.gimbal else None, watch=_watch(last_fix, watcher),
+        ) as bridge:  # fmt: skip
+            settings.schedule_this_thread()
+            # Ctrl-C is the usual way to stop a camera's bridge and must keep the counts.
+            with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
+                _run(bridge, pictures, matcher.camera, settings.seconds, progress, beat)
+            return bridge.status
 
 
 def _last_fix(files: BridgeFiles, link: MavlinkSettings) -> LastFix:
@@ -239,24 +242,6 @@ def open_bridge(
         return MavlinkBridge(link.connection(), make_navigator, link, key=key, **flight)
     except OSError as error:
         raise BackendError(f"connect: {link.connect} cannot be opened: {error.strerror or error}") from None
-
-
-def _fly(
-    opened: Callable[[], MavlinkBridge],
-    files: BridgeFiles,
-    camera: Camera,
-    settings: BridgeSettings,
-    progress: Progress,
-) -> MavlinkStatus:
-    """Open the bridge and pass the pictures to it until they end or the time is up."""
-    # Before the link: a bench autopilot takes off as soon as the bridge listens.
-    pictures = files.pictures(lambda: _wait_for_autopilot(bridge, progress, beat), settings.scheduling())
-    with opened() as bridge:
-        settings.schedule_this_thread()
-        # Ctrl-C is the usual way to stop a camera's bridge and must keep the counts.
-        with running_service() as beat, closing(pictures), suppress(KeyboardInterrupt):
-            _run(bridge, pictures, camera, settings.seconds, progress, beat)
-        return bridge.status
 
 
 def _loaded(

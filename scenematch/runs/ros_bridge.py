@@ -139,19 +139,14 @@ def _heard_camera(node: RosNode, ros: RosSettings, progress: Progress) -> Camera
     """The camera by its field of view and picture size, or the published calibration."""
     described, topics = ros.camera, ros.topics
     if described.hfov_deg is None:
-        return described.mounted(_published_camera(node, topics.camera_info, progress))
+        if not topics.camera_info:
+            raise OptionError("camera: expected a calibration, or a topic that has it")
+        progress.message(f"waiting for the calibration on {topics.camera_info}")
+        kind, expected = "sensor_msgs/msg/CameraInfo", "camera_info_topic: expected a calibration"
+        return described.mounted(camera_from_message(_heard(node, topics.camera_info, kind, expected)))
     progress.message(f"waiting for a picture on {topics.image}, whose size is not known")
     message = _heard(node, topics.image, topics.image_type, "image_topic: expected a picture")
     return described.with_field_of_view(image_from_message(message).shape)
-
-
-def _published_camera(node: RosNode, topic: str, progress: Progress) -> Camera:
-    """The calibration published on a topic."""
-    if not topic:
-        raise OptionError("camera: expected a calibration, or a topic that has it")
-    progress.message(f"waiting for the calibration on {topic}")
-    kind = "sensor_msgs/msg/CameraInfo"
-    return camera_from_message(_heard(node, topic, kind, "camera_info_topic: expected a calibration"))
 
 
 def _heard(node: RosNode, topic: str, msgtype: str, expected: str) -> Any:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from engine.errors import OptionError, TelemetryError
-from engine.matching import METHODS
 from engine.matching.matcher import SceneMatcher
-from engine.options import MatcherOptions
 from engine.values import Fix, Frame, NoFix
 from scenematch.files.frames import PICTURE_SUFFIXES, open_frames, read_image
-from scenematch.runs.arguments import check_choice, check_device, parse_position
+from scenematch.runs.arguments import parse_position
 from scenematch.runs.cameras import CameraInput, check_size
 from scenematch.runs.map_input import MapInput, check_position
 from scenematch.runs.output import SILENT, Progress, StrPath
+from scenematch.runs.settings import TrackSettings
 
 
 def locate_image(
@@ -28,10 +26,7 @@ def locate_image(
     heading_deg: float | None = None,
     roll_deg: float | None = None,
     pitch_deg: float | None = None,
-    start: str | None = None,
-    method: str = "auto",
-    device: str = "auto",
-    options: MatcherOptions | None = None,
+    settings: TrackSettings | None = None,
     progress: Progress = SILENT,
 ) -> Fix | NoFix:
     """Match one image. Height, attitude and position come from the arguments, not from a photograph's EXIF.
@@ -44,10 +39,7 @@ def locate_image(
         heading_deg: clockwise from true north.
         roll_deg: right side down.
         pitch_deg: nose up.
-        start: where to search, "LAT,LON" or "LAT,LON,SIGMA_M"; None is the whole map.
-        method: "ncc", "sift", "auto" or "learned".
-        device: to compute on.
-        options: settings of the methods; None uses the defaults.
+        settings: how to match it; its start is where to search, none is the whole map. None uses the defaults.
         progress: receives the copying of the map.
 
     Raises:
@@ -57,17 +49,21 @@ def locate_image(
     known: dict[str, Any] = {
         "height_agl_m": height_agl_m, "heading_deg": heading_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg,
     }  # fmt: skip
-    _check_numbers(known)
-    check_choice("method", method, METHODS)
-    check_device(device)
-    prior = parse_position("start", start)
+    for name, value in known.items():
+        if value is not None and not math.isfinite(value):
+            raise OptionError(f"{name}: expected a finite number, got {value}")
+    if height_agl_m is not None and height_agl_m <= 0:
+        raise OptionError(f"height_agl_m: expected metres above 0, got {height_agl_m:g}")
+    settings = settings or TrackSettings()
+    prior = parse_position("start", settings.start)
     site = MapInput.of(map).open(progress)
     _check_picture(Path(image))
     calibration = CameraInput.of(camera).load(open_frames(image), progress=progress)
     check_position("start", prior, site, OptionError)
     pixels = read_image(image)
     check_size(calibration, pixels.shape)
-    return SceneMatcher(site, calibration, method, device, options).locate(Frame(pixels, **known), prior)
+    matcher = SceneMatcher(site, calibration, settings.method, settings.device, settings)
+    return matcher.locate(Frame(pixels, **known), prior)
 
 
 def _check_picture(file: Path) -> None:
@@ -76,12 +72,3 @@ def _check_picture(file: Path) -> None:
         raise TelemetryError(f"{file}: expected a picture, got no such file")
     if not file.is_file() or file.suffix.lower() not in PICTURE_SUFFIXES:
         raise TelemetryError(f"{file}: expected one picture ({', '.join(PICTURE_SUFFIXES)})")
-
-
-def _check_numbers(known: Mapping[str, float | None]) -> None:
-    for name, value in known.items():
-        if value is not None and not math.isfinite(value):
-            raise OptionError(f"{name}: expected a finite number, got {value}")
-    height_agl_m = known["height_agl_m"]
-    if height_agl_m is not None and height_agl_m <= 0:
-        raise OptionError(f"height_agl_m: expected metres above 0, got {height_agl_m:g}")

@@ -118,10 +118,7 @@ def _record(files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, d
     given = files.flat() | {"truth": inputs.truth_path}
     for name in PATHS:
         given[name] = None if given[name] is None else str(Path(given[name]).resolve())
-    given |= {
-        "log_offset_s": files.log_offset_s or None,
-        "every": files.every if files.every > 1 else None,
-    }
+    given |= {"log_offset_s": files.log_offset_s or None, "every": files.every if files.every > 1 else None}
     return RunRecord(
         **given,
         heights=dict(inputs.flight.heights),

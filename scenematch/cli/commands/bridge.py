@@ -20,24 +20,6 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinkOptions:
-    """The autopilot.
-
-    Attributes:
-        connect: udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.
-        firmware: Firmware of the autopilot (default: ardupilot).
-    """
-
-    connect: Annotated[str | None, option("--connect", "LINK", INPUT)] = None
-    firmware: Annotated[str | None, option("--firmware", "ardupilot|px4", INPUT)] = None
-
-    def link(self, settings: Settings) -> MavlinkSettings:
-        """How to reach it and what to send."""
-        made: MavlinkSettings = table(settings, "mavlink", connect=self.connect or "", firmware=self.firmware)
-        return made
-
-
-@dataclass(frozen=True, kw_only=True)
 class OptionalMapOptions:
     """The map, needed only to send fixes.
 
@@ -93,7 +75,9 @@ def _bridge_settings(matching: options.MatchingOptions, settings: Settings) -> B
 
 @with_options
 def mavlink(
-    autopilot: LinkOptions,
+    *,
+    connect: Annotated[str | None, option("--connect", "LINK", INPUT)] = None,
+    firmware: Annotated[str | None, option("--firmware", "ardupilot|px4", INPUT)] = None,
     pictures: PictureOptions,
     matching: options.MatchingOptions,
     site: OptionalMapOptions,
@@ -112,21 +96,24 @@ def mavlink(
     compares the rotation in the pictures with the autopilot's attitude.
 
     Options:
+        connect: udpin:HOST:PORT, udp:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.
+        firmware: Firmware of the autopilot (default: ardupilot).
         out: Write the autopilot's parameters for these fixes, then exit.
         measure_delay: Measure the camera's latency, then exit.
         supervise: Keep a loaded standby process that takes over if the worker dies.
     """
     given = options.read_settings(settings)
-    if out is not None:
-        _write_parameters(autopilot, given, out, force)
-    elif autopilot.connect is None:
+    if out is None and connect is None:
         raise OptionError("connect: expected a link to the autopilot, got none")
+    link: MavlinkSettings = table(given, "mavlink", connect=connect or "", firmware=firmware)
+    if out is not None:
+        _write_parameters(link, given, out, force)
     elif measure_delay:
-        _measure_delay(autopilot, pictures, given)
+        _measure_delay(link, pictures, given)
     else:
         from scenematch.runs.mavlink_bridge import run_mavlink_bridge
 
-        files, link, how = pictures.files(site, given), autopilot.link(given), _bridge_settings(matching, given)
+        files, how = pictures.files(site, given), _bridge_settings(matching, given)
         shown = options.live_view(rerun)
         status = run_mavlink_bridge(
             files, link, how, supervise=supervise, live_view=shown, progress=console.PROGRESS
@@ -135,16 +122,14 @@ def mavlink(
         console.next_step("track --map MAP --frames VIDEO --telemetry LOG --out out")
 
 
-def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: Settings) -> None:
+def _measure_delay(link: MavlinkSettings, pictures: PictureOptions, settings: Settings) -> None:
     """Measure and print."""
     from scenematch.runs.camera_delay import measure_camera_delay
 
     source = pictures.camera_source
     if source is None:
         raise OptionError("camera_source: expected a camera to measure, got none")
-    seconds = table(settings, "bridge").seconds
-    camera = pictures.camera_input(settings)
-    link = autopilot.link(settings)
+    seconds, camera = table(settings, "bridge").seconds, pictures.camera_input(settings)
     found = measure_camera_delay(link, camera, source, seconds=seconds, progress=console.PROGRESS)
     delay_ms = round(1e3 * found.delay_s)
     values = {"exposure_to_grab_ms": delay_ms, "correlation": found.correlation}
@@ -153,12 +138,12 @@ def _measure_delay(autopilot: LinkOptions, pictures: PictureOptions, settings: S
     console.next_step(f"bridge mavlink --map MAP {measured}", hint="with the same options")
 
 
-def _write_parameters(autopilot: LinkOptions, settings: Settings, file: Path, force: bool) -> None:
+def _write_parameters(link: MavlinkSettings, settings: Settings, file: Path, force: bool) -> None:
     """Write the file and say so."""
     from scenematch.runs.mavlink_parameters import write_parameter_file
 
     wanted = table(settings, "parameters")
-    write_parameter_file(file, autopilot.link(settings), wanted, force=force)
+    write_parameter_file(file, link, wanted, force=force)
     if not console.answered_as_json({"parameters": str(file), "delay_ms": wanted.delay_ms}):
         console.say(f"written to {file}, for a delay of {wanted.delay_ms} ms")
     following = "bridge mavlink --connect LINK --map MAP --camera CAMERA --camera-source SOURCE"

@@ -43,7 +43,6 @@ def locate(
     from scenematch.runs.single_image import locate_image
 
     given = options.read_settings(settings)
-    how = matching.track_settings(given)
     result = locate_image(
         image,
         site.map_input(given),
@@ -52,18 +51,14 @@ def locate(
         heading_deg=heading_deg,
         roll_deg=roll_deg,
         pitch_deg=pitch_deg,
-        start=how.start,
-        method=how.method,
-        device=how.device,
-        options=how,
+        settings=matching.track_settings(given),
         progress=console.PROGRESS,
     )
     facts = _fix_facts(result) if isinstance(result, Fix) else _no_fix_facts(result)
     facts["latency_ms"] = result.timings.total_ms
     console.facts(facts, title=str(image))
     found, place = isinstance(result, Fix), console.quoted(site.map)
-    following = f"track --map {place} --frames FRAMES --out out" if found else f"map info {place}"
-    console.next_step(following)
+    console.next_step(f"track --map {place} --frames FRAMES --out out" if found else f"map info {place}")
     raise typer.Exit(0 if found else 1)
 
 
