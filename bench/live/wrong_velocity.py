@@ -19,7 +19,7 @@ from bench.command import parser_on_one_thread
 from bench.pages.text import fill, table
 from engine import Fix, Frame, Navigator, SceneMatcher
 from engine.navigation.motion import position_of
-from engine.navigation.track_guard import TrackGuard
+from scenematch.bridges.track_guard import TrackGuard
 
 FLIGHTS = ("gazebo-a1", "gazebo-a2")
 SHIFT_M = 40.0

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
+_IMPORT = re.compile(r"^from (\S+) import (\w+) as \w+$", re.MULTILINE)
 
-def imported_on_use(package: str, names: Mapping[str, str]) -> Callable[[str], Any]:
-    """The ``__getattr__`` of a package (PEP 562).
+
+def imported_on_use(package: str, file: str) -> tuple[list[str], Callable[[str], Any]]:
+    """The public names of a package and its ``__getattr__`` (PEP 562).
+
+    The stub beside the package lists them once, for type checkers and for this.
 
     Args:
         package: its name.
-        names: by module, separated by spaces; those of the package itself are its modules.
+        file: its ``__init__.py``; each line of the stub is ``from MODULE import NAME as NAME``.
     """
-    modules = {name: module for module, of_module in names.items() for name in of_module.split()}
+    stub = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
+    modules = {name: module for module, name in _IMPORT.findall(stub)}
 
     def found(name: str) -> Any:
         if name not in modules:
@@ -23,4 +30,4 @@ def imported_on_use(package: str, names: Mapping[str, str]) -> Callable[[str], A
             return import_module(f"{package}.{name}")
         return getattr(import_module(modules[name]), name)
 
-    return found
+    return sorted(modules), found

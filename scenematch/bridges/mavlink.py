@@ -19,7 +19,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from engine.navigation.live import Answer, Live, LiveOptions
 from engine.navigation.motion import place_of, position_of
 from engine.navigation.navigator import Navigator
-from engine.navigation.track_guard import TrackGuard
 from engine.orthomap import OrthoMap
 from engine.runtime.realtime import start_thread
 from engine.values import Fix, NoFix, Prior
@@ -32,6 +31,7 @@ from scenematch.bridges.mavlink_status import MavlinkCounters, MavlinkStatus
 from scenematch.bridges.notices import INFO, Notice, PilotNotices
 from scenematch.bridges.packets import AUTOPILOT_COMPONENT, PacketDecoder, PacketEncoder
 from scenematch.bridges.parameters import MavlinkOptions
+from scenematch.bridges.track_guard import TrackGuard
 from scenematch.bridges.vehicle import NedOrigin
 
 __all__ = ["Connection", "MavlinkBridge", "MavlinkOptions", "MavlinkStatus", "NedOrigin", "parse_connection"]

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from engine.errors import OptionError, TelemetryError, require
-from engine.navigation.lag import Lag, camera_lag, turn_between
 from engine.options import NavigatorOptions
 from engine.values import Frame, NoFix, Reason
+from scenematch.bridges.camera_lag import Lag, camera_lag, turn_between
 from scenematch.bridges.pictures import CapturedImage, capture
 from scenematch.runs.cameras import CameraInput
 from scenematch.runs.mavlink_bridge import MavlinkSettings, open_bridge

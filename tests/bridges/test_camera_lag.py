@@ -8,7 +8,7 @@ import pytest
 
 from engine.camera import mount_rotation
 from engine.errors import TelemetryError
-from engine.navigation.lag import camera_lag, turn_between
+from scenematch.bridges.camera_lag import camera_lag, turn_between
 
 FOCAL_PX = 200.0
 

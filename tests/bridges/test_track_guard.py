@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from engine.navigation.motion import PositionEstimate
-from engine.navigation.track_guard import TrackGuard
 from engine.values import Frame, NoFix, Reason
+from scenematch.bridges.track_guard import TrackGuard
 from tests.support.fixes import a_fix
 
 SPEED_MPS = 7.0
