@@ -245,7 +245,8 @@ class FeatureMatcher:
             above_m = query.above_ground_m(np.array(fix.map_xy_px), fix.up_m)
             height_chi_square = (above_m - height_m) ** 2 / variance
         if vote is not None:
-            surprise, rival, tried = vote.surprise, vote.rival_surprise, float(vote.tried)
+            rival = vote.rival_surprise(stats.inliers)  # those of the pose are no matches of another place
+            surprise, tried = vote.surprise, float(vote.tried)
         else:
             surprise = (stats.log10_tried - stats.log10_nfa) * math.log(10.0)
             rival, tried = 0.0, 10.0**stats.log10_tried

@@ -27,17 +27,48 @@ class Vote:
         turn_deg: of the orthophoto about its middle, from +x towards +y.
         voters: (M,) bool, the matches that agree.
         shift_px: (2,) from the orthophoto, turned, to the map.
-        surprise: -log of the probability that as many wrong matches agree on one translation.
-        rival_surprise: the same of the best translation elsewhere.
-        tried: how many translations were compared.
+        shifts_px: (M, 2) from each match of the turned orthophoto to the map.
+        photo_px: (M, 2) the matches in the orthophoto.
+        radius_px: a match this close to a translation agrees with it.
+        distinct_px: matches nearer to each other in the orthophoto are one piece of evidence.
+        chance: the probability that a wrong match agrees.
     """
 
     turn_deg: float
     voters: NDArray[np.bool_]
     shift_px: Array
-    surprise: float
-    rival_surprise: float
-    tried: int
+    shifts_px: Array
+    photo_px: Array
+    radius_px: float
+    distinct_px: float
+    chance: float
+
+    @property
+    def tried(self) -> int:
+        """How many translations were compared."""
+        return len(self.photo_px) * len(TURNS_DEG)
+
+    @property
+    def surprise(self) -> float:
+        """-log of the probability that as many wrong matches agree on one translation."""
+        return self._surprise_of(self.voters)
+
+    def rival_surprise(self, explained: NDArray[np.bool_]) -> float:
+        """The same of the best translation elsewhere.
+
+        Args:
+            explained: (M,) bool, the matches that agree with the pose found from this vote. They are of its place,
+                though a wrong tilt or height scatters their votes.
+        """
+        from engine.kernels import clusters  # numba takes a while to import
+
+        apart = self.shifts_px - self.shift_px
+        is_elsewhere = np.einsum("ij,ij->i", apart, apart) > (_RIVAL_RADII * self.radius_px) ** 2
+        elsewhere = np.flatnonzero(is_elsewhere & ~explained)
+        return self._surprise_of(elsewhere[clusters.densest(self.shifts_px[elsewhere], self.radius_px)])
+
+    def _surprise_of(self, agreeing: NDArray[np.bool_] | NDArray[np.intp]) -> float:
+        return _surprise(self.photo_px[agreeing], len(self.photo_px), self.chance, self.distinct_px)
 
 
 def vote(photo_px: Array, map_px: Array, radius_px: float, distinct_px: float) -> Vote | None:
@@ -67,17 +98,10 @@ def vote(photo_px: Array, map_px: Array, radius_px: float, distinct_px: float) -
         return None
     _, turn_deg, voters, shifts = best
     shift_px = shifts[voters].mean(axis=0)
-    apart = shifts - shift_px
-    elsewhere = np.einsum("ij,ij->i", apart, apart) > (_RIVAL_RADII * radius_px) ** 2
-    rivals = np.flatnonzero(elsewhere)[clusters.densest(shifts[elsewhere], radius_px)]
     placed_px = photo_px @ rotation(turn_deg).T + shift_px
     extent = np.ptp(map_px - placed_px, axis=0) + 2.0 * radius_px
     by_chance = chance_of_agreeing(placed_px.T, map_px.T, voters, radius_px, float(extent.prod()))
-    surprise, rival_surprise = (
-        _surprise(photo_px[agreeing], len(map_px), by_chance, distinct_px) for agreeing in (voters, rivals)
-    )
-    tried = len(map_px) * len(TURNS_DEG)
-    return Vote(turn_deg, voters, shift_px, surprise, rival_surprise, tried)
+    return Vote(turn_deg, voters, shift_px, shifts, photo_px, radius_px, distinct_px, by_chance)
 
 
 def chance_of_agreeing(

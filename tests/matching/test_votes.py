@@ -11,6 +11,8 @@ from engine.kernels.clusters import count_apart, count_near_pairs, densest
 from engine.matching.votes import TURNS_DEG, rotation, vote
 
 RADIUS_PX, DISTINCT_PX = 4.0, 2.0
+NOTHING = np.zeros(1000, bool)
+"""No match is explained by a pose."""
 
 
 def planted(rng, *, right, wrong, turn_deg=0.0, shift=(31.0, -12.0)):
@@ -29,7 +31,7 @@ def test_one_match_in_ten_gives_the_turn_and_the_place(turn_deg):
     assert found.voters[:20].all()
     assert np.hypot(*(found.shift_px - (31.0, -12.0))) < 1.0
     assert found.surprise - math.log(found.tried) > 23.0
-    assert found.rival_surprise < 0.5 * found.surprise
+    assert found.rival_surprise(NOTHING[: len(photo)]) < 0.5 * found.surprise
 
 
 def test_chance_makes_a_vote_no_oftener_than_its_surprise_says():
@@ -69,7 +71,18 @@ def test_a_second_place_with_as_many_votes_is_a_rival():
     on_map = photo + np.where(np.arange(60)[:, None] < 30, (31.0, -12.0), (-60.0, 50.0))
     found = vote(photo, on_map, RADIUS_PX, DISTINCT_PX)
     assert np.count_nonzero(found.voters) == 30
-    assert found.rival_surprise == pytest.approx(found.surprise, rel=0.2)  # as many, but crowded otherwise
+    rival = found.rival_surprise(NOTHING[:60])
+    assert rival == pytest.approx(found.surprise, rel=0.2)  # as many, but crowded otherwise
+    assert found.rival_surprise(found.voters) == rival  # which the pose of the winner does not explain
+
+
+def test_matches_of_the_pose_are_no_rival_though_a_wrong_height_scatters_their_votes():
+    rng = np.random.default_rng(10)
+    photo, on_map = planted(rng, right=60, wrong=60)
+    on_map[:60] += 0.3 * photo[:60]
+    found = vote(photo, on_map, RADIUS_PX, DISTINCT_PX)
+    assert found.rival_surprise(NOTHING[:120]) > 0.5 * found.surprise
+    assert found.rival_surprise(np.arange(120) < 60) < 0.3 * found.surprise
 
 
 def test_the_densest_place_is_where_brute_force_finds_it():
