@@ -80,8 +80,3 @@ def _with_accuracy(
         stated |= {"height_m": height_sigma_m, "height_share": 0.0}
     known = {name: value for name, value in stated.items() if value is not None}
     return replace(errors, **known) if known else errors
-
-
-def map_sigma_of(site: OrthoMap) -> float:
-    """Georeferencing accuracy of a map per axis: as stated, or as assumed."""
-    return AssumedErrors().map_m if site.georeference_sigma_m is None else site.georeference_sigma_m

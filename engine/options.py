@@ -52,13 +52,11 @@ class NccOptions:
         exhaustive: score every place of the window at full resolution.
         refine: refine the pose densely after the peak.
         exclusion_m: rivals nearer than this are the peak itself.
-        errors: assumed errors of the telemetry and the map.
     """
 
     exhaustive: bool = False
     refine: bool = True
     exclusion_m: float = 6.0
-    errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
         check_positive(self, "exclusion_m")
@@ -86,7 +84,6 @@ class SiftOptions:
             errors; a few features alone hardly separate a tilt from a displacement.
         refine: refine the pose densely after PnP, if height, heading, tilt and surface are known.
         pose: settings of PnP and RANSAC.
-        errors: assumed errors of the telemetry and the map.
     """
 
     scale: float = PAPER_SCALE
@@ -101,7 +98,6 @@ class SiftOptions:
     use_attitude: bool = True
     refine: bool = True
     pose: PoseOptions = field(default_factory=PoseOptions)
-    errors: AssumedErrors = field(default_factory=AssumedErrors)
 
     def __post_init__(self) -> None:
         check_positive(self, "keypoints_per_px", "tolerance_px")
@@ -145,6 +141,7 @@ class MatcherOptions:
     Attributes:
         profile: "engine", or "paper" for the paper's own recipe with OpenCV.
         risk: allowed probability of a wrong fix, see :mod:`engine.matching.evidence`.
+        errors: assumed errors of the telemetry and the map.
         ncc: settings of the NCC method.
         sift: settings of the SIFT method.
         learned: settings of the learned method.
@@ -152,6 +149,7 @@ class MatcherOptions:
 
     profile: str = "engine"
     risk: float = RISK
+    errors: AssumedErrors = field(default_factory=AssumedErrors)
     ncc: NccOptions = field(default_factory=NccOptions)
     sift: SiftOptions = field(default_factory=SiftOptions)
     learned: LearnedOptions = field(default_factory=LearnedOptions)
@@ -162,8 +160,7 @@ class MatcherOptions:
 
     def on_map(self, site: OrthoMap) -> MatcherOptions:
         """The settings, with the map's stated accuracy in place of the assumed one."""
-        ncc = replace(self.ncc, errors=self.ncc.errors.on_map(site))
-        return replace(self, ncc=ncc, sift=replace(self.sift, errors=self.sift.errors.on_map(site)))
+        return replace(self, errors=self.errors.on_map(site))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

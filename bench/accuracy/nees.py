@@ -22,7 +22,7 @@ from bench.pages.text import fill, paragraph, table
 from engine import Camera, Fix, Frame, MatcherOptions, OrthoMap, Prior, SceneMatcher
 from engine.assumed_errors import AssumedErrors
 from engine.geo import Array
-from engine.options import NccOptions, SiftOptions
+from engine.options import NccOptions
 from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import plan_flight
@@ -167,8 +167,7 @@ def samples(flight: Flight, method: str) -> list[Sample | None]:
 
 
 def _matcher(flight: Flight, method: str, errors: AssumedErrors) -> SceneMatcher:
-    ncc = NccOptions(errors=errors, refine=method != "NCC, peak")
-    options = MatcherOptions(ncc=ncc, sift=SiftOptions(errors=errors))
+    options = MatcherOptions(errors=errors, ncc=NccOptions(refine=method != "NCC, peak"))
     return SceneMatcher(flight.site, flight.camera, method.split(",")[0].lower(), "cpu", options)
 
 

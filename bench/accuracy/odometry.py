@@ -32,7 +32,7 @@ from engine import (
     Reason,
     SceneMatcher,
 )
-from engine.assumed_errors import map_sigma_of
+from engine.assumed_errors import AssumedErrors
 from engine.geo import Array
 from engine.matching.align import to_gray
 from engine.navigation.motion import GroundMotion
@@ -127,7 +127,8 @@ def fly(flight: Recorded, velocity: str) -> Gaps:
         if ends and place is not None and navigator.prediction is not None:
             predicted = navigator.prediction
             gaps.off_m.append(np.array([predicted.east_m, predicted.north_m]) + middle_m - place)
-            gaps.sigma_m.append(math.sqrt(max(predicted.sigma_m**2 - map_sigma_of(flight.site) ** 2, 0.0)))
+            map_m = AssumedErrors().on_map(flight.site).map_m
+            gaps.sigma_m.append(math.sqrt(max(predicted.sigma_m**2 - map_m**2, 0.0)))
             gaps.way_m.append(way_m)
             ended_ns = frames[index + 1].timestamp_ns
         if not withheld or ends:  # a gap without an end that can be judged is no way of the next

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from bench.accuracy.quality import Array, Gray, Keypoints, matches
 from engine import Budget, Camera, Fix, Frame, NoFix, OrthoMap, Prior
+from engine.assumed_errors import AssumedErrors
 from engine.budget import Deadline
 from engine.geo import attitude_from_rotation, enu_from_body
 from engine.matching.align import to_gray, view_of
 from engine.matching.pose import MIN_INLIERS, AttitudePrior, PoseStats, solve_pose
 from engine.matching.query import Query
-from engine.options import MatcherOptions, SiftOptions
+from engine.options import SiftOptions
 from engine.runtime.scheduler import Scheduler
-from engine.values import Attitude, GridPose, Reason, Window
+from engine.values import RISK, Attitude, GridPose, Reason, Window
 from engine.window import level_crop, level_for
 
 Image = NDArray[np.float32]
@@ -137,7 +138,8 @@ class OpenCvFeatures:
         device, options, site = torch.device("cpu"), self._options, self.site
         scheduler = Scheduler(Deadline(budget or Budget()), device)
         gray = self._camera.undistort(to_gray(frame))
-        query = Query(frame, gray, self._pinhole, site, prior, device, scheduler, MatcherOptions().risk)
+        assumed = AssumedErrors().on_map(site)
+        query = Query(frame, gray, self._pinhole, site, prior, device, scheduler, RISK, assumed)
         window = self._window(query)
         if window is None:
             return query.refuse(Reason.OUTSIDE_MAP, "no window", "sift")
@@ -197,7 +199,7 @@ class OpenCvFeatures:
         return _opencv_features(site.gray(crop, level), min(count, most or count), mask)
 
     def _attitude(self, pose: GridPose) -> AttitudePrior | None:
-        errors, attitude = self._options.errors, pose.grid_attitude
+        errors, attitude = AssumedErrors(), pose.grid_attitude
         if not self._options.use_attitude or attitude is None or not pose.has_tilt:
             return None
         turn = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
@@ -205,7 +207,7 @@ class OpenCvFeatures:
         return AttitudePrior((turn @ self._camera.mount).T, sigma_deg)
 
     def _fix(self, query: Query, stats: PoseStats, window: Window) -> Fix:
-        errors, site = self._options.errors, self.site
+        errors, site = query.errors, self.site
         slope_deg = errors.surface_slope_deg if site.has_surface else errors.unknown_slope_deg
         slope_m2 = (float(stats.center_m[2]) * math.radians(slope_deg)) ** 2
         return query.fix(

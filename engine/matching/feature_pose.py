@@ -181,7 +181,7 @@ class FeatureMatcher:
         )
         if not options.use_attitude:
             return solve()
-        errors = query.errors(options.errors)
+        errors = query.errors
         told_deg, sigma_deg = query.telemetry.grid_heading_deg, errors.heading_deg
         heading_deg, doubts_tilt = told_deg, self.doubts_tilt
         if heading_deg is None or hypothesis.x_axis_deg is None:
@@ -215,20 +215,20 @@ class FeatureMatcher:
         if not query.telemetry.has_tilt:  # features of a coarse picture share errors that look like a tilt
             stats = replace(stats, covariance=stats.covariance * max(1.0, PAPER_SCALE / options.scale) ** 2)
         measured_m = query.above_ground_m(nadir, up)
-        doubt_m = query.scale_doubt_m(measured_m, stats.rotation[2], query.errors(options.errors))
+        doubt_m = query.scale_doubt_m(measured_m, stats.rotation[2])
         above_m = up - float(site.surface_at(nadir))
-        stats = _with_tilt_doubt(stats, above_m, math.hypot(_slope_rad(site, options.errors), doubt_m / above_m))
+        stats = _with_tilt_doubt(stats, above_m, math.hypot(_slope_rad(site, query.errors), doubt_m / above_m))
         return query.fix(
             self.method,
             nadir,
-            stats.covariance_center_m2 + options.errors.map_m**2 * np.eye(3),
+            stats.covariance_center_m2 + query.errors.map_m**2 * np.eye(3),
             score=share,
             window=window,
             east_north_m=stats.center_m[:2],
             up_m=up,
             grid_attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ query.camera.mount.T)),
             turn_covariance_rad2=stats.covariance[3:, 3:],
-            map_sigma_m=options.errors.map_m,
+            map_sigma_m=query.errors.map_m,
         )
 
     def _with_confidence(
@@ -236,8 +236,7 @@ class FeatureMatcher:
     ) -> PoseCandidate:
         """The candidate of a fix; the height does not count if this hypothesis doubts it."""
         query, height_m = self.query, self.query.telemetry.height_agl_m
-        errors = query.errors(self.options.errors)
-        height_chi_square = None
+        errors, height_chi_square = query.errors, None
         if height_m is not None and hypothesis.height_m == height_m:
             assert fix.up_m is not None
             # Above ground both count: an error of the map moves the ground with the camera.

@@ -46,9 +46,8 @@ _ROUNDS = 2  # of fitting heading and height, on the middle level and at full re
 def reach_of(correlator: Correlator) -> Reach:
     """How far heading and height are searched: as far as the position, in sigmas."""
     query, height_m = correlator.query, correlator.query.telemetry.known_height_m
-    errors = query.errors(correlator.options.errors)
-    share = SPREAD_SIGMAS * errors.height_sigma_m(height_m) / height_m
-    return min(SPREAD_SIGMAS * errors.heading_deg, 180.0), min(share, _MAX_SHARE)
+    share = SPREAD_SIGMAS * query.errors.height_sigma_m(height_m) / height_m
+    return min(SPREAD_SIGMAS * query.errors.heading_deg, 180.0), min(share, _MAX_SHARE)
 
 
 def search(

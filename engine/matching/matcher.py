@@ -259,8 +259,9 @@ class SceneMatcher:
         return self._method.parts.get(method or self.method, self._method).explain(query, window)
 
     def _query(self, frame: Frame, prior: Prior | None, deadline: Deadline) -> Query:
-        scheduler = Scheduler(deadline, self.device, self._costs)
+        scheduler, known = Scheduler(deadline, self.device, self._costs), self.options
         with scheduler.stage("grey"):
             gray = self.camera.undistort(to_gray(frame))
         prior = None if prior is None else _bounded(prior)
-        return Query(frame, gray, self._pinhole, self.site, prior, self.device, scheduler, self.options.risk)
+        site, device = self.site, self.device
+        return Query(frame, gray, self._pinhole, site, prior, device, scheduler, known.risk, known.errors)

@@ -98,7 +98,7 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
     """The camera's nadir and its covariance; also the heading if it was fitted."""
     query, pose = correlator.query, aligned.pose
     is_coarse = aligned.level > query.level_of(query.telemetry.known_height_m)
-    errors = query.errors(correlator.options.errors)
+    errors = query.errors
     rows, columns = aligned.template.shape
     peak_px2 = peak_covariance_px(peak, rows * columns)
     peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), pose.known_height_m, errors)

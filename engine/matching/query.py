@@ -39,6 +39,7 @@ class Query:
         device: where pictures are correlated.
         scheduler: times its stages and decides which steps time allows.
         risk: allowed probability of a wrong fix.
+        assumed: errors of telemetry and map, of those that the frame does not state.
         told_height_m: the height that the frame came with, if a search replaced it.
     """
 
@@ -50,6 +51,7 @@ class Query:
     device: Device
     scheduler: Scheduler = field(repr=False)
     risk: float
+    assumed: AssumedErrors
     told_height_m: float | None = None
 
     @property
@@ -125,9 +127,10 @@ class Query:
         shape = (self.site.width_px, self.site.height_px)
         return place_window((float(center_px[0]), float(center_px[1])), (width, height), shape)
 
-    def errors(self, assumed: AssumedErrors) -> AssumedErrors:
-        """The assumed errors of telemetry and map, replaced by those that the frame states."""
-        return assumed.of_frame(self.frame)
+    @cached_property
+    def errors(self) -> AssumedErrors:
+        """Of telemetry and map, as the frame states them, or as assumed."""
+        return self.assumed.of_frame(self.frame)
 
     def attitude_prior(self, grid_heading_deg: float, sigma_deg: float, errors: AssumedErrors) -> AttitudePrior:
         """The frame's attitude with its assumed errors about the body's axes; an unknown tilt is taken as level.
@@ -150,13 +153,12 @@ class Query:
         """
         return up_m - float(self.site.ground_at(nadir_px))
 
-    def scale_doubt_m(self, measured_m: float, camera_down: Array, errors: AssumedErrors) -> float:
+    def scale_doubt_m(self, measured_m: float, camera_down: Array) -> float:
         """Position error to allow for if the measured height is not the telemetry's (:func:`.scale_doubt_m`).
 
         Args:
             measured_m: of the camera, above the ground.
             camera_down: (3,) optical axis in east, north, up.
-            errors: of the telemetry.
 
         Returns:
             One standard deviation per axis, 0 if the heights agree to within two standard deviations.
@@ -165,7 +167,7 @@ class Query:
         if told_m is None:
             return 0.0
         off_m = abs(measured_m - told_m)
-        if off_m <= _AGREE_SIGMAS * errors.height_sigma_m(told_m):
+        if off_m <= _AGREE_SIGMAS * self.errors.height_sigma_m(told_m):
             return 0.0
         told = self.telemetry.grid_attitude if self.telemetry.has_tilt else None
         told_down = None if told is None else self.camera.enu_from_camera(told)[:, 2]

@@ -234,14 +234,14 @@ class Refinement:
 
     def _doubting(self) -> Refinement:
         """The same for a frame whose attitude is hardly known."""
-        frame, sigma_deg = self.query.frame, self.options.errors.unknown_tilt_deg
-        heading_sigma_deg = max(self.query.errors(self.options.errors).heading_deg, sigma_deg)
+        frame, sigma_deg = self.query.frame, self.query.errors.unknown_tilt_deg
+        heading_sigma_deg = max(self.query.errors.heading_deg, sigma_deg)
         frame = replace(frame, tilt_sigma_deg=sigma_deg, heading_sigma_deg=heading_sigma_deg)
         return replace(self, query=replace(self.query, frame=frame), doubts_tilt=True)
 
     def _refined(self, fix: Fix, prior: GaussianPrior, coarser: int) -> Refined | None:
         """The fix with its pose refined from a coarser level on; None if that failed, or hardly fits elsewhere."""
-        query, errors = self.query, self.query.errors(self.options.errors)
+        query, errors = self.query, self.query.errors
         found = self._through_levels(prior, coarser)
         if found is None:
             return None
@@ -265,7 +265,7 @@ class Refinement:
         elif not query.site.has_surface:  # and a tilt may be a slope of the ground
             slope_rad = math.radians(errors.unknown_slope_deg)
             covariance[:2, :2] += (height_m * slope_rad) ** 2 * np.eye(2)
-        doubt_m = query.scale_doubt_m(height_m, fit.pose.rotation[2], errors)
+        doubt_m = query.scale_doubt_m(height_m, fit.pose.rotation[2])
         covariance[:2, :2] += doubt_m**2 * np.eye(2)
         tilt_rad = math.hypot(doubt_m / height_m, slope_rad)
         turns_rad2 = pose_covariance[3:6, 3:6] + tilt_covariance(fit.pose.rotation, tilt_rad)
@@ -286,7 +286,7 @@ class Refinement:
     @property
     def _tilt_deg(self) -> float:
         """The larger standard deviation of roll and pitch."""
-        return max(self.query.errors(self.options.errors).tilts_deg(self.query.telemetry))
+        return max(self.query.errors.tilts_deg(self.query.telemetry))
 
     @property
     def _levels_above(self) -> tuple[int, ...]:
@@ -339,8 +339,7 @@ class Refinement:
 
     def _prior(self, fix: Fix) -> GaussianPrior:
         """The telemetry's height and attitude; the correlation's position is only a start, without weight."""
-        query, known = self.query, self.query.telemetry
-        errors = query.errors(self.options.errors)
+        query, known, errors = self.query, self.query.telemetry, self.query.errors
         height_m = known.known_height_m
         attitude_prior = query.attitude_prior(known.known_attitude.heading_deg, errors.heading_deg, errors)
         precision = np.zeros((8, 8))
@@ -388,7 +387,7 @@ class Refinement:
             up_m=float(center_m[2]),
             grid_attitude=Attitude(*attitude_from_rotation(fit.pose.rotation.T @ query.camera.mount.T)),
             turn_covariance_rad2=turns_rad2,
-            map_sigma_m=self.options.errors.map_m,
+            map_sigma_m=query.errors.map_m,
         )
         return replace(refined, stage="refined", confidence=fix.confidence)
 

@@ -63,7 +63,7 @@ class Sift(Method):
             keypoints_per_px=self.options.keypoints_per_px * _FEW_SHARE,
             upsample=1,
         )
-        self._enhancement = replace(options.ncc, errors=options.sift.errors)
+        self._ncc_options = options.ncc
         if samples is None:
             samples = SampleMap(site)
         self.samples = samples
@@ -137,7 +137,7 @@ class Sift(Method):
         return found.fix if counts else None
 
     def _refinement(self, query: Query) -> Refinement:
-        return Refinement(query, self.samples, self._enhancement)
+        return Refinement(query, self.samples, self._ncc_options)
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from engine.assumed_errors import map_sigma_of
+from engine.assumed_errors import AssumedErrors
 from engine.budget import Budget, Deadline
 from engine.camera import Camera
 from engine.errors import OptionError, TelemetryError
@@ -101,8 +101,9 @@ class Navigator:
         self._budget = budget
         self._options = o = options or NavigatorOptions()
         options_of = getattr(matcher, "options", None)
-        assumed = options_of.ncc.errors if isinstance(options_of, MatcherOptions) else None
-        self._errors = TelemetryErrors(o, assumed)
+        assumed = options_of.errors if isinstance(options_of, MatcherOptions) else AssumedErrors()
+        self._assumed = assumed.on_map(matcher.site)
+        self._errors = TelemetryErrors(o, self._assumed)
         self._camera: Camera | None = getattr(matcher, "camera", None)
         self._pictures = VisualOdometry(self._camera) if o.odometry and self._camera else None
         if o.odometry and self._pictures is None:
@@ -156,7 +157,7 @@ class Navigator:
         track = tracks.best if last is None else tracks.of(last.number) or tracks.best
         if track is None:
             return None
-        return track.estimate.prior(map_sigma_m=map_sigma_of(self._matcher.site) if track.fix else 0.0)
+        return track.estimate.prior(map_sigma_m=self._assumed.map_m if track.fix else 0.0)
 
     @property
     def ground_motion(self) -> GroundMotion | None:
@@ -261,7 +262,7 @@ class Navigator:
 
     def _searched(self, tracks: Tracks, prior: Prior | None) -> tuple[Prior | None, bool]:
         """Where the matcher searches: about the best track, or the other source if that is tighter (True)."""
-        own, track, map_m = None, tracks.sought, map_sigma_of(self._matcher.site)
+        own, track, map_m = None, tracks.sought, self._assumed.map_m
         if track is not None and not self._leads_nowhere(track):
             own = track.estimate.prior(track.widened, track.moved_m, 0.0 if track.fix else map_m)
         misled = self._refusals * MISS >= RELIABLE and self._is_turn(self._refusals)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from engine.assumed_errors import map_sigma_of
+from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
 from engine.geo import Array
 from engine.navigation.motion import position_of
@@ -63,7 +63,7 @@ def diagnose(
         static.append(Finding("mirrored", "the pictures are mirrored", cure))
         return Diagnosis(static, len(chosen), len(seen), ())
     sightings = [replace(s, index=chosen[s.index]) for s in seen]
-    found = findings(series, sightings, map_sigma_of(site))
+    found = findings(series, sightings, AssumedErrors().on_map(site).map_m)
     compared, contradicted = is_known(series, sightings), contradictions(series, sightings)
     return Diagnosis(static + found, len(chosen), len(sightings), compared, contradicted)
 

@@ -82,7 +82,7 @@ def merged(values: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]
 
 
 def changed(options: Any, within: str = "") -> dict[str, Any]:
-    """Settings that differ from their defaults, by dotted name ("ncc.errors.map_m")."""
+    """Settings that differ from their defaults, by dotted name ("errors.map_m")."""
     defaults = type(options)()
     out: dict[str, Any] = {}
     for name in _kinds(type(options)):

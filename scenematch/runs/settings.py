@@ -36,6 +36,7 @@ class TrackSettings(MatcherOptions):
             telemetry's first position, or searches the whole map if there is none.
         budget_ms: longest time per frame, later answers are refused; none sets no limit.
         risk: largest acceptable probability of a wrong fix.
+        errors: assumed errors of the telemetry, the map and the ground, if these state none.
         telemetry_columns: names that telemetry.csv uses for our columns: timestamp_us = "time",
             height_agl_m = "alt". A table, [telemetry_columns]; other columns keep our names.
         ncc: settings of the NCC method.

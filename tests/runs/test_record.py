@@ -17,7 +17,7 @@ RECORD = RunRecord(
     map="/m.tif", surface=None, camera="/c.yaml", frames="/f", telemetry="/t.BIN", truth=None,
     frame_stamps="/s.csv", log_offset_s=0.5, heights={"take-off": 3},
     corrections=Corrections(columns=("roll_deg=-roll_deg",), offset_s=0.3), method="ncc", profile="engine",
-    device="cpu", changed={"ncc.errors.map_m": 1.0}, origin=LocalFrame(48.0, 16.0),
+    device="cpu", changed={"errors.map_m": 1.0}, origin=LocalFrame(48.0, 16.0),
     ground_m=3.5, ground_amsl_m=None, more={"closed_loop": {"minutes": 1.0}},
 )  # fmt: skip
 
