@@ -53,6 +53,19 @@ def test_undistortion_is_opencvs(model, shape):
     np.testing.assert_allclose(lens.undistort(image).astype(int), expected, atol=1)
 
 
+@pytest.mark.parametrize("model", LENSES)
+def test_the_rays_of_pixels_lead_back_to_them_in_every_corner(model):
+    lens = camera(model, LENSES[model])
+    xy_px = np.array([[0.0, 0.0], [639.0, 0.0], [0.0, 479.0], [639.0, 479.0], [320.0, 240.0]])
+    flat, zero = lens.undistort_points(xy_px), np.zeros(3)
+    rays = np.column_stack([flat, np.ones(len(flat))])[:, None]
+    if model in ("equidistant", "fisheye"):
+        again, _ = cv2.fisheye.projectPoints(rays, zero, zero, lens.matrix, lens.distortion)
+    else:
+        again, _ = cv2.projectPoints(rays, zero, zero, lens.matrix, lens.distortion)
+    assert again.reshape(-1, 2) == pytest.approx(xy_px, abs=1e-3)
+
+
 def test_a_frame_of_another_size_is_refused():
     with pytest.raises(CalibrationError, match=r"640 x 480.*frame is 320 x 240"):
         camera().undistort(texture((240, 320)))

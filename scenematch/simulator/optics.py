@@ -123,10 +123,5 @@ def lens_rays(camera: Camera) -> Float32:
         (H, W, 3) float32 x right, y down, z = 1.
     """
     x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float64), np.arange(camera.height_px, dtype=np.float64))
-    pixels = np.stack([x, y], axis=-1).reshape(-1, 1, 2)
-    if camera.distortion_model in ("equidistant", "fisheye"):
-        flat: Any = cv2.fisheye.undistortPoints(pixels, camera.matrix, camera.distortion)
-    else:
-        many = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
-        flat = cv2.undistortPoints(pixels, camera.matrix, camera.distortion, criteria=many)
+    flat = camera.undistort_points(np.column_stack([x.ravel(), y.ravel()]))
     return np.dstack([flat.reshape(camera.height_px, camera.width_px, 2), np.ones(x.shape)]).astype(np.float32)

@@ -27,9 +27,10 @@ def at(
 
 
 def a_site(**known: Any) -> SimpleNamespace:
-    """What a navigator asks of a map: a small one with a surface and without an error, but for what is known."""
-    usual = {"is_searchable": True, "has_surface": True, "gsd_m_per_px": 1.0, "georeference_sigma_m": 0.0}
-    return SimpleNamespace(**(usual | known))
+    """What a navigator asks of a map: a small, exact one with a surface, but for what is known."""
+    exact = {"georeference_sigma_m": 1e-9, "slope_sigma_deg": None}
+    usual = {"is_searchable": True, "has_surface": True, "gsd_m_per_px": 1.0}
+    return SimpleNamespace(**(usual | exact | known))
 
 
 class ScriptedMatcher:
