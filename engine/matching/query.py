@@ -120,7 +120,7 @@ class Query:
         if prior is None:
             return Window(0, 0, self.site.width_px, self.site.height_px)
         moved_m = np.array([prior.moved_east_m, prior.moved_north_m])
-        moved_px = np.abs(inverse_2x2(self.jacobian) @ moved_m)
+        moved_px = inverse_2x2(self.jacobian) @ moved_m
         size = window_size_px(footprint_px, (float(moved_px[0]), float(moved_px[1])))
         slack = 2.0 * SPREAD_SIGMAS * prior.sigma_m / self.site.gsd_m_per_px
         width, height = (max(a, b + slack) for a, b in zip(size, min_px, strict=True))
