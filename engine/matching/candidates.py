@@ -92,11 +92,11 @@ class PoseCandidate(Candidate):
 
     Attributes:
         is_quick: whether it is by few features, and neither refined nor confirmed.
-        is_refinable: False if a refinement of the frame's pose has failed.
+        refinement_failed: whether refining its pose was tried and gave none.
     """
 
     is_quick: bool = False
-    is_refinable: bool = True
+    refinement_failed: bool = False
 
 
 def nats(candidate: Candidate) -> float:

@@ -36,9 +36,10 @@ Array = NDArray[np.float64]
 
 MAX_KEYPOINTS = 1000
 """Of the largest orthophoto."""
+VOTE_SHARE = 0.03
+"""Of the distance to the ground, within which matches agree on a translation."""
 _MAP_DENSITY = 1.5  # landmarks per pixel over the frame's keypoints per pixel
 _VOTE_RATIO = 0.9  # of Lowe's test where matches vote: a vote tolerates many wrong ones
-_VOTE_SHARE = 0.03  # of the distance to the ground, within which matches agree on a translation
 _MAX_SCALE_FACTOR = 1.5  # by which the scales of a match may contradict a known height
 
 
@@ -173,7 +174,7 @@ def _voted(
 ) -> Matched:
     """The matches with the pose that most of them vote for."""
     site, level = query.site, matched.view.level
-    share_px = _VOTE_SHARE * slant_m(query, height_m) / (site.gsd_m_per_px * 2.0**level)
+    share_px = VOTE_SHARE * slant_m(query, height_m) / (site.gsd_m_per_px * 2.0**level)
     radius_px = max(share_px, 2.0 * options.tolerance_px)
     middle = (np.array(photo.gray.shape[::-1]) - 1.0) / 2.0
     # Matches so near to each other that they agree wherever they are: of one object, right or wrong together.

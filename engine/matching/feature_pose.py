@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,11 +20,11 @@ from engine.matching.align import MIN_DOWN
 from engine.matching.candidates import PoseCandidate
 from engine.matching.covariance import tilt_covariance
 from engine.matching.evidence import Evidence, probability
-from engine.matching.feature_matching import Matched, match_views
+from engine.matching.feature_matching import VOTE_SHARE, Matched, match_views
 from engine.matching.pose import MIN_INLIERS, PoseStats, solve_pose
 from engine.matching.query import Query
 from engine.matching.views import TelemetryHypothesis, coarser_scale, level_at, view_in, views_of, x_axis_deg
-from engine.matching.votes import Vote
+from engine.matching.votes import TURNS_DEG, Vote
 from engine.options import MIN_HEIGHT_M, PAPER_SCALE, SiftOptions
 from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, NoFix, Reason, Window
@@ -66,21 +67,23 @@ class FeatureMatcher:
             return flat
         first: NoFix | PoseCandidate | None = None
         found: list[tuple[PoseCandidate, FeatureMatcher, TelemetryHypothesis]] = []
-        deadline = query.scheduler.deadline
-        for count, (matcher, hypothesis) in enumerate(self._attempts(), 1):
-            if first is not None and deadline.remaining_ms < deadline.elapsed_ms:
-                break
+        deadline, attempts, count = query.scheduler.deadline, deque(self._attempts()), 0
+        while attempts and (first is None or deadline.remaining_ms >= deadline.elapsed_ms):
+            (matcher, hypothesis), count = attempts.popleft(), count + 1
             result = matcher._find_with(hypothesis)
-            if isinstance(result, PoseCandidate):  # it is the best of all that was tried so far
-                result = result.weighed(replace(result.evidence, tried=result.evidence.tried * count))
             first = first or result
-            if isinstance(result, PoseCandidate):
-                found.append((result, matcher, hypothesis))
-                # What is found after the telemetry failed may be as wrong as that.
-                if result.suffices(query.risk) or (result is first and result.promises(query.risk)):
+            if isinstance(result, NoFix):
+                if result.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
                     break
-            elif result.reason not in (Reason.TOO_FEW_MATCHES, Reason.BAD_POSE):
+                continue
+            tried = result.evidence.tried * count  # it is the best of all that was tried so far
+            found.append((result.weighed(replace(result.evidence, tried=tried)), matcher, hypothesis))
+            # What is found after the telemetry failed may be as wrong as that.
+            if found[-1][0].suffices(query.risk) or (result is first and result.promises(query.risk)):
                 break
+            again = matcher._at(result, hypothesis) if matcher.query is query else None
+            if again is not None:
+                attempts.appendleft(again)
         if not found:
             assert first is not None  # the telemetry's own hypothesis is always tried
             return first
@@ -122,6 +125,28 @@ class FeatureMatcher:
         wide = TelemetryHypothesis(unknown if height_m is None else (height_m / 2.0, height_m * 2.0), None)
         if options.search_widely and wide != known:
             yield self, wide
+
+    def _at(
+        self, found: PoseCandidate, hypothesis: TelemetryHypothesis
+    ) -> tuple[FeatureMatcher, TelemetryHypothesis] | None:
+        """The attempt at the height and heading of a pose; None if it was found with nearly these.
+
+        The frame is drawn as the map would show it, which the telemetry's height or heading did not allow.
+        """
+        query, fix = self.query, found.fix
+        if self.finder is not None or fix.up_m is None or fix.attitude is None:
+            return None
+        height_m = query.above_ground_m(np.array(fix.map_xy_px), fix.up_m)
+        heading_deg = fix.attitude.heading_deg + query.site.frame.convergence_deg(fix.lat_deg, fix.lon_deg)
+        told_m, told_deg = hypothesis.height_m, query.telemetry.grid_heading_deg
+        turn_deg = math.inf if told_deg is None else abs(wrap_difference_deg(heading_deg - told_deg))
+        is_near = told_m is not None and abs(height_m - told_m) < VOTE_SHARE * told_m
+        if height_m < MIN_HEIGHT_M or (is_near and turn_deg < TURNS_DEG[-1] / 2.0):
+            return None
+        doubts_tilt = self.doubts_tilt or SPREAD_SIGMAS * query.errors.heading_deg < turn_deg < math.inf
+        there = query.at(replace(query.telemetry, height_agl_m=height_m, grid_heading_deg=heading_deg % 360.0))
+        matcher = replace(self, query=there, doubts_tilt=doubts_tilt)
+        return matcher, TelemetryHypothesis((height_m, height_m), x_axis_deg(there))
 
     def matches_in(self, window: Window) -> tuple[Array, Array, PoseStats | None]:
         """The matches in a window at the frame's own height and heading, and their pose: for reports.

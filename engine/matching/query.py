@@ -175,16 +175,17 @@ class Query:
 
     def at(self, pose: GridPose) -> Query:
         """The same query with the heading and height that a search found, as accurate as its steps."""
-        known, height_m = self.telemetry, pose.known_height_m
-        turn_deg = pose.known_attitude.heading_deg - known.known_attitude.heading_deg
+        height_m = pose.known_height_m
+        towards_north = replace(self, frame=replace(self.frame, heading_deg=0.0)).telemetry
+        heading_deg = pose.known_attitude.heading_deg - towards_north.known_attitude.heading_deg
         found = replace(
             self.frame,
-            heading_deg=wrap_heading_deg((self.frame.heading_deg or 0.0) + turn_deg),
+            heading_deg=wrap_heading_deg(heading_deg),
             heading_sigma_deg=_FOUND_HEADING_DEG,
             height_agl_m=height_m,
             height_sigma_m=_FOUND_HEIGHT_SHARE * height_m,
         )
-        return replace(self, frame=found, told_height_m=known.height_agl_m)
+        return replace(self, frame=found, told_height_m=self.frame.height_agl_m)
 
     # --------------------------------------------------------------------------------------------- answers
 

@@ -205,7 +205,7 @@ class _Rungs:
         return found if isinstance(found, PoseCandidate) and found.promises(self._query.risk) else None
 
     def _if_few_do_not_suffice(self, answer: Answer | None) -> Works:
-        return self._works if answer is None or (_is_quick(answer) and answer.is_refinable) else {}
+        return self._works if answer is None or (_is_quick(answer) and not answer.refinement_failed) else {}
 
     def _by_all(self, answer: Answer | None, step: Hashable) -> Answer:
         """The pose by all features."""
@@ -214,7 +214,7 @@ class _Rungs:
 
     def _if_unconfirmed(self, answer: Answer | None) -> Works:
         """All features without the stated tilt, if a refinement has failed, which makes that doubtful."""
-        return self._works if isinstance(answer, PoseCandidate) and not answer.is_refinable else {}
+        return self._works if isinstance(answer, PoseCandidate) and answer.refinement_failed else {}
 
     def _by_matches(self, answer: Answer | None, step: Hashable) -> Answer:
         """The pose by all features that does not rest on the stated tilt."""
@@ -226,7 +226,9 @@ class _Rungs:
         if not (is_accepted(answer, self._query) or _is_quick(answer)):
             return {}
         assert isinstance(answer, PoseCandidate)  # no other is proposed here
-        offered = answer.is_refinable and answer.fix.stage != "refined" and self._sift.can_refine(self._query)
+        offered = (
+            not answer.refinement_failed and answer.fix.stage != "refined" and self._sift.can_refine(self._query)
+        )
         return {_REFINEMENT: float(self._query.gray.size)} if offered else {}
 
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer | None:
@@ -234,7 +236,7 @@ class _Rungs:
         assert isinstance(answer, PoseCandidate)  # or it was not offered
         refined = self._sift.refined(self._query, answer.fix)
         if refined is None:
-            return replace(answer, is_refinable=False)
+            return replace(answer, refinement_failed=True)
         if not (is_accepted(answer, self._query) or refined.score >= CONFIRMING_CORRELATION):
             return None
         return replace(answer, fix=refined, is_quick=False, evidence=replace(answer.evidence, is_tested=True))

@@ -218,3 +218,13 @@ def test_a_pose_must_outdo_chance_at_its_place_and_not_among_all_places_of_the_w
     frame = replace(ground.frame(camera, NADIR, 150.0, **TRUE), roll_deg=None, pitch_deg=None)
     fix = SceneMatcher(ground.map_of(), camera, "ncc", "cpu").locate(frame, ground.prior(NADIR))
     assert fix.stage == stage
+
+
+@pytest.mark.parametrize("height_agl_m", [110.0, 120.0, 190.0])
+def test_a_frame_is_drawn_anew_at_the_height_that_its_matches_show(ground, site, camera, height_agl_m):
+    """A few features of the reduced frame, which are found at any scale, are ten times as far off."""
+    few = MatcherOptions(sift=SiftOptions(max_keypoints=20, refine=False))
+    frame = replace(ground.frame(camera, NADIR, 150.0, **TRUE), height_agl_m=height_agl_m)
+    fix = SceneMatcher(site, camera, "sift", "cpu", few).locate(frame, ground.prior(NADIR))
+    assert np.hypot(*ground.off_m(fix, NADIR)) < 0.15
+    assert abs(fix.up_m - 150.0) < 1.0
