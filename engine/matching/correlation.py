@@ -13,7 +13,7 @@ from engine.kernels.coarse_to_fine import EarlyStop
 from engine.kernels.scores import enhance
 from engine.maps.prepared import PreparedMap, Region
 from engine.matching import refusals
-from engine.matching.align import FRACTION, MIN_SHRINK, GroundView, Patch, rectify, view_of
+from engine.matching.align import FRACTION, MIN_SHRINK, GroundView, Patch, ground_bounds_px, rectify, view_of
 from engine.matching.oblique import is_oblique, relief_patch
 from engine.matching.query import Query
 from engine.ncc_fft import match_template, surface
@@ -91,8 +91,8 @@ class Correlator:
             pose: the height and heading to align it by.
             level: of the pyramid.
             nadir_px: (2,) where to look up the ground's relief; None takes the prior's place, or level ground.
-            over_relief_px: rows and columns of the middle of the frame to draw over the relief; None draws it on
-                a plane, and all of an oblique frame over the relief.
+            over_relief_px: rows and columns to draw over the relief, in the middle of what would lie on the map
+                there; None draws the frame's middle on a plane, and all of an oblique frame over the relief.
         """
         drawn = self._drawn(pose, level, nadir_px, over_relief_px)
         if isinstance(drawn, NoFix):
@@ -124,8 +124,11 @@ class Correlator:
         if over_relief_px or is_oblique(query, attitude):
             place = query.prior_px if nadir_px is None else nadir_px
             patch = relief_patch(query, attitude, height, level, place, over_relief_px)
-            if patch is None:
+            if patch is None and ground_bounds_px(query.camera, attitude, height, query.jacobian) is None:
                 return refusals.tilted(query, attitude, METHOD)
+            if patch is None:
+                detail = "what the frame would show at the prior's place lies outside the map"
+                return query.refuse(Reason.OUTSIDE_MAP, detail, METHOD)
             size = np.array(patch.gray.shape[::-1], np.float64)
             extent = (float(size[0]), float(size[1]))
             view = GroundView(np.eye(3), patch.offset_px + (size - 1.0) / 2.0, extent, float(size.prod()))

@@ -172,14 +172,11 @@ class Ncc(Method):
             PeakCandidate | None: None if the template is nowhere on the map.
         """
         with query.scheduler.stage("structure"):
-            return match_structure(self._correlator(query), found, self.surroundings(query, found))
+            return match_structure(self._correlator(query), found, self._correlator(_about(query, found)))
 
-    def surroundings(self, query: Query, found: PeakCandidate) -> Window:
-        """The window to match structure in: the first one's; after a search, the surroundings of the place."""
-        if not found.by_search:
-            return found.fix.window
-        place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
-        return self._correlator(replace(query, prior=place)).window(found.aligned) or found.fix.window
+    def window(self, query: Query, aligned: Aligned) -> Window | None:
+        """The adaptive window of a frame."""
+        return self._correlator(query).window(aligned)
 
     def _correlator(self, query: Query) -> Correlator:
         return Correlator(query, self.prepared, self.options)
@@ -309,7 +306,8 @@ class _Rungs:
         """Structure about a refused peak, once."""
         if not self._falls_short(answer) or answer.by_structure:
             return {}
-        return {_STRUCTURE: answer.aligned.work_px(self._ncc.surroundings(self._query, answer))}
+        window = self._ncc.window(_about(self._query, answer), answer.aligned)
+        return {} if window is None else {_STRUCTURE: answer.aligned.work_px(window)}
 
     def _match_structure(self, answer: Answer | None, step: Hashable) -> Answer | None:
         """Structure where the refused peak lies; it sees what grey levels see, and more: its peak counts."""
@@ -366,3 +364,11 @@ class _Rungs:
         if found.is_fitted:
             return Refinement(self._query.at(found.aligned.pose), samples, options)
         return Refinement(self._query, samples, options, pictures=self._pictures)
+
+
+def _about(query: Query, found: PeakCandidate) -> Query:
+    """The query to match structure by: about its prior; after a search, about the place."""
+    if not found.by_search:
+        return query
+    place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
+    return replace(query, prior=place)

@@ -43,7 +43,8 @@ def relief_patch(
         attitude: about grid north.
         height_m: above the ground below the camera.
         level: of the pyramid.
-        nadir_px: (2,) full-resolution pixel about which the ground is looked up; None takes it for level.
+        nadir_px: (2,) full-resolution pixel about which the ground is looked up, and from which the part must show
+            ground of the map; None takes the ground for level and all of it for the map.
         most_px: rows and columns of its middle that are kept; None keeps all.
 
     Returns:

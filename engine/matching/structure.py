@@ -3,8 +3,9 @@
 Another season, year or sun changes grey levels and swaps the brighter side of an edge, but not the position and
 direction of edges. The surface is the mean over grey levels and both orientation channels
 (:func:`engine.kernels.scores.orientation`). With a surface model the frame is drawn over the ground's relief, and
-not on a plane, which takes longer. Null-hypothesis templates, the frame's own upside down and mirrored, measure in
-the same window what chance reaches.
+not on a plane, which takes longer; and of it the part that would lie on the map at an assumed place, which may be
+another part than that matched before. Null-hypothesis templates, the frame's own upside down and mirrored, measure
+in the same window what chance reaches.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from engine.window import level_crop
 FloatImage = NDArray[np.float32]
 
 
-def match_structure(correlator: Correlator, found: PeakCandidate, window: Window) -> PeakCandidate | None:
+def match_structure(correlator: Correlator, found: PeakCandidate, around: Correlator) -> PeakCandidate | None:
     """The candidate of the highest peak by grey levels and structure, on the first level where it suffices.
 
     A map is often blurrier than its pixels: what a coarser level leaves out, it does not show. If none suffices,
@@ -36,31 +37,34 @@ def match_structure(correlator: Correlator, found: PeakCandidate, window: Window
 
     Args:
         correlator: of the frame.
-        found: the candidate by grey levels, whose hypothesis is examined.
-        window: in full-resolution map pixels; the fix names that of the candidate.
+        found: the candidate by grey levels, whose hypothesis is examined; the fix names its window.
+        around: of the frame with the prior about which the place must stand out.
 
     Returns:
         PeakCandidate | None: None if the template is nowhere on the map.
     """
-    risk, own = correlator.query.risk, _on_level(correlator, found, window, 0)
+    risk, own = correlator.query.risk, _on_level(correlator, found, around, 0)
     if own is not None and own.suffices(risk):
         return own
     alike = 1.0 if own is None else own.evidence.alike
     for coarser in COARSER[1:]:
-        seen = _on_level(correlator, found, window, coarser)
+        seen = _on_level(correlator, found, around, coarser)
         weighed = None if seen is None else seen.weighed(replace(seen.evidence, least_alike=alike))
         if weighed is not None and weighed.suffices(risk):
             return weighed
     return own
 
 
-def _on_level(correlator: Correlator, found: PeakCandidate, window: Window, coarser: int) -> PeakCandidate | None:
-    """The candidate out of every place of a window, so many levels above that of the candidate by grey levels.
+def _on_level(
+    correlator: Correlator, found: PeakCandidate, around: Correlator, coarser: int
+) -> PeakCandidate | None:
+    """The candidate out of every place of its window, so many levels above that of the candidate by grey levels.
 
     Its rival is the better of the best elsewhere and of what chance reaches.
     """
     aligned = _coarser(correlator, found, coarser)
-    if aligned is None:
+    window = None if aligned is None else around.window(aligned)
+    if aligned is None or window is None:
         return None
     scored = _scores(correlator, aligned, window, _templates(correlator, aligned))
     if scored is None:
