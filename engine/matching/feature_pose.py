@@ -259,7 +259,10 @@ class FeatureMatcher:
     def _with_confidence(
         self, fix: Fix, stats: PoseStats, vote: Vote | None, hypothesis: TelemetryHypothesis
     ) -> PoseCandidate:
-        """The candidate of a fix; the height does not count if this hypothesis doubts it."""
+        """The candidate of a fix, by the evidence of its vote; without one by the inliers of the pose.
+
+        The height does not count if this hypothesis doubts it.
+        """
         query, height_m = self.query, self.query.telemetry.height_agl_m
         errors, height_chi_square = query.errors, None
         if height_m is not None and hypothesis.height_m == height_m:

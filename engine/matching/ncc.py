@@ -221,7 +221,8 @@ class _Rungs:
     def by_telemetry(self) -> list[Rung]:
         """Those at the frame's own heading and height, in their order.
 
-        A null hypothesis is tested if refinement leaves doubt: the pose is stronger evidence, and cheaper.
+        A null hypothesis is tested if refinement leaves doubt: the pose is stronger evidence, and cheaper. What
+        structure finds is another candidate, which is refined and tested in its turn.
         """
         coarse = [self.coarsest, self.at_once, self.null]
         return [*coarse, self.levels, self.refinement, self.null, self.structure, self.refinement, self.null]
@@ -310,7 +311,7 @@ class _Rungs:
         return {} if window is None else {_STRUCTURE: answer.aligned.work_px(window)}
 
     def _match_structure(self, answer: Answer | None, step: Hashable) -> Answer | None:
-        """Structure where the refused peak lies; it sees what grey levels see, and more: its peak counts."""
+        """The peak of structure and grey levels together, in place of the refused one."""
         assert isinstance(answer, PeakCandidate)  # or it was not offered
         found = self._ncc.match_structure(self._query, answer)
         return None if found is None else self._resting(found)

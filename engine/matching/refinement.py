@@ -290,7 +290,10 @@ class Refinement:
 
     @property
     def _levels_above(self) -> tuple[int, ...]:
-        """How many levels above the frame's own refinements start, in turn."""
+        """How many levels above the frame's own refinements start, in turn.
+
+        First that on which a wrong tilt moves the ground by few pixels, then a finer one, then coarser ones.
+        """
         query, height_m = self.query, self.query.telemetry.known_height_m
         own = query.level_of(height_m)
         off_px = height_m * math.radians(self._tilt_deg) / (query.site.gsd_m_per_px * 2.0**own)
