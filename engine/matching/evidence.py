@@ -51,7 +51,7 @@ class Evidence:
             confirmed the pose; if not, only evidence beyond doubt counts.
         least_alike: how much places looked alike to another look at the frame, on another level; at least 1.
         refined: the surprise of the pose refined there, less what was tried for it; -inf if none could be refined,
-            which few right places do and costs 3.9 nats; None if it was not tried, or says nothing.
+            as at few right places, which costs 3.9 nats; None if it was not tried, or says nothing.
     """
 
     surprise: float
