@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 
 from engine.matching.agreement import agree_in_place
 from engine.matching.evidence import Evidence, probability
-from engine.values import Fix, Peak
+from engine.values import Fix, GridPose, Peak
 
 if TYPE_CHECKING:
     from engine.matching.correlation import Aligned
@@ -93,10 +93,12 @@ class PoseCandidate(Candidate):
     Attributes:
         is_quick: whether it is by few features, and neither refined nor confirmed.
         refinement_failed: whether refining its pose was tried and gave none.
+        drawn_at: the height and heading at which the frame was drawn; None takes the telemetry's.
     """
 
     is_quick: bool = False
     refinement_failed: bool = False
+    drawn_at: GridPose | None = None
 
 
 def nats(candidate: Candidate) -> float:

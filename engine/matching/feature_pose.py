@@ -77,9 +77,11 @@ class FeatureMatcher:
                     break
                 continue
             tried = result.evidence.tried * count  # it is the best of all that was tried so far
-            found.append((result.weighed(replace(result.evidence, tried=tried)), matcher, hypothesis))
+            drawn_at = None if matcher.query is query else matcher.query.telemetry
+            weighed = replace(result, drawn_at=drawn_at).weighed(replace(result.evidence, tried=tried))
+            found.append((weighed, matcher, hypothesis))
             # What is found after the telemetry failed may be as wrong as that.
-            if found[-1][0].suffices(query.risk) or (result is first and result.promises(query.risk)):
+            if weighed.suffices(query.risk) or (result is first and result.promises(query.risk)):
                 break
             again = matcher._at(result, hypothesis) if matcher.query is query else None
             if again is not None:

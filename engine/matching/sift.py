@@ -127,10 +127,10 @@ class Sift(Method):
         is_known = known.height_agl_m is not None and known.grid_heading_deg is not None and known.has_tilt
         return is_known and query.site.has_surface
 
-    def refined(self, query: Query, fix: Fix) -> Fix | None:
+    def refined(self, query: Query, candidate: PoseCandidate) -> Fix | None:
         """The fix with its pose refined; None if that fails, or chance may have given that pose as well."""
-        refinement = self._refinement(query)
-        found = refinement.refine_pose(fix)
+        refinement = self._refinement(query if candidate.drawn_at is None else query.at(candidate.drawn_at))
+        found = refinement.refine_pose(candidate.fix)
         if found is None or not found.is_consistent:
             return None
         counts = found.is_clear or is_beyond_doubt(refinement.surprise_of(found), query.risk)
@@ -234,7 +234,7 @@ class _Rungs:
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer | None:
         """The pose refined, if its features are beyond doubt or the picture confirms it."""
         assert isinstance(answer, PoseCandidate)  # or it was not offered
-        refined = self._sift.refined(self._query, answer.fix)
+        refined = self._sift.refined(self._query, answer)
         if refined is None:
             return replace(answer, refinement_failed=True)
         if not (is_accepted(answer, self._query) or refined.score >= CONFIRMING_CORRELATION):
