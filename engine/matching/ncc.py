@@ -172,11 +172,14 @@ class Ncc(Method):
             PeakCandidate | None: None if the template is nowhere on the map.
         """
         with query.scheduler.stage("structure"):
-            return match_structure(self._correlator(query), found, self._correlator(_about(query, found)))
+            return match_structure(self._correlator(query), found, self.around(query, found))
 
-    def window(self, query: Query, aligned: Aligned) -> Window | None:
-        """The adaptive window of a frame."""
-        return self._correlator(query).window(aligned)
+    def around(self, query: Query, found: PeakCandidate) -> Correlator:
+        """Of the frame where structure is matched: about its prior; after a search, about the place."""
+        if found.by_search:
+            place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
+            query = replace(query, prior=place)
+        return self._correlator(query)
 
     def _correlator(self, query: Query) -> Correlator:
         return Correlator(query, self.prepared, self.options)
@@ -307,7 +310,7 @@ class _Rungs:
         """Structure about a refused peak, once."""
         if not self._falls_short(answer) or answer.by_structure:
             return {}
-        window = self._ncc.window(_about(self._query, answer), answer.aligned)
+        window = self._ncc.around(self._query, answer).window(answer.aligned)
         return {} if window is None else {_STRUCTURE: answer.aligned.work_px(window)}
 
     def _match_structure(self, answer: Answer | None, step: Hashable) -> Answer | None:
@@ -365,11 +368,3 @@ class _Rungs:
         if found.is_fitted:
             return Refinement(self._query.at(found.aligned.pose), samples, options)
         return Refinement(self._query, samples, options, pictures=self._pictures)
-
-
-def _about(query: Query, found: PeakCandidate) -> Query:
-    """The query to match structure by: about its prior; after a search, about the place."""
-    if not found.by_search:
-        return query
-    place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
-    return replace(query, prior=place)

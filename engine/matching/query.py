@@ -85,10 +85,17 @@ class Query:
         Without a position it takes the middle of the map, where grid north is true north.
         """
         frame, heading_deg = self.frame, self.frame.heading_deg
-        if heading_deg is not None and self.prior_px is not None and np.isfinite(self.prior_px).all():
-            lat, lon = self.site.geodetic_from_pixel(self.prior_px)
-            heading_deg = wrap_heading_deg(heading_deg + self.site.frame.convergence_deg(float(lat), float(lon)))
+        if heading_deg is not None:
+            heading_deg = wrap_heading_deg(heading_deg + self._convergence_deg)
         return GridPose(frame.height_agl_m, heading_deg, frame.roll_deg, frame.pitch_deg)
+
+    @cached_property
+    def _convergence_deg(self) -> float:
+        """What a heading from grid north is more than from true north, where the vehicle should be."""
+        if self.prior_px is None or not np.isfinite(self.prior_px).all():
+            return 0.0
+        lat, lon = self.site.geodetic_from_pixel(self.prior_px)
+        return self.site.frame.convergence_deg(float(lat), float(lon))
 
     @cached_property
     def jacobian(self) -> Array:
@@ -176,11 +183,9 @@ class Query:
     def at(self, pose: GridPose) -> Query:
         """The same query with the heading and height that a search found, as accurate as its steps."""
         height_m = pose.known_height_m
-        towards_north = replace(self, frame=replace(self.frame, heading_deg=0.0)).telemetry
-        heading_deg = pose.known_attitude.heading_deg - towards_north.known_attitude.heading_deg
         found = replace(
             self.frame,
-            heading_deg=wrap_heading_deg(heading_deg),
+            heading_deg=wrap_heading_deg(pose.known_attitude.heading_deg - self._convergence_deg),
             heading_sigma_deg=_FOUND_HEADING_DEG,
             height_agl_m=height_m,
             height_sigma_m=_FOUND_HEIGHT_SHARE * height_m,
