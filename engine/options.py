@@ -15,7 +15,6 @@ from engine.values import RISK, SIGNIFICANCE, check, check_choice, check_positiv
 if TYPE_CHECKING:
     from engine.orthomap import OrthoMap
 
-PROFILES = ("engine", "paper")
 PAPER_SCALE = 0.5
 """To which the paper reduces frame and map before detection."""
 MIN_HEIGHT_M = 1.0
@@ -139,7 +138,6 @@ class MatcherOptions:
     """Settings of all methods.
 
     Attributes:
-        profile: "engine", or "paper" for the paper's own recipe with OpenCV.
         risk: allowed probability of a wrong fix, see :mod:`engine.matching.evidence`.
         errors: assumed errors of the telemetry and the map.
         ncc: settings of the NCC method.
@@ -147,7 +145,6 @@ class MatcherOptions:
         learned: settings of the learned method.
     """
 
-    profile: str = "engine"
     risk: float = RISK
     errors: AssumedErrors = field(default_factory=AssumedErrors)
     ncc: NccOptions = field(default_factory=NccOptions)
@@ -155,7 +152,6 @@ class MatcherOptions:
     learned: LearnedOptions = field(default_factory=LearnedOptions)
 
     def __post_init__(self) -> None:
-        check_choice(self, "profile", PROFILES)
         check(self, "risk", "a probability above 0 and below 1", lambda risk: 0.0 < risk < 1.0)
 
     def on_map(self, site: OrthoMap) -> MatcherOptions:
@@ -204,14 +200,3 @@ class NavigatorOptions:
     def __post_init__(self) -> None:
         check_positive(self, *(name for name in self.__dataclass_fields__ if name != "odometry"))
         check(self, "risk", "a probability below 1", lambda risk: risk < 1.0)
-
-
-ACCEPT_ALL = NavigatorOptions(
-    gate=1e12,
-    risk=1.0 - 1e-12,
-    attitude_lag_s=1e-9,
-    attitude_jitter_s=1e-9,
-    tilt_bias_deg=1e-9,
-    heading_bias_deg=1e-9,
-)
-"""Accept every match, as the paper's recipe does: the baseline."""

@@ -47,7 +47,7 @@ def test_numbers_are_above_0(options, name, value):
         *((PoseOptions, name, value, "a number above 0") for name, value in (
             ("reprojection_px", 0), ("distinct_px", -1))),
         (LearnedOptions, "max_keypoints", 1, ".+"), (LearnedOptions, "max_picture_px", 10, ".+"),
-        (LearnedOptions, "max_window_px", 10, ".+"), (MatcherOptions, "profile", "fast", "one of engine, paper"),
+        (LearnedOptions, "max_window_px", 10, ".+"),
         *((MatcherOptions, "risk", value, "a probability above 0 and below 1")
           for value in (0.0, 1.0, 98.0, math.nan)),
     ],

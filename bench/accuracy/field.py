@@ -25,15 +25,16 @@ from bench.accuracy.flights import MIDDLE, where_truth_is
 from bench.accuracy.truth import START_SIGMA_M, answered, rows_of
 from bench.command import parser_on_one_thread
 from bench.pages import field
-from engine import Frame, Navigator, OrthoMap, Prior, SceneMatcher
+from engine import Frame, Navigator, OrthoMap, Prior
 from engine.geo import Array
-from engine.options import ACCEPT_ALL, LearnedOptions
+from engine.options import LearnedOptions
 from scenematch import FlightFiles, TrackSettings, track
 from scenematch.files.track import TrackRow, read_track
 from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
 from scenematch.runs.arguments import parse_position
 from scenematch.runs.inputs import FlightInputs, open_inputs
+from scenematch.runs.paper_recipe import ACCEPT_ALL
 
 REAL = ("brighton", "seneca", "caliterra", "nust")
 DRAWN = {"gazebo-a1": 8, "gazebo-a2": 8, "gazebo-a1-evening": 8}
@@ -113,7 +114,7 @@ def _middles(name: str, inputs: FlightInputs, settings: TrackSettings) -> list[T
 
     A fix with a pose is the vehicle's position, and the file of a track does not hold the pose's attitude.
     """
-    matcher = SceneMatcher(inputs.site, inputs.camera, settings.method, "cpu", settings)
+    matcher = settings.matcher(inputs.site, inputs.camera)
     matcher.warmup()
     options = ACCEPT_ALL if settings.profile == "paper" else settings.navigator
     navigator = Navigator(matcher, parse_position("start", settings.start), None, options)

@@ -26,12 +26,13 @@ from bench.speed.peers import OpenCvFeatures
 from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.geo import Array, enu_from_body
 from engine.navigation.navigator import Matcher
-from engine.options import ACCEPT_ALL, SiftOptions
+from engine.options import SiftOptions
 from engine.values import Attitude, Truth
 from scenematch.files.flight import open_flight
 from scenematch.files.telemetry import ground_amsl_m
 from scenematch.files.truth import interpolate_truth, read_truth
 from scenematch.report.metrics import Ground, errors_en_m, summarise
+from scenematch.runs.paper_recipe import ACCEPT_ALL, PaperSift
 from scenematch.simulator import plan_flight
 
 STEPS = {"gazebo-a1": 3, "gazebo-a2": 3, "gazebo-a1-evening": 3, "nust": 2, "caliterra": 1}
@@ -140,7 +141,7 @@ def methods(flight: Recorded) -> Iterator[tuple[str, Matcher]]:
     yield OURS, _engine(flight, SiftOptions())
     yield NO_ATTITUDE, _engine(flight, SiftOptions(use_attitude=False))
     yield OPENCV, OpenCvFeatures(flight.site, flight.camera, prepared=True)
-    yield PAPER, SceneMatcher(flight.site, flight.camera, "sift", "cpu", MatcherOptions(profile="paper"))
+    yield PAPER, SceneMatcher(flight.site, flight.camera, PaperSift, "cpu")
 
 
 def _engine(flight: Recorded, options: SiftOptions) -> SceneMatcher:

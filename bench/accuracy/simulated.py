@@ -18,9 +18,10 @@ from bench.accuracy.shutter import Shutter, ShutterFlight
 from bench.accuracy.truth import answered, pooled, rows_of, true_start
 from bench.command import parser_on_one_thread
 from bench.pages.text import fill, machine, paragraph, percent, table_of
-from engine import MatcherOptions, Navigator, SceneMatcher
-from engine.options import ACCEPT_ALL
+from engine import Navigator, SceneMatcher
 from scenematch.report.metrics import Ground, summarise
+from scenematch.runs.paper_recipe import ACCEPT_ALL
+from scenematch.runs.settings import TrackSettings
 from scenematch.simulator import FlightPlan, plan_flight
 
 SEEDS = (71, 72, 73, 74, 75)
@@ -58,24 +59,30 @@ class Run:
     with_attitude: bool
 
 
-def matchers(plan: FlightPlan, ways: tuple[tuple[str, str], ...]) -> list[SceneMatcher]:
+Ready = list[tuple[str, SceneMatcher]]
+"""Matchers with their profiles."""
+
+
+def matchers(plan: FlightPlan, ways: tuple[tuple[str, str], ...]) -> Ready:
     """Each way to match over the map of a town, warmed up."""
     site = plan.town.site()
-    made = [SceneMatcher(site, plan.camera, method, "cpu", MatcherOptions(profile=p)) for method, p in ways]
-    for matcher in made:
+    made = [
+        (profile, TrackSettings(method=method, profile=profile, device="cpu").matcher(site, plan.camera))
+        for method, profile in ways
+    ]
+    for _, matcher in made:
         matcher.warmup()
     return made
 
 
 def fly(
-    plan: FlightPlan, ready: list[SceneMatcher], day: str, hills_m: float = 0.0, *, with_attitude: bool = True
+    plan: FlightPlan, ready: Ready, day: str, hills_m: float = 0.0, *, with_attitude: bool = True
 ) -> Iterator[Run]:
     """The same frames by every matcher, each from the true start."""
     truth, frames = plan.truth_rows(), list(plan.iter_frames())
     if not with_attitude:
         frames = [replace(frame, roll_deg=None, pitch_deg=None) for frame in frames]
-    for matcher in ready:
-        profile = matcher.options.profile
+    for profile, matcher in ready:
         navigator = Navigator(matcher, true_start(truth), options=ACCEPT_ALL if profile == "paper" else None)
         rows = rows_of(*answered(navigator.update, ((frame,) for frame in frames)))
         ground = Ground(matcher.site.ground_m, plan.town.datum_amsl_m)

@@ -17,7 +17,8 @@ import numpy as np
 from bench.accuracy.truth import off, prior_at, true_places_m
 from engine import Budget, Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.geo import Array
-from engine.options import ACCEPT_ALL
+from engine.matching.method import Method
+from engine.options import NavigatorOptions
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M
 from scenematch.simulator import plan_flight
 
@@ -92,7 +93,7 @@ def draw(count: int | None = None, dive_m: float = DIVE_M, rate_hz: float = RATE
     return Course(site, plan.camera, list(plan.iter_frames()), places_m, round(1e9 / rate_hz))
 
 
-def warm(course: Course, method: str, options: MatcherOptions | None = None) -> SceneMatcher:
+def warm(course: Course, method: str | type[Method], options: MatcherOptions | None = None) -> SceneMatcher:
     """A matcher that is ready to fly."""
     matcher = SceneMatcher(course.site, course.camera, method, "cpu", options)
     matcher.warmup()
@@ -196,9 +197,9 @@ def fly(
     count: int,
     budget_ms: float = math.inf,
     each: Callable[[int, float], None] | None = None,
+    options: NavigatorOptions | None = None,
 ) -> Flown:
     """Follow the course for ``count`` frames; ``each`` as in :func:`measured`."""
-    options = ACCEPT_ALL if matcher.options.profile == "paper" else None
     navigator = Navigator(matcher, course.start, Budget(total_ms=budget_ms), options)
     return measured(navigator.update, lambda n: (course.frame(n),), course.error, count, budget_ms, each)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from bench.live.endless import Course, draw, fly, summary, warm
-from engine import MatcherOptions
 from engine.runtime.threads import set_threads
 from scenematch.runs.demo import PAPER_TABLE
+from scenematch.runs.paper_recipe import ACCEPT_ALL, RECIPES
 
 Row = dict[str, Any]
 BUDGETS_MS = (1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 40.0, 80.0, 121.0)
@@ -40,8 +40,9 @@ def table_one(frames: int, paper_frames: int) -> list[Row]:
     rows: list[Row] = []
     for method, (rms_m, ms) in PAPER_TABLE.items():
         rows.append({"who": f"{method.upper()}, as published", "rms_m": rms_m, "mean": ms})
-        recipe = warm(course, method, MatcherOptions(profile="paper"))
-        rows.append(summary(fly(course, recipe, paper_frames), f"{method.upper()}, paper's recipe", threads=1))
+        recipe = warm(course, RECIPES[method])
+        flown = fly(course, recipe, paper_frames, options=ACCEPT_ALL)
+        rows.append(summary(flown, f"{method.upper()}, paper's recipe", threads=1))
     for threads in (1, 2):
         set_threads(threads)
         for method in METHODS:

@@ -18,8 +18,9 @@ from bench.inputs.scenes import flight
 from bench.inputs.views import Size, warped_pairs
 from bench.speed import peers
 from bench.speed.detectors import detectors
-from engine import Fix, MatcherOptions, SceneMatcher, set_threads
+from engine import Fix, SceneMatcher, set_threads
 from engine.options import NccOptions, SiftOptions
+from scenematch.runs.settings import TrackSettings
 
 SIZES: list[Size] = [(150, 150), (300, 300), (640, 480)]
 BATCH = 16
@@ -97,8 +98,8 @@ def test_features(benchmark: Any, peer: str, batch: int, size: Size, threads: in
 
 def _engine(method: str, profile: str = "engine", **sift: Any) -> SceneMatcher:
     scene, peak = flight(), NccOptions(refine=False)
-    options = MatcherOptions(profile=profile, ncc=peak, sift=SiftOptions(**sift))
-    matcher = SceneMatcher(scene.site, scene.camera, method, "cpu", options)
+    options = TrackSettings(method=method, profile=profile, device="cpu", ncc=peak, sift=SiftOptions(**sift))
+    matcher = options.matcher(scene.site, scene.camera)
     matcher.warmup()
     return matcher
 

@@ -1,7 +1,7 @@
 """How a frame is matched: one file per method, and the steps that the methods share.
 
 A method is a class derived from :class:`engine.matching.method.Method`. A new method is one file and one line in
-:data:`BY_PROFILE`.
+:data:`CLASSES`; one from outside is given to :class:`engine.SceneMatcher` as its class.
 """
 
 from __future__ import annotations
@@ -15,27 +15,23 @@ from engine.errors import OptionError
 if TYPE_CHECKING:
     from engine.matching.method import Method
 
-BY_PROFILE: Mapping[str, Mapping[str, str]] = {
-    "engine": {"ncc": "ncc.Ncc", "sift": "sift.Sift", "auto": "auto.Auto", "learned": "learned.Learned"},
-    "paper": {"ncc": "paper.PaperNcc", "sift": "paper.PaperSift"},
-}
+CLASSES: Mapping[str, str] = {
+    "ncc": "ncc.Ncc", "sift": "sift.Sift", "auto": "auto.Auto", "learned": "learned.Learned",
+}  # fmt: skip
 """The module and class of each method, imported when a matcher is made: options need no torch."""
-METHODS = tuple(BY_PROFILE["engine"])
+METHODS = tuple(CLASSES)
 CLASSICAL = tuple(name for name in METHODS if name != "learned")
 """Methods that need no file of weights."""
 
 
-def method_type(name: str, profile: str) -> type[Method]:
+def method_type(name: str) -> type[Method]:
     """The class of a method.
 
     Raises:
-        OptionError: no method has this name, or not in this profile.
+        OptionError: no method has this name.
     """
     if name not in METHODS:
         raise OptionError(f"method: expected one of {', '.join(METHODS)}, got {name!r}")
-    methods = BY_PROFILE[profile]
-    if name not in methods:
-        raise OptionError(f"method: the {profile}'s profile has {' and '.join(methods)}, got {name!r}")
-    module, _, of_module = methods[name].partition(".")
+    module, _, of_module = CLASSES[name].partition(".")
     found: type[Method] = getattr(import_module(f"engine.matching.{module}"), of_module)
     return found

@@ -29,6 +29,7 @@ class Auto(Method):
         options: settings of both.
     """
 
+    name = "auto"
     loops = tuple(dict.fromkeys(Ncc.loops + Sift.loops))
 
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:

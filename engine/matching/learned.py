@@ -37,6 +37,8 @@ class Learned(Method):
         OptionError: there are no weights, or they make no matcher.
     """
 
+    name = METHOD
+
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:
         own = options.learned
         matcher = load_matcher(own.weights, device=device)

@@ -59,8 +59,8 @@ class SceneMatcher:
         site: the map.
         camera: as calibrated, with its distortion; frames are undistorted by a lookup computed once.
         method: "ncc" (needs height and heading), "sift" (needs neither), "auto": NCC if height and heading are
-            known, and SIFT if that leaves doubt and time; or "learned": networks with the weights of
-            ``options.learned``.
+            known, and SIFT if that leaves doubt and time; "learned": networks with the weights of
+            ``options.learned``; or your own, a class derived from :class:`engine.matching.method.Method`.
         device: "cpu", "cuda" or "auto".
         options: settings. The accuracy that the map states overrides theirs.
 
@@ -73,18 +73,18 @@ class SceneMatcher:
         self,
         site: OrthoMap,
         camera: Camera,
-        method: str = "ncc",
+        method: str | type[Method] = "ncc",
         device: str | torch.device = "auto",
         options: MatcherOptions | None = None,
     ) -> None:
         self.options = (options or MatcherOptions()).on_map(site)
-        build = method_type(method, self.options.profile)
+        kind = method_type(method) if isinstance(method, str) else method
         self.site = site
         self.camera = camera
-        self.method = method
+        self.method = kind.name
         self.device = devices.resolve(device)
         threads.default_threads()
-        self._method: Method = build(site, self.device, self.options)
+        self._method = kind(site, self.device, self.options)
         self._costs = Costs()
         self._is_warm = False
         # The camera of undistorted pictures; the mount stays.
@@ -139,6 +139,10 @@ class SceneMatcher:
         height_m = per_px * camera.focal_px * site.gsd_m_per_px
         prior = Prior(east_m=float(middle[0]), north_m=float(middle[1]), sigma_m=5.0)
         return Frame(np.asarray(image, np.uint8), 0, height_m, 0.0, 0.0, 0.0), prior
+
+    def twin(self) -> SceneMatcher:
+        """An equal matcher with caches of its own, for another thread."""
+        return SceneMatcher(self.site, self.camera, type(self._method), self.device, self.options)
 
     @property
     def cache_counters(self) -> dict[str, int]:

@@ -16,7 +16,7 @@ from engine.values import Result, Window
 
 
 class Method(ABC):
-    """A method. One without caches, costs or parts only needs ``locate`` and ``explain``.
+    """A method. One without caches, costs or parts only needs ``name``, ``locate`` and ``explain``.
 
     Args:
         site: the map.
@@ -26,6 +26,9 @@ class Method(ABC):
 
     def __init__(self, site: OrthoMap, device: Device, options: MatcherOptions) -> None:  # noqa: B027
         """Store nothing; a method that prepares the map overrides this."""
+
+    name: ClassVar[str]
+    """As its fixes and refusals call it."""
 
     @property
     def parts(self) -> Mapping[str, Method]:

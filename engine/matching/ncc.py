@@ -44,6 +44,7 @@ class Ncc(Method):
         options: settings; ``options.ncc`` counts.
     """
 
+    name = METHOD
     loops = (
         "map_points",
         "gauss_newton",

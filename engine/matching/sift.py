@@ -37,6 +37,7 @@ class Sift(Method):
         samples: of the map for the refinement, if another method already has them.
     """
 
+    name = METHOD
     loops = (
         "map_points",
         "gauss_newton",

@@ -79,8 +79,7 @@ class LiveView:
 
     def __init__(self, stream: rr.RecordingStream, matcher: SceneMatcher) -> None:
         self._stream = stream
-        options = matcher.options
-        self._matcher = SceneMatcher(matcher.site, matcher.camera, matcher.method, matcher.device, options)
+        self._matcher = matcher.twin()
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         stream.log("world/map", _map_mesh(matcher.site), static=True)
         words, colours = [state.value for state in STATE_RGB], list(STATE_RGB.values())

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from engine.errors import EngineError, OptionError, TelemetryError
-from engine.matching.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
 from scenematch.files.settings import nested, options_from_mapping
 from scenematch.files.track import TrackRow, read_track
@@ -82,7 +81,7 @@ def _report_frames(record: RunRecord, rows: list[TrackRow], site: OrthoMap) -> R
         if (stamps, flight.names) != (recorded, [row.frame for row in rows]):
             return ReportFrames(why_missing="the frames or their telemetry have changed since the run.")
         camera = files.load_camera(flight)
-        return ReportFrames(flight, SceneMatcher(site, camera, settings.method, settings.device, settings))
+        return ReportFrames(flight, settings.matcher(site, camera))
     except (EngineError, OSError) as error:
         return ReportFrames(why_missing=f"{error}.")
 

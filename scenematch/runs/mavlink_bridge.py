@@ -252,7 +252,7 @@ def _loaded(
         site = files.map.open(progress)
         camera = files.load_camera(progress)
         check_position("start", start, site, OptionError)
-        matcher = SceneMatcher(site, camera, settings.method, settings.device, settings)
+        matcher = settings.matcher(site, camera)
         with progress.task("compiling") as report_compiled:
             matcher.warmup(report_compiled, brief=brief)
     return matcher

@@ -9,7 +9,6 @@ from typing import Any
 
 from engine.camera import Camera
 from engine.errors import BackendError, OptionError
-from engine.matching.matcher import SceneMatcher
 from scenematch.bridges.ros import RosBridge, RosNode, RosStatus, RosTopics
 from scenematch.bridges.ros_out import RosOptions
 from scenematch.bridges.vehicle import NedOrigin
@@ -105,7 +104,7 @@ def run_ros_bridge(
     camera = None if ros.camera.camera is None else ros.camera.load(None)
     node = node or _node(ros.version, ros.arguments)
     camera = camera or _heard_camera(node, ros, progress)
-    matcher = SceneMatcher(site, camera, settings.method, settings.device, settings)
+    matcher = settings.matcher(site, camera)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
 

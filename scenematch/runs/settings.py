@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from engine.errors import OptionError
 from engine.matching import METHODS
@@ -22,6 +22,12 @@ from scenematch.files.settings import (
 from scenematch.files.telemetry import COLUMNS
 from scenematch.runs.arguments import check_choice, check_device, parse_budget, parse_position
 from scenematch.runs.output import StrPath
+
+if TYPE_CHECKING:
+    from engine.camera import Camera
+    from engine.matching.matcher import SceneMatcher
+    from engine.matching.method import Method
+    from engine.orthomap import OrthoMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +56,7 @@ class TrackSettings(MatcherOptions):
     """
 
     method: str = "auto"
+    profile: str = "engine"
     device: str = "auto"
     start: str | None = None
     budget_ms: float | None = None
@@ -58,6 +65,7 @@ class TrackSettings(MatcherOptions):
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
+        check_choice("profile", self.profile, ("engine", "paper"))
         MatcherOptions.__post_init__(self)  # super() would be the class before its slots
         if self.profile == "paper" and self.method not in ("ncc", "sift"):
             raise OptionError(f"method: expected ncc or sift with `profile` paper, got {self.method!r}")
@@ -67,6 +75,17 @@ class TrackSettings(MatcherOptions):
         parse_position("start", self.start)
         parse_budget("budget_ms", self.budget_ms)
         check_device(self.device)
+
+    def matcher(self, site: OrthoMap, camera: Camera) -> SceneMatcher:
+        """The matcher of a map and a camera."""
+        from engine.matching.matcher import SceneMatcher  # settings alone need no torch
+
+        method: str | type[Method] = self.method
+        if self.profile == "paper":
+            from scenematch.runs.paper_recipe import RECIPES
+
+            method = RECIPES[self.method]
+        return SceneMatcher(site, camera, method, self.device, self)
 
     def _check_columns(self) -> None:
         for name, theirs in self.telemetry_columns.items():

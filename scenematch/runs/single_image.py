@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from engine.errors import OptionError, TelemetryError
-from engine.matching.matcher import SceneMatcher
 from engine.values import Fix, Frame, NoFix
 from scenematch.files.frames import PICTURE_SUFFIXES, open_frames, read_image
 from scenematch.runs.arguments import parse_position
@@ -62,7 +61,7 @@ def locate_image(
     check_position("start", prior, site, OptionError)
     pixels = read_image(image)
     check_size(calibration, pixels.shape)
-    matcher = SceneMatcher(site, calibration, settings.method, settings.device, settings)
+    matcher = settings.matcher(site, calibration)
     return matcher.locate(Frame(pixels, **known), prior)
 
 

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from engine.budget import Budget
 from engine.errors import EngineError, TelemetryError
-from engine.matching.matcher import SceneMatcher
 from engine.navigation.navigator import Navigator
-from engine.options import ACCEPT_ALL
 from engine.values import Fix, NoFix, Prior, Reason
 from scenematch.files.flight import FlightFrame
 from scenematch.files.settings import changed
@@ -23,6 +21,7 @@ from scenematch.runs.checking import as_rows, diagnose_flight
 from scenematch.runs.inputs import FlightFiles, FlightInputs, open_inputs
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
 from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder
+from scenematch.runs.paper_recipe import ACCEPT_ALL
 from scenematch.runs.record import PATHS, RunRecord
 from scenematch.runs.results import NOTES, OWNED, TRACK, ReportFrames, write_results
 from scenematch.runs.settings import TrackSettings
@@ -73,7 +72,7 @@ def track(
     start, budget = parse_position("start", settings.start), parse_budget("budget_ms", settings.budget_ms)
     inputs = inputs or open_inputs(files, [settings], progress=progress)
     site, flight = inputs.site, inputs.flight
-    matcher = SceneMatcher(site, inputs.camera, settings.method, settings.device, settings)
+    matcher = settings.matcher(site, inputs.camera)
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
     prepare_folder(out, force, OWNED)

@@ -19,10 +19,14 @@ from engine.matching.align import to_gray
 from engine.matching.candidates import PoseCandidate
 from engine.matching.evidence import Evidence, probability
 from engine.matching.feature_pose import FeatureMatcher
+from engine.matching.for_reports import Explanation
+from engine.matching.method import Method
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
 from engine.options import MatcherOptions, NccOptions, SiftOptions
-from engine.values import Fix, Frame, GridPose, NoFix, Prior, Reason
+from engine.values import Fix, Frame, GridPose, NoFix, Prior, Reason, Window
+from scenematch.runs.paper_recipe import RECIPES
+from scenematch.runs.settings import TrackSettings
 from tests.support.fixes import a_fix, px_off, values_of
 from tests.support.ground import Ground
 from tests.support.landmarks import landmarks_of
@@ -78,12 +82,12 @@ def test_a_fix_says_the_same_place_in_every_way(matchers, ground, frame, prior, 
      pytest.param("sift", "paper", marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_the_same_question_has_the_same_answer_in_any_order(ground, camera, frame, prior, method, profile):
-    options = MatcherOptions(profile=profile)
+    settings = TrackSettings(method=method, profile=profile, device="cpu")
     other = ground.frame(camera, NADIR + 12.0, heading_deg=200.0, timestamp_ns=77)
     flat = with_telemetry(np.full((300, 300), 90, np.uint8))
     questions = [(frame, prior), (flat, prior), (other, ground.prior(NADIR + 12.0)), (frame, None)]
-    forwards = SceneMatcher(ground.site, camera, method, "cpu", options)
-    backwards = SceneMatcher(ground.site, camera, method, "cpu", options)
+    forwards = settings.matcher(ground.site, camera)
+    backwards = settings.matcher(ground.site, camera)
     first = [values_of(forwards.locate(*question)) for question in questions]
     again = [values_of(forwards.locate(*question)) for question in questions]
     last = [values_of(backwards.locate(*question)) for question in reversed(questions)]
@@ -384,7 +388,7 @@ def test_a_prior_that_the_maps_crs_cannot_show_is_refused(camera, frame, method,
     """Null island, as a receiver without a fix reports it, and its opposite have no place in UTM's zone 46."""
     gray = np.random.default_rng(0).integers(0, 256, (400, 400), np.uint8)
     site = OrthoMap.from_arrays(gray, [[0.5, 0.0, 500_000.0], [0.0, -0.5, 3_600_000.0]], "EPSG:32646")
-    matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions(profile=profile))
+    matcher = TrackSettings(method=method, profile=profile, device="cpu").matcher(site, camera)
     for lon_deg in (0.0, 183.0, -177.0):
         nowhere = Prior(lat_deg=0.0, lon_deg=lon_deg, sigma_m=10.0)
         assert_refused(matcher.locate(frame, nowhere), Reason.OUTSIDE_MAP)
@@ -462,8 +466,29 @@ def test_a_device_that_is_missing_is_an_error_and_only_auto_falls_back(ground, c
 def test_options_are_refused_by_name(ground, camera):
     with pytest.raises(OptionError, match=r"^method: expected one of ncc, sift, auto, learned, got 'orb'"):
         SceneMatcher(ground.site, camera, "orb")
-    with pytest.raises(OptionError, match=r"^method: the paper's profile"):
-        SceneMatcher(ground.site, camera, "auto", "cpu", MatcherOptions(profile="paper"))
+
+
+class TheMapsMiddle(Method):
+    """A method of a user's own: wherever the frame was taken."""
+
+    name = "middle"
+
+    def __init__(self, site, device, options):
+        self.middle_px = site.inner_px
+
+    def locate(self, query):
+        return query.fix(self.name, self.middle_px, np.eye(3), score=1.0, window=Window(0, 0, 9, 9))
+
+    def explain(self, query, window):
+        return Explanation(query.gray)
+
+
+def test_a_method_of_ones_own_is_given_as_its_class(ground, camera, frame, prior):
+    matcher = SceneMatcher(ground.site, camera, TheMapsMiddle, "cpu")
+    for each in (matcher, matcher.twin()):
+        fix = each.locate(frame, prior)
+        assert (fix.method, each.method) == ("middle", "middle")
+        np.testing.assert_allclose(fix.map_xy_px, ground.site.inner_px)
 
 
 # The paper's profile
@@ -471,7 +496,7 @@ def test_options_are_refused_by_name(ground, camera):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_papers_profile_finds_the_place_of_a_level_frame(ground, camera, prior, method):
-    matcher = SceneMatcher(ground.site, camera, method, "cpu", MatcherOptions(profile="paper"))
+    matcher = SceneMatcher(ground.site, camera, RECIPES[method], "cpu")
     for heading, given in ((0.0, prior), (60.0, None), (250.0, prior)):
         fix = matcher.locate(ground.frame(camera, NADIR, heading_deg=heading), given)
         assert px_off(fix, NADIR) < (1.0 if method == "ncc" else 2.0)  # whole pixels; no attitude to lean on
@@ -480,7 +505,7 @@ def test_the_papers_profile_finds_the_place_of_a_level_frame(ground, camera, pri
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_papers_profile_refuses_what_it_cannot_do(ground, camera, frame, prior, method):
-    matcher = SceneMatcher(ground.site, camera, method, "cpu", MatcherOptions(profile="paper"))
+    matcher = SceneMatcher(ground.site, camera, RECIPES[method], "cpu")
     assert_refused(matcher.locate(with_telemetry(frame.image, None), prior), Reason.NO_HEIGHT, method)
     assert_refused(matcher.locate(frame, Prior(east_m=9e3, north_m=0.0, sigma_m=5.0)), Reason.OUTSIDE_MAP, method)
     assert_refused(matcher.locate(frame, prior, Budget(total_ms=1e-6)), Reason.LATE, method)

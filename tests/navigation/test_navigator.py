@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Navigator, NavigatorState, SceneMatcher
+from engine import Navigator, NavigatorState
 from engine.budget import Budget
 from engine.errors import TelemetryError
-from engine.options import ACCEPT_ALL, MatcherOptions, NavigatorOptions
+from engine.options import NavigatorOptions
 from engine.values import Attitude, Fix, NoFix, Prior, Reason
+from scenematch.runs.paper_recipe import ACCEPT_ALL
+from scenematch.runs.settings import TrackSettings
 from tests.support import matchers
 from tests.support.fixes import a_fix
 from tests.support.matchers import ScriptedMatcher, a_site, at
@@ -274,7 +276,7 @@ def test_every_frame_gets_the_budget():
 def fly(error_m, sim_site, sim_flight):
     def fly(method, *, profile="engine", start=True, skip=0, dark=()):
         """Frames from one on: their results, and the errors of those that are fixes."""
-        matcher = SceneMatcher(sim_site, sim_flight.camera, method, "cpu", MatcherOptions(profile=profile))
+        matcher = TrackSettings(method=method, profile=profile, device="cpu").matcher(sim_site, sim_flight.camera)
         truth = sim_flight.truth[skip:]
         prior = Prior(lat_deg=truth[0].lat_deg, lon_deg=truth[0].lon_deg, sigma_m=10.0) if start else None
         navigator = Navigator(matcher, prior, options=ACCEPT_ALL if profile == "paper" else None)

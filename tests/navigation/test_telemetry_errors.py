@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from engine import Camera, Navigator, Prior, SceneMatcher
 from engine.assumed_errors import AssumedErrors
 from engine.navigation.telemetry_errors import TelemetryErrors, considered
-from engine.options import ACCEPT_ALL, NavigatorOptions
+from engine.options import NavigatorOptions
 from engine.values import Attitude, Fix, Frame
+from scenematch.runs.paper_recipe import ACCEPT_ALL
 from scenematch.simulator import plan_flight
 from tests.support.fields import fields_of
 from tests.support.fixes import a_fix

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, MatcherOptions, SceneMatcher, Window
+from engine import Fix, Window
+from scenematch.runs.settings import TrackSettings
 from tests.support.ground import Ground
 
 HEIGHT_M = 80.0
@@ -39,7 +40,7 @@ def frame(polar, camera, north_deg):
 @pytest.fixture(scope="module")
 def make(polar, camera):
     def build(method, profile="engine"):
-        return SceneMatcher(polar.site, camera, method, "cpu", MatcherOptions(profile=profile))
+        return TrackSettings(method=method, profile=profile, device="cpu").matcher(polar.site, camera)
 
     return build
 

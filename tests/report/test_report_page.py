@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
-from engine.options import MatcherOptions, NccOptions, SiftOptions
+from engine import Fix, NoFix, OptionError, OrthoMap, Prior
+from engine.options import NccOptions, SiftOptions
 from engine.values import Reason, Window
 from scenematch import TrackSettings, evaluate
 from scenematch.cli.app import run
@@ -172,8 +172,8 @@ def test_settings_are_read_back_from_the_record():
 
 def matched(flight, site, method, profile="engine"):
     """A matcher and its first fix of a flight, with the frame."""
-    options = MatcherOptions(profile=profile, ncc=NccOptions(refine=False), sift=SiftOptions(refine=False))
-    matcher = SceneMatcher(site, flight.camera, method, "cpu", options)
+    coarse = {"ncc": NccOptions(refine=False), "sift": SiftOptions(refine=False)}
+    matcher = TrackSettings(method=method, profile=profile, device="cpu", **coarse).matcher(site, flight.camera)
     frame, truth = flight.frames[0], flight.truth[0]
     prior = Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=4.0)
     fix = matcher.locate(frame, prior)

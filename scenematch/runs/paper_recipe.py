@@ -3,9 +3,13 @@
 NCC: grey, equalise, scale (eq. 2), rotate (eq. 3), ``TM_CCORR_NORMED`` (eq. 1) in the adaptive window (eq. 4, 5),
 whole-pixel peak; tilt is not compensated. SIFT: frame and window at 0.5, features of both computed for every
 frame, Lowe's ratio, flat ground, ``solvePnPRansac``. Neither refuses a match that it found.
+
+Give a class of :data:`RECIPES` to :class:`engine.SceneMatcher` as its method.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -23,21 +27,33 @@ from engine.matching.for_reports import (
 )
 from engine.matching.method import Method
 from engine.matching.query import Query
-from engine.options import PAPER_SCALE
+from engine.options import NavigatorOptions
 from engine.values import MAX_SIGMA_M, Attitude, Reason, Result, Window
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Scores = NDArray[np.float32]
 
+SCALE = 0.5  # of the pictures in which SIFT looks
 RATIO = 0.8  # the paper gives none; Lowe's own
 REPROJECTION_PX = 4.0
 SIGMA_M = 2.4  # the paper states no covariance; this is the RMS error that it reports
 _COVARIANCE_M2 = SIGMA_M**2 / 2.0 * np.eye(3)
+ACCEPT_ALL = NavigatorOptions(
+    gate=1e12,
+    risk=1.0 - 1e-12,
+    attitude_lag_s=1e-9,
+    attitude_jitter_s=1e-9,
+    tilt_bias_deg=1e-9,
+    heading_bias_deg=1e-9,
+)
+"""Accept every match, as the paper's recipe does."""
 
 
 class PaperNcc(Method):
     """The paper's NCC."""
+
+    name = "ncc"
 
     def locate(self, query: Query) -> Result:
         """The highest peak in the window; needs height and heading."""
@@ -72,6 +88,8 @@ class PaperNcc(Method):
 
 class PaperSift(Method):
     """The paper's SIFT."""
+
+    name = "sift"
 
     def locate(self, query: Query) -> Result:
         """The pose of OpenCV's PnP with RANSAC; needs the height for its window."""
@@ -115,6 +133,10 @@ class PaperSift(Method):
         return Explanation(query.gray, rectified, matches=found)
 
 
+RECIPES: Mapping[str, type[Method]] = {kind.name: kind for kind in (PaperNcc, PaperSift)}
+"""The methods by name."""
+
+
 def _window(query: Query) -> Window | None:
     scale = _scale(query)
     extent = (scale * query.camera.width_px, scale * query.camera.height_px)
@@ -150,9 +172,7 @@ def surface(template: Gray, search: Gray) -> Scores:
 def matches(gray: Gray, search: Gray) -> tuple[Array, Array] | None:
     """Points (M, 2) of the frame and of the window that SIFT matches at half scale; None without features."""
     detector = cv2.SIFT_create()
-    halves = [
-        cv2.resize(p, None, fx=PAPER_SCALE, fy=PAPER_SCALE, interpolation=cv2.INTER_AREA) for p in (gray, search)
-    ]
+    halves = [cv2.resize(p, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA) for p in (gray, search)]
     (frame_points, frame_words), (map_points, map_words) = (
         detector.detectAndCompute(half, None) for half in halves
     )
@@ -161,7 +181,7 @@ def matches(gray: Gray, search: Gray) -> tuple[Array, Array] | None:
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(frame_words, map_words, k=2)
     good = [best for best, second in pairs if best.distance < RATIO * second.distance]
     found = ([frame_points[m.queryIdx].pt for m in good], [map_points[m.trainIdx].pt for m in good])
-    frame_px, map_px = ((np.array(points).reshape(-1, 2) + 0.5) / PAPER_SCALE - 0.5 for points in found)
+    frame_px, map_px = ((np.array(points).reshape(-1, 2) + 0.5) / SCALE - 0.5 for points in found)
     return frame_px, map_px
 
 
