@@ -23,7 +23,7 @@ def deliver(answer: Answer) -> None:
         print(f"{answer.result.lat_deg:.7f} {answer.result.lon_deg:.7f}, {answer.age_ms:.0f} ms old")
 
 
-with Live(lambda prior: Navigator(matcher, prior or start), deliver, options=LiveOptions(deadline_ms=500)) as live:
+with Live(lambda prior: Navigator(matcher, prior), deliver, start, LiveOptions(deadline_ms=500)) as live:
     for image, taken_ns in filter(None, capture(pipeline, exposure_to_grab_ms=60.0)):  # measure yours
         known = dict(zip(KNOWN, vehicle.at(taken_ns) or (None,) * 4, strict=True))
         live.submit(Frame(image, taken_ns, **known), captured_ns=taken_ns)  # capture gives RGB

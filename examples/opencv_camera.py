@@ -19,13 +19,16 @@ def deliver(answer: Answer) -> None:
     """Print the fix; send it to your autopilot here."""
     if isinstance(answer.result, Fix):
         print(f"{answer.result.lat_deg:.7f} {answer.result.lon_deg:.7f}, {answer.age_ms:.0f} ms old")
+    else:
+        print(answer.result.reason.value, answer.result.detail)
 
 
-with Live(lambda prior: Navigator(matcher, prior or start), deliver, options=LiveOptions(deadline_ms=500)) as live:
+with Live(lambda prior: Navigator(matcher, prior), deliver, start, LiveOptions(deadline_ms=500)) as live:
     camera = cv2.VideoCapture(0)
     while camera.grab():
         taken_ns = time.monotonic_ns()  # minus your camera's latency from exposure to here
         image = camera.retrieve()[1]
-        time.sleep(0.02)  # until the attitude after the exposure has arrived
+        while (vehicle.last_ns or 0) < taken_ns and time.monotonic_ns() < taken_ns + 50_000_000:
+            time.sleep(0.002)  # until the attitude after the exposure has arrived
         known = dict(zip(KNOWN, vehicle.at(taken_ns) or (None,) * 4, strict=True))
         live.submit(Frame.from_bgr(image, taken_ns, **known), captured_ns=taken_ns)

@@ -20,7 +20,7 @@ def deliver(answer: Answer) -> None:
         print(f"{answer.result.lat_deg:.7f} {answer.result.lon_deg:.7f}, {answer.age_ms:.0f} ms old")
 
 
-with Live(lambda prior: Navigator(matcher, prior or start), deliver, options=LiveOptions(deadline_ms=500)) as live:
+with Live(lambda prior: Navigator(matcher, prior), deliver, start, LiveOptions(deadline_ms=500)) as live:
     camera = Picamera2()
     camera.configure(camera.create_video_configuration({"size": (640, 480), "format": "RGB888"}))  # BGR in memory
     camera.start()

@@ -35,7 +35,7 @@ FIGURES = {  # page: claim: results page, heading and words of each row that sta
     "docs/calibrate.md": {
         "300 x 300 px were enough from 100 m": [("mavlink.md", "ArduCopter SITL", "ArduCopter 4.8-dev")],
     },
-    "docs/embed.md": {"takes `auto` 6.8 ms": [("latency.md", "Table I", "| auto, scenematch | 1 |")]},
+    "docs/embed.md": {"`auto` needs 6.8 ms": [("latency.md", "Table I", "| auto, scenematch | 1 |")]},
     "docs/datasets.md": {"by 26 degrees": [("datasets.md", "Published", "The 26 degrees")]},
     "docs/first-hour.md": {
         "300 of 300 frames were fixed, with 0.22 m RMS and 1.22 m at most":

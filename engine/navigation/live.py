@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from engine.budget import Budget
@@ -112,7 +112,7 @@ class Live:
     ) -> None:
         self._make_navigator, self._deliver = make_navigator, deliver
         self._options, self._clock_ns = options or LiveOptions(), clock_ns or time.monotonic_ns
-        self._last: tuple[Fix, int, Navigator] | None = None  # its capture, and whose it is
+        self._last: tuple[Fix | Prior, int, Navigator] | None = None  # where, when, and whose
         self._anew: Prior | None = None  # where a new navigator was asked to start
         self._changed = threading.Condition()
         self._delivering = threading.Lock()
@@ -123,7 +123,10 @@ class Live:
         self._closed = False
         self._threads: list[threading.Thread] = []
         check_realtime(self._options.realtime)
-        self._start_thread(self._work, make_navigator(start), 0)
+        navigator = make_navigator(start)
+        if start is not None:
+            self._last = (start, self._clock_ns(), navigator)
+        self._start_thread(self._work, navigator, 0)
         self._start_thread(self._watch, above=1)  # a computing worker must not keep it from answering
 
     @property
@@ -132,7 +135,7 @@ class Live:
         with self._changed:
             return Counts(**self._counts)
 
-    def submit(self, frame: Frame, prior: Prior | None = None, captured_ns: int | None = None) -> None:
+    def submit(self, frame: Frame, *, prior: Prior | None = None, captured_ns: int | None = None) -> None:
         """Submit the newest frame; one still waiting is dropped. Blocks only as long as a lock is held.
 
         Args:
@@ -219,7 +222,7 @@ class Live:
                     self._counts["workers_replaced"] += 1
 
     def _create_navigator(self, start: Prior | None) -> Navigator | None:
-        """A navigator that starts there, else at the last fix; one that fails is tried again until closing."""
+        """A navigator that starts there, else where the last one was; tried again until closing if it fails."""
         while not self._closed:
             try:
                 return self._make_navigator(start or self._resume())
@@ -297,14 +300,16 @@ class Live:
                 _log.exception("deliver failed")
 
     def _resume(self) -> Prior | None:
-        """Where a new worker starts: at the last fix, widened by how far the vehicle may have moved since."""
+        """Where a new worker starts: at the last fix, else the start, as far as the vehicle may have moved."""
         with self._changed:
             last = self._last
         if last is None:
             return None
-        fix, captured_ns, navigator = last
+        place, captured_ns, navigator = last
         moved_m = navigator.options.max_speed_mps * max(self._clock_ns() - captured_ns, 0) * 1e-9
-        return Prior(east_m=fix.east_m, north_m=fix.north_m, sigma_m=fix.sigma_m + moved_m)
+        if isinstance(place, Prior):
+            return replace(place, sigma_m=place.sigma_m + moved_m)
+        return Prior(east_m=place.east_m, north_m=place.north_m, sigma_m=place.sigma_m + moved_m)
 
     def _start_thread(self, target: Callable[..., None], *args: object, above: int = 0) -> None:
         name = f"scenematch-{target.__name__}"

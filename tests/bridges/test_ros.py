@@ -809,7 +809,7 @@ def test_a_camera_without_a_calibration_is_of_the_first_pictures_size(maker, nod
     """Of its field of view; nothing but the picture's topic is waited for."""
     node.wait_for = Mock(side_effect=[an_image(maker, NOW_NS, (30, 40, 3)), None])
     matcher = Mock(side_effect=LookupError)  # ends the run where the camera is known
-    monkeypatch.setattr("scenematch.runs.ros_bridge.SceneMatcher", matcher)
+    monkeypatch.setattr("engine.matching.matcher.SceneMatcher", matcher)
     camera, topics = CameraInput(hfov_deg=90.0), RosTopics(image="/down")
     settings = RosSettings(map=MapInput(flight / "map.tif"), camera=camera, topics=topics)
     with pytest.raises(LookupError):

@@ -187,6 +187,16 @@ def test_a_worker_that_hangs_is_replaced_and_starts_from_the_last_fix():
     assert [a.frame.timestamp_ns for a in answers] == [0, 1, 2, 3]
 
 
+def test_a_worker_that_dies_before_any_fix_starts_where_the_vehicle_may_be_by_then():
+    clock, navigators, answers = Clock(), Navigators({0: die}), []
+    start = Prior(lat_deg=1.0, lon_deg=2.0, sigma_m=15.0)
+    with Live(navigators, answers.append, start, LiveOptions(deadline_ms=60_000), clock) as live:
+        clock.advance(2000)
+        live.submit(frame(0))
+        wait_until(lambda: len(navigators.starts) == 2)
+    assert navigators.starts == [start, Prior(lat_deg=1.0, lon_deg=2.0, sigma_m=15.0 + 16.0 * 2.0)]
+
+
 def test_a_navigator_that_is_on_a_wrong_track_is_started_where_it_should_be():
     navigators = Navigators()
     with running(navigators) as (live, answers):
