@@ -35,6 +35,7 @@ from engine.runtime.threads import set_threads as set_threads
 from engine.values import Attitude as Attitude
 from engine.values import Fix as Fix
 from engine.values import Frame as Frame
+from engine.values import Look as Look
 from engine.values import NoFix as NoFix
 from engine.values import Prior as Prior
 from engine.values import Reason as Reason

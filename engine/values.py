@@ -292,6 +292,25 @@ class Timings:
         return sum(self.stages_ms.values())
 
 
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What was known of a frame's place after one look at it.
+
+    Attributes:
+        method: "ncc", "sift" or "learned".
+        name: of the look, such as "structure".
+        nats: evidence for the place that its method then proposed, in natural log-odds; None if it proposed none.
+            A fix needs log((1 - risk) / risk), three times that if no null hypothesis was tested.
+    """
+
+    method: str
+    name: str
+    nats: float | None
+
+    def __str__(self) -> str:
+        return f"{self.method} {self.name} {'-' if self.nats is None else format(self.nats, '.1f')}"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:
     """A position with its covariance, at the capture of the frame.
@@ -320,6 +339,7 @@ class Fix:
             method states none, as in the paper's profile.
         map_sigma_m: the georeference's part of ``covariance_m2``, one standard deviation per axis. All fixes on a
             map share this one error.
+        looks: the looks at the frame, in their order: why it was accepted.
     """
 
     timestamp_ns: int | None
@@ -339,6 +359,7 @@ class Fix:
     confidence: float | None = None
     map_sigma_m: float = 0.0
     attitude_covariance_deg2: NDArray[np.float64] | None = None
+    looks: tuple[Look, ...] = ()
 
     @property
     def rests_on_attitude(self) -> bool:
@@ -416,6 +437,7 @@ class NoFix:
         window: the crop that was searched, or None.
         timings: milliseconds per stage that ran.
         match: what was found but not accepted, with its own confidence and covariance, or None.
+        looks: the looks at the frame, in their order.
     """
 
     reason: Reason
@@ -426,6 +448,7 @@ class NoFix:
     window: Window | None = None
     timings: Timings = field(default_factory=Timings)
     match: Fix | None = None
+    looks: tuple[Look, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

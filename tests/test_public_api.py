@@ -13,7 +13,7 @@ from tests.support.paths import ROOT
 
 PUBLIC = [
     "Answer", "AssumedErrors", "Attitude", "BackendError", "Budget", "CalibrationError", "Camera", "DeviceError",
-    "DtypeError", "EngineError", "Fix", "Frame", "LearnedOptions", "Live", "LiveOptions", "MapError",
+    "DtypeError", "EngineError", "Fix", "Frame", "LearnedOptions", "Live", "LiveOptions", "Look", "MapError",
     "MatcherOptions", "MissingExtraError", "Navigator", "NavigatorOptions", "NavigatorState", "NccOptions",
     "NoFix", "OptionError", "OrthoMap", "PoseOptions", "Prior", "Realtime", "Reason", "SceneMatcher", "ShapeError",
     "SiftOptions", "StateError", "TelemetryError", "Timings", "Window", "features", "ncc_fft", "set_realtime",

@@ -15,7 +15,7 @@ from engine.matching.candidates import Candidate
 from engine.matching.evidence import is_beyond_doubt
 from engine.matching.query import Query
 from engine.runtime.scheduler import OutOfTime, Scheduler
-from engine.values import NoFix, Reason, Result
+from engine.values import Look, NoFix, Reason, Result
 
 SHARES = (1.0, 0.5)
 """Of the scale at which features are matched, a level of the map apart; the smaller if time is short."""
@@ -42,6 +42,7 @@ class Rung:
 
     Attributes:
         method: whose answer it gives or improves.
+        name: of the look, for :attr:`.Fix.looks`.
         offers: the variants of its step, the best first, that may change the method's answer so far (None if there
             is none yet); empty if it cannot.
         run: gets the method's answer so far and a variant, and gives the new answer; None leaves the old one.
@@ -49,6 +50,7 @@ class Rung:
     """
 
     method: str
+    name: str
     offers: Callable[[Answer | None], Works]
     run: Callable[[Answer | None, Hashable], Answer | None]
     is_needless: Callable[[Answer, Query], bool] = is_settled
@@ -78,6 +80,8 @@ def climb(query: Query, rungs: Sequence[Rung]) -> dict[str, Answer]:
             if step is not None:
                 with query.scheduler.costed(step, works[step]):
                     looked = rung.run(own, step)
+                nats = looked.evidence.nats if isinstance(looked, Candidate) else None
+                query.looks.append(Look(rung.method, rung.name, nats))
                 if looked is not None and not (is_accepted(own, query) and is_late(looked)):
                     answers[rung.method] = looked
     return answers or {rungs[-1].method: refusals.late(query, rungs[-1].method)}

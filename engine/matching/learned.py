@@ -58,7 +58,7 @@ class Learned(Method):
     def locate(self, query: Query) -> Answer:
         """A fix on the finest level of the map that time allows."""
         works: Works = {(METHOD, share): query.gray.size * self._scale(query, share) ** 2 for share in SHARES}
-        return climb(query, [Rung(METHOD, lambda _: works, partial(self._match, query))])[METHOD]
+        return climb(query, [Rung(METHOD, "matches", lambda _: works, partial(self._match, query))])[METHOD]
 
     def _match(self, query: Query, answer: Answer | None, step: Hashable) -> Answer:
         assert isinstance(step, tuple)

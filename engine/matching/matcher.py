@@ -178,8 +178,8 @@ class SceneMatcher:
         query.scheduler.note_answer()
         if isinstance(result, Fix) and not deadline.met:
             detail = "the answer came after the budget"
-            return query.refuse(Reason.LATE, detail, result.method, window=result.window)
-        return replace(result, timings=query.timings)
+            result = query.refuse(Reason.LATE, detail, result.method, window=result.window)
+        return replace(result, timings=query.timings, looks=tuple(query.looks))
 
     def locate_many(
         self,

@@ -213,13 +213,13 @@ class _Rungs:
         self._ncc, self._query = ncc, query
         self._works, self._frame_px = ncc.works(query), float(query.gray.size)
         self._pictures: dict[int, EnhancedFrame] = {}
-        self.coarsest = Rung(METHOD, self._if_coarse_suffices, self._search_coarsely)
-        self.at_once = Rung(METHOD, self._if_coarse, self._refine_at_once)
-        self.null = Rung(METHOD, self._if_untested, self._test_null)
-        self.levels = Rung(METHOD, self._finer, self._correlate)
-        self.refinement = Rung(METHOD, self._if_unrefined, self._refine)
-        self.structure = Rung(METHOD, self._if_unseen, self._match_structure)
-        self.search = Rung(METHOD, self._if_refused, self._search, is_accepted)
+        self.coarsest = Rung(METHOD, "coarsest level", self._if_coarse_suffices, self._search_coarsely)
+        self.at_once = Rung(METHOD, "pose of coarse peak", self._if_coarse, self._refine_at_once)
+        self.null = Rung(METHOD, "null hypothesis", self._if_untested, self._test_null)
+        self.levels = Rung(METHOD, "peak", self._finer, self._correlate)
+        self.refinement = Rung(METHOD, "pose", self._if_unrefined, self._refine)
+        self.structure = Rung(METHOD, "structure", self._if_unseen, self._match_structure)
+        self.search = Rung(METHOD, "headings and heights", self._if_refused, self._search, is_accepted)
 
     @property
     def by_telemetry(self) -> list[Rung]:

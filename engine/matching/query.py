@@ -17,7 +17,7 @@ from engine.matching.pose import AttitudePrior
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
 from engine.runtime.scheduler import Scheduler
-from engine.values import Attitude, Fix, Frame, GridPose, NoFix, Prior, Reason, Timings, Window
+from engine.values import Attitude, Fix, Frame, GridPose, Look, NoFix, Prior, Reason, Timings, Window
 from engine.window import SPREAD_SIGMAS, level_for, place_window, window_size_px
 
 Array = NDArray[np.float64]
@@ -41,6 +41,7 @@ class Query:
         risk: allowed probability of a wrong fix.
         assumed: errors of telemetry and map, of those that the frame does not state.
         told_height_m: the height that the frame came with, if a search replaced it.
+        looks: what was known after each look so far.
     """
 
     frame: Frame
@@ -53,6 +54,7 @@ class Query:
     risk: float
     assumed: AssumedErrors
     told_height_m: float | None = None
+    looks: list[Look] = field(default_factory=list, repr=False)
 
     @property
     def needed_nats(self) -> float:

@@ -182,10 +182,10 @@ class _Rungs:
         self._sift, self._query = sift, query
         self._few_options = sift.few_options(query)
         self._works = sift.works(query)
-        self.few = Rung(METHOD, self._if_few_suffice, self._by_few)
-        self.all = Rung(METHOD, self._if_few_do_not_suffice, self._by_all)
-        self.refinement = Rung(METHOD, self._if_refinable, self._refine)
-        self.doubted = Rung(METHOD, self._if_unconfirmed, self._by_matches)
+        self.few = Rung(METHOD, "few features", self._if_few_suffice, self._by_few)
+        self.all = Rung(METHOD, "all features", self._if_few_do_not_suffice, self._by_all)
+        self.refinement = Rung(METHOD, "pose", self._if_refinable, self._refine)
+        self.doubted = Rung(METHOD, "all features, tilt doubted", self._if_unconfirmed, self._by_matches)
 
     def _if_few_suffice(self, answer: Answer | None) -> Works:
         """Few features, if time allows all of them as well, or only few."""

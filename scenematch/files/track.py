@@ -58,6 +58,7 @@ class TrackRow:
         heading_sigma_deg: of the heading.
         protection_level_m: radius that contains the vehicle except with a probability of at most 1e-4; None if no
             bound holds.
+        looks: the looks at the frame with the evidence after each, in nats.
         alt_amsl_m: height above mean sea level, which neither file has; an export may know it.
     """
 
@@ -93,6 +94,7 @@ class TrackRow:
     pitch_sigma_deg: float | None = None
     heading_sigma_deg: float | None = None
     protection_level_m: float | None = None
+    looks: str | None = None
     alt_amsl_m: float | None = None
 
     @property
@@ -149,6 +151,7 @@ def track_row(
         latency_ms=latency_ms,
         deadline_met=deadline_met,
         state=state,
+        looks="; ".join(map(str, result.looks)) or None,
     )
     if isinstance(result, NoFix):
         return replace(row, reason=result.reason.value, detail=result.detail or None)

@@ -25,11 +25,11 @@ def told(site, camera, frame, prior, monkeypatch):
             found = climb(query, rungs_of_ncc(self, query)[0])["ncc"]
             moved = {"east_m": found.fix.east_m + off_m, "covariance_m2": 0.01 * np.eye(3), "map_sigma_m": 0.0}
             found = weighed(replace(found, fix=replace(found.fix, stage="fine", **moved)), ncc_nats)
-            return [Rung("ncc", lambda _: {"told": 1.0}, lambda *_: found)], []
+            return [Rung("ncc", "peak", lambda _: {"told": 1.0}, lambda *_: found)], []
 
         def noted(self, query):
             seen.append(weighed(climb(query, rungs_of_sift(self, query))["sift"], sift_nats))
-            return [Rung("sift", lambda _: {"told": 1.0}, lambda *_: seen[0])]
+            return [Rung("sift", "features", lambda _: {"told": 1.0}, lambda *_: seen[0])]
 
         monkeypatch.setattr(Ncc, "rungs", off)
         monkeypatch.setattr(Sift, "rungs", noted)

@@ -17,14 +17,14 @@ from engine.errors import DeviceError, OptionError
 from engine.features import match, sift
 from engine.matching.align import to_gray
 from engine.matching.candidates import PoseCandidate
-from engine.matching.evidence import Evidence, probability
+from engine.matching.evidence import Evidence, needed_nats, probability
 from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.for_reports import Explanation
 from engine.matching.method import Method
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
 from engine.options import MatcherOptions, NccOptions, SiftOptions
-from engine.values import Fix, Frame, GridPose, NoFix, Prior, Reason, Window
+from engine.values import RISK, Fix, Frame, GridPose, NoFix, Prior, Reason, Window
 from scenematch.runs.paper_recipe import RECIPES
 from scenematch.runs.settings import TrackSettings
 from tests.support.fixes import a_fix, px_off, values_of
@@ -74,6 +74,19 @@ def test_a_fix_says_the_same_place_in_every_way(matchers, ground, frame, prior, 
     assert fix.attitude.heading_deg == pytest.approx(25.0, abs=0.5)
     assert fix.attitude.roll_deg == pytest.approx(3.0, abs=0.5)
     assert fix.attitude.pitch_deg == pytest.approx(-2.0, abs=0.5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_looks_say_why_a_frame_was_accepted_or_refused(matchers, ground, camera, frame, prior, method):
+    """The last look's evidence is the fix's probability; no look at another place has enough."""
+    fix = matchers[method].locate(frame, prior)
+    assert {look.method for look in fix.looks} == {method}
+    assert fix.confidence == pytest.approx(probability(fix.looks[-1].nats))
+    assert fix.looks[-1].nats >= needed_nats(RISK)
+    elsewhere = matchers[method].locate(with_telemetry(frame.image[:, ::-1].copy()), prior)
+    assert isinstance(elsewhere, NoFix)
+    assert elsewhere.looks
+    assert all((look.nats or 0.0) < needed_nats(RISK) for look in elsewhere.looks)
 
 
 @pytest.mark.parametrize(
