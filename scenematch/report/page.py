@@ -141,7 +141,7 @@ def _facts(i: int, row: TrackRow, track: FinishedTrack) -> list[tuple[str, str]]
         ("score", None if row.score is None else f"{row.score:.3f}"),
         ("confidence", None if row.confidence is None else f"{row.confidence:.3f}"),
         ("method", f"{row.method or '-'}" + (f", {row.stage}" if row.stage else "")),
-        ("evidence", row.looks),
+        ("evidence, nats", row.looks),
         ("navigator", row.state),
         ("latency", None if row.latency_ms is None else f"{row.latency_ms:.1f} ms"),
     ]
