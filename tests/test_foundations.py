@@ -11,11 +11,10 @@ import pytest
 import torch
 
 import engine.errors
+from engine import NavigatorOptions, set_threads
 from engine.budget import Budget, Deadline
 from engine.errors import DeviceError, DtypeError, EngineError, OptionError, ShapeError, TelemetryError
-from engine.options import NavigatorOptions
 from engine.runtime.device import resolve
-from engine.runtime.threads import set_threads
 from engine.values import Attitude, Fix, Frame, NoFix, Peak, Prior, Timings, Window
 from tests.support.fixes import a_fix
 from tests.support.interpreters import done_by

@@ -15,10 +15,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from engine.camera import Camera
+from engine import Attitude, Camera, LiveOptions, NoFix, Reason, Window
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
-from engine.navigation.live import LiveOptions
-from engine.values import Attitude, NoFix, Reason, Window
 from scenematch import CameraInput, MapInput, RosSettings, run_ros_bridge
 from scenematch.bridges.ros import OUTPUTS, RosBridge
 from scenematch.bridges.ros_in import RosTelemetry, RosTopics

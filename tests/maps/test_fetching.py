@@ -15,9 +15,7 @@ from PIL import Image
 from pyproj import CRS, Transformer
 from rasterio.transform import Affine
 
-from engine import OrthoMap
-from engine.errors import MapError, OptionError
-from engine.values import Window
+from engine import MapError, OptionError, OrthoMap, Window
 from scenematch.fetch import pictures
 from scenematch.fetch.heights import files_for, read_part
 from scenematch.runs.map_fetch import FetchSettings, fetch_map

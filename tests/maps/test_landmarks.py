@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from engine import OrthoMap
+from engine import OrthoMap, Window
 from engine.features import sift
 from engine.maps import landmark_cache, landmarks
 from engine.maps.landmarks import CELL_PX, MAX_PER_CELL, LandmarkMap, as_picture
 from engine.maps.tiles import TILE_PX
 from engine.runtime.device import CPU
-from engine.values import Window
 from tests.support.ground import Ground
 from tests.support.rasters import from_corner, whole, write_raster
 

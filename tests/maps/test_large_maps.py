@@ -11,9 +11,8 @@ from affine import Affine
 from rasterio.enums import Resampling
 from rich.console import Console
 
-from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher
+from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher, Window
 from engine.maps import metric_copy
-from engine.values import Window
 from scenematch.cli import console
 from scenematch.cli.app import run
 from scenematch.runs.inputs import check_start

@@ -14,10 +14,8 @@ from pyproj import Geod, Proj, Transformer
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.warp import calculate_default_transform, reproject
 
-from engine.errors import DtypeError, MapError, OptionError, ShapeError
+from engine import DtypeError, MapError, OptionError, OrthoMap, ShapeError, Window
 from engine.maps.accuracy import GEOREFERENCE_TAG, SLOPE_TAG
-from engine.orthomap import OrthoMap
-from engine.values import Window
 from scenematch.files.geotiff import write_geotiff
 from tests.support.rasters import whole, write_raster
 from tests.support.refusals import refusal

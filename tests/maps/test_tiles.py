@@ -9,10 +9,8 @@ import pytest
 from affine import Affine
 from rasterio.shutil import copy
 
-from engine.errors import MapError
+from engine import MapError, OrthoMap, Window
 from engine.maps.accuracy import GEOREFERENCE_TAG
-from engine.orthomap import OrthoMap
-from engine.values import Window
 from tests.support.rasters import write_raster
 from tests.support.refusals import refusal
 

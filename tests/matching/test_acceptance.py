@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from engine import Camera
-from engine.assumed_errors import AssumedErrors
+from engine import AssumedErrors, Camera
 from engine.matching.covariance import (
     misalignment_covariance_px2,
     ncc_covariance_m2,

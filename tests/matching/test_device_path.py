@@ -8,8 +8,7 @@ import torch
 
 import engine.runtime.device
 from bench.inputs.scenes import flight, town_gray
-from engine import MatcherOptions, SceneMatcher, SiftOptions
-from engine.errors import OptionError
+from engine import MatcherOptions, OptionError, SceneMatcher, SiftOptions
 from engine.features import match, sift
 from engine.ncc_fft import match_template, ncc, prepare, surface
 from engine.runtime.device import on_host, to_device

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
+from engine import Fix, MatcherOptions, NccOptions, NoFix, Prior, SceneMatcher
 from engine.matching import hypothesis_search
-from engine.options import NccOptions
 from engine.window import SPREAD_SIGMAS
 from scenematch.simulator import FlightStyle, SensorNoise, plan_flight
 from tests.support.towns import drawn_flight, drawn_town, site_of

@@ -12,13 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from engine import SceneMatcher
-from engine.budget import Budget
+from engine import Budget, Fix, Frame, MatcherOptions, NoFix, Prior, Reason, SceneMatcher, SiftOptions
 from engine.errors import BackendError, CalibrationError, OptionError
-from engine.options import MatcherOptions, SiftOptions
 from engine.runtime import workers as processes
 from engine.runtime.step_costs import Costs
-from engine.values import Fix, Frame, NoFix, Prior, Reason
 from tests.support.fixes import values_of
 from tests.support.threads import called_at_once
 

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from engine import Camera, OrthoMap, SceneMatcher
-from engine.assumed_errors import AssumedErrors
+from engine import AssumedErrors, Camera, DeviceError, OptionError, OrthoMap, SceneMatcher
 from engine.budget import Budget, Deadline
-from engine.errors import DeviceError, OptionError
 from engine.features import match, sift
 from engine.matching.align import to_gray
 from engine.matching.candidates import PoseCandidate

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from engine import Camera
+from engine import Attitude, Camera
 from engine.geo import enu_from_body
 from engine.matching.align import MAX_FIELD_DEG, SIDE_STEP_PX, ground_bounds_px, orthorectify, view_of
-from engine.values import Attitude
 
 CAMERA = Camera.from_fov(320, 240, 60.0)
 JACOBIAN = np.diag([0.5, -0.5])

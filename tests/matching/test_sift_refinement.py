@@ -6,14 +6,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from engine import Budget, Fix, SceneMatcher
+from engine import Budget, Fix, MatcherOptions, SceneMatcher, SiftOptions
 from engine.budget import Deadline
 from engine.matching import feature_matching
 from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.refinement import Refinement
 from engine.matching.sift import Sift
 from engine.matching.views import drawn_px
-from engine.options import MatcherOptions, SiftOptions
 from tests.matching.test_scheduler import FixedCosts, out_of_time
 
 NADIR = np.array([310.0, 305.0])

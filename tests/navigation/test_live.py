@@ -9,9 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from engine.errors import StateError, TelemetryError
-from engine.navigation.live import Live, LiveOptions
-from engine.options import NavigatorOptions
+from engine import Live, LiveOptions, NavigatorOptions, StateError, TelemetryError
 from engine.values import Fix, Frame, NoFix, Prior, Reason
 from tests.support.fixes import a_fix
 from tests.support.waiting import wait_until

@@ -6,9 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Navigator, NavigatorState, SceneMatcher
-from engine.budget import Budget
-from engine.errors import TelemetryError
+from engine import Budget, Navigator, NavigatorState, SceneMatcher, TelemetryError
 from engine.options import ACCEPT_ALL, MatcherOptions, NavigatorOptions
 from engine.values import Attitude, Fix, NoFix, Prior, Reason
 from tests.support import matchers

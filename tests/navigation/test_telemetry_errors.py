@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine import Camera, Navigator, Prior, SceneMatcher
-from engine.assumed_errors import AssumedErrors
+from engine import AssumedErrors, Attitude, Camera, Fix, Frame, Navigator, Prior, SceneMatcher
 from engine.navigation.telemetry_errors import TelemetryErrors, considered
 from engine.options import ACCEPT_ALL, NavigatorOptions
-from engine.values import Attitude, Fix, Frame
 from scenematch.simulator import plan_flight
 from tests.support.fields import fields_of
 from tests.support.fixes import a_fix

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine import Fix, NoFix, OptionError, OrthoMap, Prior, SceneMatcher
+from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher, Window
 from engine.options import MatcherOptions, NccOptions, SiftOptions
-from engine.values import Reason, Window
 from scenematch import TrackSettings, evaluate
 from scenematch.cli.app import run
 from scenematch.files.settings import changed, nested, options_from_mapping

@@ -19,15 +19,12 @@ import pytest
 from engine import OptionError, SceneMatcher
 from engine.navigation.live import Counts
 from engine.runtime.realtime import _FIFO_CURE, _MEMORY_CURE
+from scenematch import BridgeFiles, FlightFiles, Progress, RosSettings, run_ros_bridge
 from scenematch.bridges.camera_stream import _IDLE_S, _REOPEN_S, _TIMEOUTS
 from scenematch.bridges.ros import RosStatus, RosTopics
 from scenematch.runs import mavlink_bridge, service
-from scenematch.runs.bridge_files import BridgeFiles
-from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
-from scenematch.runs.output import Progress
-from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
 from scenematch.runs.service import _BEATS, running_service, status_reporter
 from tests.support.paths import ROOT
 from tests.support.ros import StandInNode, maker_of

@@ -8,9 +8,8 @@ import pytest
 
 from engine import Attitude, Camera, OptionError
 from scenematch.runs.simulation import WorldSettings
-from scenematch.simulator import Condition, FlightStyle, SensorNoise, build_town, plan_flight
+from scenematch.simulator import LIGHTS, Condition, FlightStyle, SensorNoise, build_town, plan_flight
 from scenematch.simulator.flight import paper_camera
-from scenematch.simulator.light import LIGHTS
 from scenematch.simulator.optics import through_lens
 from scenematch.simulator.render import Atmosphere, render_frame
 from tests.support.patches import CAMERA, ORIGIN, patch_world

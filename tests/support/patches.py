@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from engine.camera import Camera
+from engine import Attitude, Camera
 from engine.geo import LocalFrame, enu_from_body
-from engine.values import Attitude
 from scenematch.simulator import World
 from scenematch.simulator.render import transformer
 

@@ -12,8 +12,7 @@ from affine import Affine
 from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterWindow
 
-from engine import OrthoMap
-from engine.values import Window
+from engine import OrthoMap, Window
 
 
 def whole(site: OrthoMap, level: int = 0) -> Window:
