@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from engine import AssumedErrors, Camera, DeviceError, OptionError, OrthoMap, SceneMatcher
+from engine import AssumedErrors, Camera, OptionError, OrthoMap, SceneMatcher
 from engine.budget import Budget, Deadline
 from engine.features import match, sift
 from engine.matching.align import to_gray
@@ -436,25 +436,7 @@ def test_a_frame_of_another_place_is_refused(mirrored_site, sim_flight, method):
         assert isinstance(matcher.locate(shown, HERE), NoFix)
 
 
-def test_a_map_that_repeats_itself_is_ambiguous(ground, camera):
-    """A chessboard of one picture: every place has its double 100 m away."""
-    tile = ground.gray[:200, :200]
-    site = ground.map_of(np.tile(tile, (4, 4)))
-    image = cv2.resize(np.tile(tile, (4, 4))[250:424, 250:424], (300, 300), interpolation=cv2.INTER_CUBIC)
-    height_m = 150.0 * 174 * site.gsd_m_per_px / (2 * 150 * np.tan(np.pi / 6))
-    result = SceneMatcher(site, camera, "ncc", "cpu").locate(with_telemetry(image, height_m, 0.0, 0.0, 0.0))
-    assert_refused(result, Reason.AMBIGUOUS, "ncc")
-    assert result.score > 0.8
-
-
 # What is wrong is said at once
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-def test_a_device_that_is_missing_is_an_error_and_only_auto_falls_back(ground, camera):
-    with pytest.raises(DeviceError, match=r"^device: cuda was requested"):
-        SceneMatcher(ground.site, camera, device="cuda")
-    assert SceneMatcher(ground.site, camera, device="auto").device.type == "cpu"
 
 
 def test_options_are_refused_by_name(ground, camera):
