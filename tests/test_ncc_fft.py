@@ -190,15 +190,6 @@ def test_a_peak_on_the_border_is_not_refined(place):
     assert not peak.curvature.any()
 
 
-@pytest.mark.parametrize("size", [(1, 1), (3, 3), (1, 8), (12, 10)])
-def test_a_surface_of_one_level_has_a_finite_peak(size):
-    peak = find_peak(torch.full(size, 0.25), exclusion_px=2.0)
-    assert peak.score == 0.25
-    assert np.isfinite([peak.x, peak.y, peak.second_score]).all()
-    assert 0 <= peak.x < size[1]
-    assert 0 <= peak.y < size[0]
-
-
 @pytest.mark.parametrize("size", [(4,), (0, 4), (1, 4, 4)])
 def test_a_peak_needs_a_surface(size):
     with pytest.raises(ShapeError, match=r"^scores: expected \(H, W\) with no empty axis, got "):
