@@ -336,12 +336,6 @@ def test_a_row_that_names_no_picture_is_refused_before_the_flight(folder, save):
     assert "telemetry.csv: line 3, frame: expected one of 3 pictures, 1.png to 10.png, got '4.png'" in message
 
 
-def test_a_video_flight_names_frames_by_index(video, save):
-    flight = open_flight(video, save("timestamp_ns,frame\n0,0\n1,5\n2,10\n"))
-    assert [round(float(item.frame.image.mean()) / 20) for item in flight] == [0, 5, 10]
-    assert flight.unused == 9
-
-
 @pytest.mark.parametrize("name", ["flight.ts", "flight.klv", "GX010001.MP4"])
 def test_metadata_in_a_video_is_refused_with_the_way_out(folder, tmp_path, name):
     """The first bytes are those of a transport stream and of a UAS data link's packet (MISB ST 0601)."""

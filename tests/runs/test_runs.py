@@ -125,11 +125,6 @@ def test_what_is_no_picture_is_not_located(flight, tmp_path):
             scenematch.locate_image(file, flight / "map.tif", camera=flight / "camera.yaml")
 
 
-def test_a_name_that_is_not_public_is_none_of_the_package():
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        scenematch.nothing  # noqa: B018
-
-
 @pytest.mark.slow
 def test_the_library_imports_nothing_optional_and_no_command_line():
     loaded = (

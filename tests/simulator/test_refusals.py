@@ -18,7 +18,6 @@ from tests.support.towns import drawn_town
 LEVEL = Attitude(0.0, 0.0, 0.0)
 BENT = Camera(300, 300, CAMERA.matrix, distortion=np.array([0.1, 0, 0, 0, 0]))
 WIDE = Camera(300, 300, np.array([[60, 0, 149.5], [0, 60, 149.5], [0, 0, 1]]), "equidistant", np.zeros(4))
-SMALL = np.zeros((3, 3), np.float32)
 
 
 POSITIVE = (SensorNoise, FlightStyle)
