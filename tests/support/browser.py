@@ -1,7 +1,5 @@
 """A headless Chromium: what a page does in it, what it asks for, and pictures of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A world of one bright patch on a dark box: where its pixels must lie in a picture is known by other means."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine import Attitude, Camera

@@ -1,7 +1,5 @@
 """Matches with a known pose and matches with none, drawn."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Small rasters in files."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any
