@@ -4,9 +4,7 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +16,7 @@ from engine.runtime import workers as processes
 from engine.runtime.step_costs import Costs
 from tests.support.fixes import values_of
 from tests.support.threads import called_at_once
+from tests.support.waiting import is_running, wait_until
 
 PLACES = [np.array([300.0 + 6.0 * k, 290.0 + 4.0 * (k % 3)]) for k in range(6)]
 
@@ -182,14 +181,4 @@ def test_workers_end_with_their_parent():
         pids = {int(parent.stdout.readline()) for _ in range(12)} - {parent.pid}
         parent.kill()
     assert len(pids) > 1
-    until = time.monotonic() + 10.0
-    while any(Path(f"/proc/{pid}").exists() and "Z" not in _state(pid) for pid in pids):
-        assert time.monotonic() < until
-        time.sleep(0.05)
-
-
-def _state(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().split()[2]
-    except OSError:
-        return "Z"
+    wait_until(lambda: not any(map(is_running, pids)), 10.0)
