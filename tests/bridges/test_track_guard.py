@@ -165,9 +165,7 @@ def test_a_map_that_shifts_back_is_trusted_at_once_whatever_the_estimator_states
 
 
 @pytest.mark.parametrize(("cover_s", "drift_mps2"), [(10.0, 0.2), (20.0, 0.1), (60.0, 0.1)])
-def test_an_estimator_without_fixes_drifts_and_is_right_again_before_it_is_proven_wrong(
-    flight, cover_s, drift_mps2
-):
+def test_an_estimator_without_fixes_drifts_and_is_right_before_it_is_proven_wrong(flight, cover_s, drift_mps2):
     for second in range(round(cover_s)):
         flight.fly(1.0, covered, off_mps=drift_mps2 * second)
     assert all(flight.fly(5.0, noisy(0.3)))

@@ -54,9 +54,7 @@ def prior_of(flight, sigma_m=10.0):
 
 
 @pytest.mark.parametrize("method", ["ncc", "sift"])
-def test_a_frame_is_found_where_the_small_map_has_it_in_a_part_of_the_memory(
-    large_path, small, sim_flight, method
-):
+def test_a_frame_is_found_where_the_small_map_has_it_in_part_of_the_memory(large_path, small, sim_flight, method):
     """The grey levels and validity of the whole would take 578 MB."""
     frame, prior, camera = sim_flight.frames[5], prior_of(sim_flight), sim_flight.camera
     at_home = SceneMatcher(small, camera, method, "cpu").locate(frame, prior)
@@ -96,9 +94,7 @@ def test_what_holds_no_map_is_nodata_and_the_warm_up_finds_a_place_that_does(lar
 # ------------------------------------------------------------------------------------------------- searching
 
 
-def test_without_a_place_to_begin_at_only_a_map_that_is_too_large_is_refused(
-    large, small, sim_flight, monkeypatch
-):
+def test_without_a_place_to_begin_only_a_map_that_is_too_large_is_refused(large, small, sim_flight, monkeypatch):
     check_start(None, small)
     monkeypatch.setattr("engine.orthomap.SEARCH_LIMIT_PX", 1_000_000)
     for method in ("ncc", "sift", "auto"):

@@ -219,9 +219,7 @@ def test_without_a_wide_search_a_height_off_by_two_is_refused(ground, camera, fr
 
 
 @pytest.mark.parametrize(("budget_ms", "looks"), [(50.0, 1), (60_000.0, 4)])
-def test_a_wide_search_is_not_begun_where_the_budget_does_not_hold_it(
-    ground, camera, frame, prior, monkeypatch, budget_ms, looks
-):
+def test_a_wide_search_is_begun_only_if_there_is_time(ground, camera, frame, prior, monkeypatch, budget_ms, looks):
     hypotheses, clock = [], SimpleNamespace(now_ns=0)
     monkeypatch.setattr("engine.matching.matcher.Deadline", partial(Deadline, clock_ns=lambda: clock.now_ns))
 
@@ -246,9 +244,7 @@ def test_a_wide_search_is_not_begun_where_the_budget_does_not_hold_it(
         ([None, 12.0, None, None], 4, 100.0),
     ],
 )
-def test_what_is_found_after_the_telemetry_failed_is_weighed_against_other_places(
-    ground, camera, frame, prior, monkeypatch, found_nats, looks, fixed_at_m
-):
+def test_a_late_place_must_be_surer(ground, camera, frame, prior, monkeypatch, found_nats, looks, fixed_at_m):
     mirrored, tried = np.ascontiguousarray(frame.image[:, ::-1]), []
 
     def look(matcher, hypothesis):

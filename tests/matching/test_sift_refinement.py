@@ -82,9 +82,7 @@ def test_doubtful_few_features_give_way_to_all(ground, camera, matcher, monkeypa
 
 
 @pytest.mark.parametrize("abandoned", [False, True])
-def test_where_refinement_fails_or_is_abandoned_all_features_give_the_pose(
-    ground, camera, matcher, plain, monkeypatch, abandoned
-):
+def test_without_refinement_all_features_give_the_pose(ground, camera, matcher, plain, monkeypatch, abandoned):
     frame, prior = shot(ground, camera), ground.prior(NADIR)
     expected = plain.locate(frame, prior)
     refuse_to_refine(monkeypatch)

@@ -301,9 +301,7 @@ def test_photographs_seconds_apart_are_fixes_with_and_without_positions_of_their
 
 @pytest.mark.parametrize(("off_m", "confirmed", "first"), [(80.0, True, 1), (80.0, False, 20), (3.0, False, 0)])
 @pytest.mark.parametrize("stage", ["coarse", "unconfirmed"])
-def test_an_attitude_that_nothing_confirmed_is_believed_only_where_the_start_predicts(
-    stage, off_m, confirmed, first
-):
+def test_an_attitude_that_nothing_confirmed_is_believed_where_the_start_predicts(stage, off_m, confirmed, first):
     """Its error moves all matches alike, however many: they agree with each other, and not with the start."""
     fixes = [replace(fix_at(off_m + 1.4 * k), stage="fine" if confirmed else stage) for k in range(20)]
     start = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0)

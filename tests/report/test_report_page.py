@@ -309,9 +309,7 @@ def test_seconds_and_numbers_of_frames_are_not_drawn_over_one_axis(flown, tmp_pa
     assert "Stated sigma (m)" not in mixed.read_text(encoding="utf-8")
 
 
-def test_a_page_for_a_folder_that_is_not_there_is_refused_before_anything_is_drawn(
-    flown, tmp_path, monkeypatch, capsys
-):
+def test_a_page_for_no_folder_is_refused_before_anything_is_drawn(flown, tmp_path, monkeypatch, capsys):
     other = shutil.copytree(flown, tmp_path / "other")
     monkeypatch.setattr("scenematch.runs.evaluation.draw_together", lambda *_, **__: pytest.fail("drawn"))
     page = tmp_path / "nofolder" / "x.html"

@@ -128,9 +128,7 @@ def test_a_manager_that_does_not_read_stops_nobody(manager):
     assert time.monotonic() - begin_s < 60.0
 
 
-def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog(
-    manager, flight_in, tmp_path, monkeypatch
-):
+def test_a_bridge_with_an_open_link_is_ready_and_feeds_the_watchdog(manager, flight_in, tmp_path, monkeypatch):
     monkeypatch.setenv("WATCHDOG_USEC", "800000")  # no more beats than the socket's queue holds
     monkeypatch.setattr(mavlink_bridge, "end_on_sigterm", lambda: None)
     monkeypatch.setattr(mavlink_bridge, "_AUTOPILOT_TIMEOUT_S", 0.5)
