@@ -11,7 +11,6 @@ ROS = ["bridge", "ros", "--map=m.tif"]
 IN_REAL_TIME = [[*command, "--settings=bridge.realtime=true"] for command in (PLAYED, ROS)]
 NO_ORIGIN = ["--settings=mavlink.set_origin=false", "--settings=mavlink.origin_alt_m=3"]
 SIMULATE = ["simulate", "--out=o"]
-LOOP = [*SIMULATE, "--closed-loop"]
 TRACK = ["track", "--map=m.tif", "--camera=c.yaml", "--frames=f", "--out=o"]
 CHECK = ["check", "--map=m.tif", "--camera=c.yaml", "--frames=f"]
 LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
@@ -42,7 +41,7 @@ LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
         ([*SIMULATE, "--map=m.tif"], "--relief-m", "5"),
         (SIMULATE, "--condition", "eclipse"),
         *(
-            (LOOP, f"--{name}", value)
+            ([*SIMULATE, "--closed-loop"], f"--{name}", value)
             for name, value in (
                 ("fault", "lost"),
                 ("method", "orb"),

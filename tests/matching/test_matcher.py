@@ -28,7 +28,6 @@ from tests.support.matches import pairs_of
 
 METHODS = ("ncc", "sift")
 NADIR = np.array([315.0, 296.0])
-HERE = Prior(east_m=0.0, north_m=0.0, sigma_m=10.0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -429,7 +428,7 @@ def test_an_answer_after_the_budget_is_late(matchers, frame, prior, method):
 def test_a_frame_of_another_place_is_refused(mirrored_site, sim_flight, method):
     matcher = SceneMatcher(mirrored_site, sim_flight.camera, method, "cpu")
     for shown in sim_flight.frames[:3]:
-        assert isinstance(matcher.locate(shown, HERE), NoFix)
+        assert isinstance(matcher.locate(shown, Prior(east_m=0.0, north_m=0.0, sigma_m=10.0)), NoFix)
 
 
 # What is wrong is said at once

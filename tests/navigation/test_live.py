@@ -14,12 +14,9 @@ from engine.values import Fix, Frame, NoFix, Prior, Reason
 from tests.support.fixes import a_fix
 from tests.support.waiting import wait_until
 
-IMAGE = np.zeros((4, 4), np.uint8)
-OPTIONS = NavigatorOptions(max_speed_mps=16.0)
-
 
 def frame(number: int) -> Frame:
-    return Frame(IMAGE, number)
+    return Frame(np.zeros((4, 4), np.uint8), number)
 
 
 def fix(of: Frame) -> Fix:
@@ -41,7 +38,7 @@ class Navigators:
         if callable(odd):
             odd()
             odd = {}
-        return SimpleNamespace(update=partial(self.update, odd), options=OPTIONS)
+        return SimpleNamespace(update=partial(self.update, odd), options=NavigatorOptions(max_speed_mps=16.0))
 
     def update(self, odd, frame, prior=None, budget=None):
         self.budgets.append(budget.total_ms)

@@ -20,9 +20,6 @@ BENT = Camera(300, 300, CAMERA.matrix, distortion=np.array([0.1, 0, 0, 0, 0]))
 WIDE = Camera(300, 300, np.array([[60, 0, 149.5], [0, 60, 149.5], [0, 0, 1]]), "equidistant", np.zeros(4))
 
 
-POSITIVE = (SensorNoise, FlightStyle)
-
-
 def numbers_of(kind):
     """Names of the fields that hold a number."""
     return [name for name, field in kind.__dataclass_fields__.items() if isinstance(field.default, int | float)]
@@ -59,7 +56,7 @@ def seen(height_agl_m=150.0, attitude=LEVEL, camera=CAMERA):
         (lambda: plan_flight(town=drawn_town(), style=FlightStyle(height_agl_m=400.0)),
          "town: expected a map larger"),
         *((partial(kind, **{name: value}), name)
-          for kind in POSITIVE for name in numbers_of(kind) for value in (-1.0, math.nan)),
+          for kind in (SensorNoise, FlightStyle) for name in numbers_of(kind) for value in (-1.0, math.nan)),
     ],
 )  # fmt: skip
 def test_an_option_that_cannot_be_is_refused(make, words):
