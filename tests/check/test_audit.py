@@ -312,9 +312,8 @@ def test_the_corridor_is_of_what_the_camera_sees_not_of_where_it_flies(town):
 def test_both_parts_are_looked_at(town):
     place, route = around(town, [200, 200], 50.0), lat_lon(town, [[500, 700], [800, 700]])
     both = plan_audit(town, CAMERA, HEIGHT_M, part=MapPart(around=place, route=route))
-    one, other = (
-        plan_audit(town, CAMERA, HEIGHT_M, part=part) for part in (MapPart(around=place), MapPart(route=route))
-    )
+    parts = MapPart(around=place), MapPart(route=route)
+    one, other = (plan_audit(town, CAMERA, HEIGHT_M, part=part) for part in parts)
     assert len(both) == pytest.approx(len(one) + len(other), rel=0.15)
 
 

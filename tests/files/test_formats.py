@@ -75,13 +75,7 @@ def test_telemetry_round_trip(tmp_path):
     """With values at the ends of their ranges, unknown cells, stamps before 1970 and a name that needs quotes."""
     path, second = tmp_path / "telemetry.csv", 10**9
     known = {name: 1.25 + k for k, name in enumerate(BOUNDS)}
-    ends = {
-        "heading_deg": 359.9,
-        "roll_deg": -180.0,
-        "pitch_deg": 90.0,
-        "lat_deg": -90.0,
-        "lon_deg": 179.123456789,
-    }
+    ends = {"heading_deg": 359.9, "roll_deg": -180, "pitch_deg": 90, "lat_deg": -90, "lon_deg": 179.123456789}
     rows = [
         TelemetryRow(timestamp_ns=-(2**62) // second * second, frame='a,"b".jpg', **known),
         TelemetryRow(timestamp_ns=-second, frame="b.jpg"),

@@ -165,9 +165,7 @@ def test_normal_equations_are_those_of_the_weighted_least_squares(samples):
 def test_sums_for_the_covariance_are_those_of_the_definition(samples):
     shown, expected, points, offset_m, rotation, weights, differences, cells = samples
     one, two = (rows(g, points, offset_m, rotation) for g in (shown, expected))
-    own, common, of_map, by_cell = information(
-        shown, expected, points, offset_m, rotation, weights, differences, cells
-    )
+    own, common, of_map, by_cell = information(*samples)
     for found, a, b in ((own, one, one), (common, one, two), (of_map, two, two)):
         right = (a.T * weights) @ b
         np.testing.assert_allclose(found, 0.5 * (right + right.T), rtol=1e-10, atol=1e-9)

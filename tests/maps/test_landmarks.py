@@ -122,9 +122,7 @@ def test_memory_is_bounded_and_what_was_given_up_comes_back_the_same(site, marks
     small = LandmarkMap(site, CPU)
     windows = [Window(x, y, 80, 80) for y in (20, 300, 470) for x in (20, 300, 510)]
     for window in [*windows, *windows]:
-        np.testing.assert_array_equal(
-            table(small.find(window, 0, upright=True)), table(marks.find(window, 0, upright=True))
-        )
+        np.testing.assert_array_equal(*(table(one.find(window, 0, upright=True)) for one in (small, marks)))
         kept = [len(tile["rank"]) for tile in small.tiles.values()]
         assert sum(kept) <= 700 or len(kept) == len(small._keys(window, 0, True))
 

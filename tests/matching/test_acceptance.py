@@ -96,7 +96,6 @@ def errors_for(frame, **assumed):
 
 def test_half_a_degree_of_tilt_is_1_3_metres_at_150():
     covariance = errors_for(GridPose(150.0, 0.0, 0.0, 0.0), tilt_deg=0.5, map_m=0.3)
-    assert 150.0 * math.tan(math.radians(0.5)) == pytest.approx(1.309, abs=1e-3)
     # A level camera: the axis meets the ground below, whatever the height and the heading.
     np.testing.assert_allclose(np.diag(covariance)[:2], 1.309**2 + 0.3**2, rtol=1e-3)
     assert covariance[2, 2] == pytest.approx(0.5**2 + 1.5**2)

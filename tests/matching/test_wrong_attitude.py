@@ -85,9 +85,8 @@ def test_an_unconfirmed_pose_by_features_rests_on_no_told_tilt(ground, matchers,
 def test_over_a_map_alone_a_camera_that_says_it_is_level_gives_no_wrong_fix(ground, camera, method, pitch_deg):
     """Taken for a slope of the ground, its tilt would move the fix by 16 to 32 m."""
     frame = replace(ground.frame(camera, NADIR, 150.0, pitch_deg=pitch_deg), pitch_deg=0.0)
-    result = SceneMatcher(ground.map_of(georeference_sigma_m=0.1), camera, method, "cpu").locate(
-        frame, ground.prior(NADIR)
-    )
+    matcher = SceneMatcher(ground.map_of(georeference_sigma_m=0.1), camera, method, "cpu")
+    result = matcher.locate(frame, ground.prior(NADIR))
     assert isinstance(result, NoFix) or ground.chi_square(result, NADIR) < 9.0
 
 

@@ -28,15 +28,8 @@ def fix_at(east_m, north_m=0.0, confidence=0.9999, sigma_m=1.0):
 
 def a_track(velocity=(0.0, 0.0), covariance=((4.0, 1.0), (1.0, 2.0)), **known):
     """A track whose position is the filtered one, with their covariance to the velocity."""
-    usual = {
-        "en_m": np.zeros(2),
-        "support": 20.0,
-        "trusts_velocity": True,
-        "number": 0,
-        "fix": fix_at(0.0),
-        "misses": 0,
-    }
-    usual |= {"filtered_m": known.get("en_m", np.zeros(2)), "velocity_mps": np.array(velocity, float)}
+    usual = {"en_m": np.zeros(2), "support": 20.0, "trusts_velocity": True, "number": 0, "fix": fix_at(0.0)}
+    usual |= {"misses": 0, "filtered_m": known.get("en_m", np.zeros(2)), "velocity_mps": np.array(velocity, float)}
     return Track(covariance=np.array(covariance)[np.ix_([0, 0, 1], [0, 0, 1])], **(usual | known))
 
 
@@ -141,9 +134,8 @@ def test_a_covariance_stays_one_whatever_happens(legs):
 
 def test_a_way_in_two_parts_is_the_whole_way():
     begin, between, end = np.array([[4.0, 0.0], [4.6, 0.6], [6.0, 2.0]])
-    whole = a_track(velocity=(3.0, 1.0)).carried(
-        Ways(2.0, told=Step(np.array([10.0, 0.0]), begin, end, 0.5, 0.3)), OPTIONS
-    )
+    way = Ways(2.0, told=Step(np.array([10.0, 0.0]), begin, end, 0.5, 0.3))
+    whole = a_track(velocity=(3.0, 1.0)).carried(way, OPTIONS)
     parts = a_track(velocity=(3.0, 1.0))
     parts = parts.carried(Ways(0.6, told=Step(np.array([3.0, 0.0]), begin, between, 0.5, 0.09)), OPTIONS)
     parts = parts.carried(Ways(1.4, told=Step(np.array([7.0, 0.0]), between, end, 0.5, 0.21)), OPTIONS)
@@ -240,9 +232,8 @@ def test_tracks_that_share_their_newest_match_are_one_account():
 
 def test_another_source_speaks_for_or_against_a_new_place_by_its_reliability():
     """It is right 99 times in 100; where it is wrong, it says nothing."""
-    at_odds = [
-        match(fix_at(0.0, confidence=0.9), given=PositionEstimate(np.array([e, 0.0]), 3.0)) for e in (0.0, 500.0)
-    ]
+    places = (PositionEstimate(np.array([east_m, 0.0]), 3.0) for east_m in (0.0, 500.0))
+    at_odds = [match(fix_at(0.0, confidence=0.9), given=place) for place in places]
     assert at_odds[0].support > nats_of(0.9) + 3.0
     assert at_odds[1].support == pytest.approx(nats_of(0.9) + math.log(0.01))
     vague = PositionEstimate(np.zeros(2), 500.0)

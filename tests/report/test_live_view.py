@@ -275,7 +275,7 @@ def test_what_cannot_be_watched_is_refused_in_one_line_before_any_work(tmp_path,
 def test_the_viewer_draws_it_without_a_complaint(runs, tmp_path):
     picture = tmp_path / "view.png"
     recording = runs / "ncc.rrd"
-    with browser.serve_recording(recording) as address, browser.open_browser(browser.SOFTWARE_GL) as page:
+    with browser.serve_recording(recording) as address, browser.open_browser(browser.WITH_GL) as page:
         page.open(address, 1200, 800)
         page.wait_until_still()
         page.save(picture)

@@ -127,9 +127,7 @@ def test_what_is_no_picture_is_not_located(flight, tmp_path):
 
 @pytest.mark.slow
 def test_the_library_imports_nothing_optional_and_no_command_line():
-    loaded = (
-        "print(*[name for name in sys.modules if name.partition('.')[0] in wanted or 'scenematch.cli' in name])"
-    )
+    loaded = "print(*[n for n in sys.modules if n.partition('.')[0] in wanted or 'scenematch.cli' in n])"
     script = (
         "import sys; from scenematch import *; wanted = "
         "{'rerun', 'pymavlink', 'serial', 'rospy', 'rclpy', 'rosbags', 'pyulog', 'rich', 'typer'}; "
@@ -163,9 +161,8 @@ def test_a_missing_extra_is_always_the_same_error(module, package, extra, use, t
     with pytest.raises(MissingExtraError) as caught:
         use(tmp_path)
     assert isinstance(caught.value, BackendError)
-    assert str(caught.value) == (
-        f"expected {package} to be installed, got none: pip install 'scenematch-engine[{extra}]'"
-    )
+    cure = f"pip install 'scenematch-engine[{extra}]'"
+    assert str(caught.value) == f"expected {package} to be installed, got none: {cure}"
 
 
 @pytest.mark.parametrize("is_wrong", [True, False])

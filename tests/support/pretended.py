@@ -117,9 +117,8 @@ class Crossings(TorchDispatchMode):
                 self.uploads += [t.numel() for t in uploaded]
                 others = [t for t in others if all(t is not u for u in uploaded)]
         if mine and others:
-            raise RuntimeError(
-                f"{func}: expected all tensors on one device, got {[t.shape for t in others]} on cpu"
-            )
+            shapes = [t.shape for t in others]
+            raise RuntimeError(f"{func}: expected all tensors on one device, got {shapes} on cpu")
 
 
 # Arguments and results of an operation are tensors, numbers, and lists, tuples and dictionaries of them: the trees
