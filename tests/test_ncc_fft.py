@@ -15,15 +15,8 @@ from engine.ncc_fft import find_peak, ncc
 from tests.support.refusals import refusal
 
 MODES = {True: cv2.TM_CCOEFF_NORMED, False: cv2.TM_CCORR_NORMED}
-LEVELS = {
-    "uint8": (0, 256),
-    "int16": (-3000, 3000),
-    "uint16": (0, 65536),
-    "int32": (-100_000, 100_000),
-    "float16": (-50, 200),
-    "float32": (-50, 200),
-    "float64": (-50, 200),
-}
+LEVELS = {"uint8": (0, 256), "int16": (-3000, 3000), "uint16": (0, 65536), "int32": (-100_000, 100_000)}
+LEVELS |= dict.fromkeys(("float16", "float32", "float64"), (-50, 200))
 SIZES = [
     ((31, 47), (7, 11)),  # odd, prime
     ((64, 64), (16, 16)),

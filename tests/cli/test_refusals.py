@@ -11,6 +11,7 @@ ROS = ["bridge", "ros", "--map=m.tif"]
 IN_REAL_TIME = [[*command, "--settings=bridge.realtime=true"] for command in (PLAYED, ROS)]
 NO_ORIGIN = ["--settings=mavlink.set_origin=false", "--settings=mavlink.origin_alt_m=3"]
 SIMULATE = ["simulate", "--out=o"]
+LOOP = [*SIMULATE, "--closed-loop"]
 TRACK = ["track", "--map=m.tif", "--camera=c.yaml", "--frames=f", "--out=o"]
 CHECK = ["check", "--map=m.tif", "--camera=c.yaml", "--frames=f"]
 LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
@@ -40,16 +41,9 @@ LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
         ([*SIMULATE, "--map=m.tif"], "--relief-m", "5"),
         (SIMULATE, "--condition", "eclipse"),
-        *(
-            ([*SIMULATE, "--closed-loop"], f"--{name}", value)
-            for name, value in (
-                ("fault", "lost"),
-                ("method", "orb"),
-                ("minutes", "0"),
-                ("frames", "3"),
-                ("camera-pitch-deg", "-45"),
-            )
-        ),
+        *((LOOP, f"--{name}", value) for name, value in (("fault", "lost"), ("method", "orb"), ("minutes", "0"))),
+        (LOOP, "--frames", "3"),
+        (LOOP, "--camera-pitch-deg", "-45"),
         *((command, "--device", "gpu") for command in (PLAYED, ROS, TRACK, LOCATE)),
         (PLAYED, "--firmware", "x"),
         *((PLAYED, "--connect", value) for value in ("nonsense", "udpin:0.0.0.0:14550")),

@@ -380,17 +380,10 @@ def test_geotiff_refuses_what_it_cannot_write(tmp_path, name, crs):
 
 # ---------------------------------------------------------------------------------------------------- track
 
-FIX = a_fix(
-    timestamp_ns=107_802_500_000,
-    lat_deg=32.7931868031,
-    lon_deg=34.9888531542,
-    east_m=-12.34567,
-    north_m=0.00004,
-    covariance_m2=np.array([[4.0, -0.5, 0.0], [-0.5, 2.25, 0.0], [0.0, 0.0, 9.0]]),
-    score=0.87654321,
-    window=Window(3, 4, 420, 415),
-    map_xy_px=(1.0, 2.0),
-)
+PLACE = {"lat_deg": 32.7931868031, "lon_deg": 34.9888531542, "east_m": -12.34567, "north_m": 0.00004}
+COVARIANCE_M2 = np.array([[4.0, -0.5, 0.0], [-0.5, 2.25, 0.0], [0.0, 0.0, 9.0]])
+SEEN = {"timestamp_ns": 107_802_500_000, "score": 0.87654321, "window": Window(3, 4, 420, 415)}
+FIX = a_fix(**PLACE, **SEEN, covariance_m2=COVARIANCE_M2)
 REFUSAL = NoFix(reason=Reason.AMBIGUOUS, timestamp_ns=None, method="sift", score=-0.00001)
 
 

@@ -266,12 +266,8 @@ def test_a_copy_says_how_far_it_is_and_one_that_is_there_says_nothing(opened, ti
 
 def test_what_a_copy_is_padded_by_is_no_nodata(tmp_path, tiny_limits):
     """Tiles of a GeoTIFF have sides of 16 pixels, and a copy's overviews halve them."""
-    path = write_raster(
-        tmp_path / "map.tif",
-        np.full((300, 301), 90, np.uint8),
-        crs=UTM,
-        transform=Affine(1, 0, 607400, 0, -1, 5345369),
-    )
+    corner = Affine(1, 0, 607400, 0, -1, 5345369)
+    path = write_raster(tmp_path / "map.tif", np.full((300, 301), 90, np.uint8), crs=UTM, transform=corner)
     site = OrthoMap.open(path, cache_dir=tmp_path / "cache")
     assert site.info()["source_nodata_share"] == site.info()["nodata_share"] == 0.0
 

@@ -230,12 +230,8 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
         from scenematch.bridges.links import Connection
         from scenematch.bridges.parameters import MavlinkOptions
 
-        made = mavlink.MavlinkBridge(
-            Connection("udpin", "127.0.0.1", 0),
-            quiet,
-            MavlinkOptions(),
-            watch=lambda answer, _: stated.append(answer),
-        )
+        link, options = Connection("udpin", "127.0.0.1", 0), MavlinkOptions()
+        made = mavlink.MavlinkBridge(link, quiet, options, watch=lambda answer, _: stated.append(answer))
     else:
         made = RosBridge(StandInNode(maker_of("ros2")), sim_site, quiet, RosOptions(), watch=stated.append)
     made.deliver(answer)

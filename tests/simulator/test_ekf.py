@@ -37,17 +37,10 @@ SAMPLE = IdealImu(np.array([0.4, -0.3, -9.6]), np.array([0.2, -0.1, 0.3]))
 def some_belief() -> FilterState:
     rng = np.random.default_rng(2)
     spread = rng.normal(0.0, 0.3, (STATES, STATES))
-    return FilterState(
-        4.0,
-        np.array([10.0, -5.0, 120.0]),
-        np.array([6.0, 2.0, -0.5]),
-        enu_from_body(4.0, -9.0, 130.0),
-        np.array([0.05, -0.02, 0.03]),
-        np.array([0.001, 0.002, -0.001]),
-        0.4,
-        0.02,
-        spread @ spread.T + 0.01 * np.eye(STATES),
-    )
+    place_m, velocity_mps = np.array([10.0, -5.0, 120.0]), np.array([6.0, 2.0, -0.5])
+    biases = np.array([0.05, -0.02, 0.03]), np.array([0.001, 0.002, -0.001]), 0.4, 0.02
+    covariance = spread @ spread.T + 0.01 * np.eye(STATES)
+    return FilterState(4.0, place_m, velocity_mps, enu_from_body(4.0, -9.0, 130.0), *biases, covariance)
 
 
 def moved(estimate: FilterState, error: np.ndarray) -> FilterState:
