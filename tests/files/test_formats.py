@@ -10,17 +10,11 @@ from PIL import Image
 
 from engine import CalibrationError, Camera, MapError
 from engine.values import NoFix, Prior, Reason, Truth, Window
+from scenematch.files import telemetry as telemetry_files
 from scenematch.files.flight import open_flight
 from scenematch.files.frames import open_frames, read_image
 from scenematch.files.geotiff import write_geotiff
-from scenematch.files.telemetry import (
-    BOUNDS,
-    DEFAULT_PRIOR_SIGMA_M,
-    TelemetryRow,
-    ground_amsl_m,
-    read_telemetry,
-    write_telemetry,
-)
+from scenematch.files.telemetry import BOUNDS, DEFAULT_PRIOR_SIGMA_M, TelemetryRow, read_telemetry, write_telemetry
 from scenematch.files.track import COLUMNS, NOTE_COLUMNS, TrackRow, read_track, track_row, write_track
 from scenematch.files.truth import interpolate_truth, read_truth, write_truth
 from tests.support.fixes import a_fix
@@ -144,8 +138,8 @@ def test_missing_telemetry_and_a_folder_in_its_place_are_refused(tmp_path):
 def test_ground_is_the_median_difference_of_the_two_heights():
     pairs = [(200.0, 150.0), (210.0, 159.0), (300.0, 100.0), (None, 5.0), (5.0, None)]
     rows = [TelemetryRow(timestamp_ns=0, frame="a", alt_amsl_m=a, height_agl_m=h) for a, h in pairs]
-    assert ground_amsl_m(rows) == 51.0
-    assert ground_amsl_m(rows[3:]) is None
+    assert telemetry_files.ground_amsl_m(rows) == 51.0
+    assert telemetry_files.ground_amsl_m(rows[3:]) is None
 
 
 # ---------------------------------------------------------------------------------------------------- truth

@@ -10,12 +10,8 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from engine import AssumedErrors, Camera
-from engine.matching.covariance import (
-    misalignment_covariance_px2,
-    ncc_covariance_m2,
-    peak_covariance_px,
-    score_sigma,
-)
+from engine.matching import covariance as covariances
+from engine.matching.covariance import misalignment_covariance_px2, peak_covariance_px, score_sigma
 from engine.ncc_fft import find_peak, ncc
 from engine.values import GridPose, Peak
 
@@ -91,7 +87,8 @@ def test_the_covariance_of_a_peak_is_what_white_noise_does():
 
 
 def errors_for(frame, **assumed):
-    return ncc_covariance_m2(1e-12 * np.eye(2), frame, CAMERA, 0.5 * np.eye(2), AssumedErrors(**assumed))
+    errors = AssumedErrors(**assumed)
+    return covariances.ncc_covariance_m2(1e-12 * np.eye(2), frame, CAMERA, 0.5 * np.eye(2), errors)
 
 
 def test_half_a_degree_of_tilt_is_1_3_metres_at_150():

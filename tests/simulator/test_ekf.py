@@ -9,18 +9,9 @@ import pytest
 
 from engine import Attitude, StateError
 from engine.geo import enu_from_body
-from scenematch.simulator import ekf
+from scenematch.simulator import ekf, quadrotor
 from scenematch.simulator.ekf import STATES, FilterState, History, fuse_fix, fuse_heading, fuse_height
-from scenematch.simulator.quadrotor import (
-    STEP_S,
-    IdealImu,
-    WindField,
-    advance,
-    hovering,
-    rotation,
-    rotation_vector,
-    shaken,
-)
+from scenematch.simulator.quadrotor import STEP_S, IdealImu, WindField, advance, hovering, rotation_vector, shaken
 from scenematch.simulator.sensors import Instruments, SensorSuite
 from tests.support.fixes import a_fix
 
@@ -46,7 +37,7 @@ def some_belief() -> FilterState:
 def moved(estimate: FilterState, error: np.ndarray) -> FilterState:
     """The truth where the estimate is off by an error."""
     sums = {name: getattr(estimate, name) + error[part] for name, part in ADDITIVE.items()}
-    return replace(estimate, enu_from_body=rotation(error[ekf.TURN]) @ estimate.enu_from_body, **sums)
+    return replace(estimate, enu_from_body=quadrotor.rotation(error[ekf.TURN]) @ estimate.enu_from_body, **sums)
 
 
 def apart(truth: FilterState, estimate: FilterState) -> np.ndarray:
