@@ -12,12 +12,8 @@ from engine.errors import CalibrationError
 K = [500.0, 0.0, 319.5, 0.0, 505.0, 239.5, 0.0, 0.0, 1.0]
 PLUMB_BOB = [-0.28, 0.09, 0.0007, -0.0004, -0.01]
 FISHEYE = [0.03, -0.012, 0.004, -0.001]
-LENSES = {
-    "plumb_bob": PLUMB_BOB,
-    "rational_polynomial": [0.2, 0.05, 0.0005, -0.0003, 0.01, 0.45, 0.1, 0.02],
-    "equidistant": FISHEYE,
-    "fisheye": FISHEYE,
-}
+RATIONAL = [0.2, 0.05, 0.0005, -0.0003, 0.01, 0.45, 0.1, 0.02]
+LENSES = {"plumb_bob": PLUMB_BOB, "rational_polynomial": RATIONAL, "equidistant": FISHEYE, "fisheye": FISHEYE}
 
 
 def camera(model="plumb_bob", distortion=PLUMB_BOB):

@@ -20,12 +20,8 @@ SIDES = st.integers(1, 40) | st.sampled_from([63, 64, 65, 96, 97, 127])
 
 def reference_scores(search, templates, zero_mean=True):
     """Scores (B, T, Y, X) in float64 of windows (B, H, W) and templates (B, T, h, w)."""
-    return np.stack(
-        [
-            [reference.ncc_surface(window, template, zero_mean=zero_mean) for template in hypotheses]
-            for window, hypotheses in zip(search, templates, strict=True)
-        ]
-    )
+    pairs = zip(search, templates, strict=True)
+    return np.stack([[reference.ncc_surface(window, t, zero_mean=zero_mean) for t in of] for window, of in pairs])
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)

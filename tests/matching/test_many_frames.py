@@ -30,10 +30,8 @@ def _started_at_once(monkeypatch):
 @pytest.fixture(scope="module")
 def questions(ground, camera):
     """Frames with their priors: places in a row, ways to be refused, and a search of the map."""
-    frames = [
-        ground.frame(camera, nadir, heading_deg=20.0 * k, roll_deg=2.0, pitch_deg=-1.0, timestamp_ns=k)
-        for k, nadir in enumerate(PLACES)
-    ]
+    angles = [{"heading_deg": 20.0 * k, "roll_deg": 2.0, "pitch_deg": -1.0} for k in range(len(PLACES))]
+    frames = [ground.frame(camera, nadir, timestamp_ns=k, **angles[k]) for k, nadir in enumerate(PLACES)]
     priors = [ground.prior(nadir) for nadir in PLACES]
     flat = Frame(np.full((300, 300), 90, np.uint8), 100, 150.0, 0.0, 0.0, 0.0)
     frames += [flat, replace(frames[0], height_agl_m=None), frames[1], frames[2]]

@@ -109,10 +109,8 @@ def test_a_prior_is_the_same_in_metres_or_in_degrees_of_either_longitude(matcher
 def test_torch_and_numpy_images_agree_and_so_do_colours_and_their_luma(matchers, frame, prior, method):
     colour = np.dstack([frame.image, frame.image, frame.image[::-1]])
     for image in (colour, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)):
-        results = [
-            matchers[method].locate(with_telemetry(picture), prior)
-            for picture in (image, torch.from_numpy(image), np.asfortranarray(image), colour)
-        ]
+        pictures = image, torch.from_numpy(image), np.asfortranarray(image), colour
+        results = [matchers[method].locate(with_telemetry(picture), prior) for picture in pictures]
         assert px_off(results[0], NADIR) < 0.3
         assert all(values_of(result) == values_of(results[0]) for result in results)
 
