@@ -133,8 +133,3 @@ def test_the_covariance_of_angles_is_that_of_small_turns_about_the_body(angles):
     turn = enu_from_body(*angles)
     about_enu = geo.enu_turn_covariance_rad2(covariance, angles)
     assert about_enu == pytest.approx(turn @ root @ root.T @ turn.T, rel=1e-9, abs=1e-15)
-
-
-@given(covariance=arrays(np.float64, (2, 2), elements=st.floats(-1e3, 1e3)).map(lambda a: a @ a.T))
-def test_the_longer_axis_is_the_larger_eigenvalue(covariance):
-    assert geo.larger_variance(covariance) == pytest.approx(np.linalg.eigvalsh(covariance)[-1], rel=1e-9, abs=1e-9)
