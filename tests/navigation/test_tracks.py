@@ -145,11 +145,6 @@ def test_a_way_in_two_parts_is_the_whole_way():
     assert parts.support == pytest.approx(whole.support)
 
 
-def test_past_evidence_fades_to_that_of_one_match():
-    for support, later in ((CERTAIN + 100.0, CERTAIN + 100.0 / math.e), (CERTAIN - 1.0, CERTAIN - 1.0)):
-        assert a_track(support=support).carried(Ways(OPTIONS.memory_s), OPTIONS).support == pytest.approx(later)
-
-
 # Bayes' rule
 
 
@@ -195,13 +190,6 @@ def test_of_two_motions_the_better_one_gains_whatever_the_ground():
     assert first.log_odds - second.log_odds == pytest.approx(math.log(16.0 / 4.0))
 
 
-def test_neither_motion_becomes_improbable_for_good():
-    told = a_track(support=500.0)
-    free = replace(told, trusts_velocity=False, support=20.0)
-    known = tracks_of(told, free).weighed(match(fix_at(500.0))).tracks.known[:2]
-    assert [each.log_odds for each in known] == pytest.approx([500.0 - MISS, 500.0 - MISS - CERTAIN])
-
-
 def test_a_frame_without_a_match_leaves_half_of_the_past_evidence():
     (known, *_) = tracks_of(a_track(support=CERTAIN + 100.0)).missed().known
     assert known.log_odds == pytest.approx(CERTAIN + 50.0 - MISS)
@@ -222,12 +210,6 @@ def test_a_match_belongs_to_the_account_that_predicts_it_best():
     weighed = tracks_of(vague, rival).weighed(match(fix_at(50.0)))
     assert weighed.number == 1
     assert [each.misses for each in weighed.tracks.known if each.number == 0] == [1, 1]
-
-
-def test_tracks_that_share_their_newest_match_are_one_account():
-    fix = fix_at(5.0)
-    twice = [replace(a_track(support=odds), fix=fix) for odds in (30.0, 20.0)]
-    assert [each.trusts_velocity for each in tracks_of(*twice).missed().known] == [True, False]
 
 
 def test_another_source_speaks_for_or_against_a_new_place_by_its_reliability():
