@@ -124,9 +124,8 @@ def centroid(site, xy):
 @pytest.mark.parametrize("crs", [UTM, "EPSG:4326", "EPSG:3857", "rotated"])
 def test_features_lie_in_one_place_whatever_the_file_is_stored_in(tmp_path, crs):
     image, centres = blobs(250, 200)
-    lon, lat = Transformer.from_crs(UTM, 4326, always_xy=True).transform(
-        WEST + (centres[:, 0] + 0.5) * STEP_M, NORTH - (centres[:, 1] + 0.5) * STEP_M
-    )
+    east, north = WEST + (centres[:, 0] + 0.5) * STEP_M, NORTH - (centres[:, 1] + 0.5) * STEP_M
+    lon, lat = Transformer.from_crs(UTM, 4326, always_xy=True).transform(east, north)
     to = UTM if crs == "rotated" else crs
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PendingDeprecationWarning)

@@ -105,9 +105,8 @@ def test_a_folder_gives_what_it_has(flight, tmp_path):
 def test_errors_name_arguments(flight, tmp_path):
     files = FlightFiles.in_folder(flight)
     assert refused(TrackSettings, budget_ms=-1.0) == "budget_ms: expected milliseconds above 0, got -1"
-    assert refused(track, files, flight) == (
-        f"out: {flight} exists; choose another folder, or add `force` to replace its results"
-    )
+    exists = "exists; choose another folder, or add `force` to replace its results"
+    assert refused(track, files, flight) == f"out: {flight} {exists}"
     far = TrackSettings(start="0,0")
     off_it = refused(track, files, tmp_path / "out", far)
     assert off_it.startswith("start: expected a place on the map")
