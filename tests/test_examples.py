@@ -159,8 +159,7 @@ class CameraOfNoCamera:
     def get_metadata(self):
         return {"SensorTimestamp": time.monotonic_ns(), "ExposureTime": 1000}
 
-    def release(self):
-        pass
+    release = start
 
 
 @pytest.mark.usefixtures("bare_runs")

@@ -88,7 +88,6 @@ FIGURES = {  # page: claim: results page, heading and words of each row that sta
 FIGURE = re.compile(
     r"(?<![\w.])(\d+(?:\.\d+)?)(?= (?:m|mm|ms|s|GB|MB|degrees|%|of \d+|RMS)(?!\w)| to [\d.]+ (?:m|ms|s|%))"
 )
-NUMBER = re.compile(r"(?<![\w.-])\d[\d,]*(?:\.\d+)?")
 UNMEASURED = {  # what the front pages state as assumed
     "README.md": ["good to 1 m", "adds 3 m unless", "over 10 m off"],
     "docs/index.md": [],
@@ -110,7 +109,7 @@ def results(name, heading, *words):
 
 
 def numbers(text):
-    return [word.replace(",", "") for word in NUMBER.findall(text)]
+    return [word.replace(",", "") for word in re.findall(r"(?<![\w.-])\d[\d,]*(?:\.\d+)?", text)]
 
 
 def states(rows, word):

@@ -11,11 +11,10 @@ import pytest
 import torch
 
 import engine.errors
+from engine import NavigatorOptions, set_threads
 from engine.budget import Budget, Deadline
 from engine.errors import DeviceError, DtypeError, EngineError, OptionError, ShapeError, TelemetryError
-from engine.options import NavigatorOptions
 from engine.runtime.device import resolve
-from engine.runtime.threads import set_threads
 from engine.values import Attitude, Fix, Frame, NoFix, Peak, Prior, Timings, Window
 from tests.support.fixes import a_fix
 from tests.support.interpreters import done_by
@@ -146,7 +145,6 @@ def test_the_attitude_of_a_frame_takes_unknown_tilt_as_level():
 # Priors
 
 
-ONE_POSITION = "prior: expected either lat_deg and lon_deg or east_m and north_m"
 COORDINATES = ("lat_deg", "lon_deg", "east_m", "north_m")
 PARTS = [part for n in range(5) for part in combinations(COORDINATES, n)]
 
@@ -155,7 +153,7 @@ PARTS = [part for n in range(5) for part in combinations(COORDINATES, n)]
     ("values", "message"),
     [
         *(
-            (dict.fromkeys(names, 1.0), ONE_POSITION)
+            (dict.fromkeys(names, 1.0), "prior: expected either lat_deg and lon_deg or east_m and north_m")
             for names in PARTS
             if names not in (COORDINATES[:2], COORDINATES[2:])
         ),

@@ -5,8 +5,7 @@ import math
 
 import pytest
 
-from engine import LearnedOptions, LiveOptions, MatcherOptions, NavigatorOptions, OptionError
-from engine.assumed_errors import AssumedErrors
+from engine import AssumedErrors, LearnedOptions, LiveOptions, MatcherOptions, NavigatorOptions, OptionError
 from engine.options import NccOptions, PoseOptions, SiftOptions
 
 ENGINE = (AssumedErrors, LearnedOptions, MatcherOptions, NavigatorOptions, NccOptions, PoseOptions, SiftOptions)

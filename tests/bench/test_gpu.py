@@ -30,9 +30,6 @@ def test_a_row_has_times_beside_those_of_its_peers():
 
 
 def test_copies_are_told_apart_by_their_direction():
-    names = [
-        "Memcpy HtoD (Pinned -> Device)",
-        "Memcpy DtoD (Device -> Device)",
-        "Memcpy DtoH (Device -> Pageable)",
-    ]
-    assert gpu.directions([*names, "vectorized_elementwise_kernel", names[0]]) == (2, 1)
+    up, within, down = "HtoD (Pinned -> Device)", "DtoD (Device -> Device)", "DtoH (Device -> Pageable)"
+    copies = [f"Memcpy {way}" for way in (up, within, down, up)]
+    assert gpu.directions([*copies, "vectorized_elementwise_kernel"]) == (2, 1)

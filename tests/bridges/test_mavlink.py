@@ -25,32 +25,15 @@ from bench.live.bridge_counts import free_port
 from engine import Attitude, NavigatorOptions, NoFix, OptionError, Prior, Reason, TelemetryError
 from engine.camera import mount_rotation
 from engine.geo import LocalFrame
-from scenematch.bridges import mavlink_requests
+from scenematch.bridges import mavlink_out, mavlink_requests, packets
 from scenematch.bridges.fix_velocity import GroundVelocity, VelocityFromFixes
 from scenematch.bridges.links import Connection, parse_connection
 from scenematch.bridges.mavlink import CONFIRM_COMMAND, MavlinkBridge
 from scenematch.bridges.mavlink_in import HANDLED_MESSAGES, REQUESTED_RATES_HZ, AutopilotClock, MavlinkTelemetry
-from scenematch.bridges.mavlink_out import (
-    FixReport,
-    command_message,
-    fix_message,
-    heartbeat_message,
-    no_position_message,
-    pose_covariance,
-    set_origin_message,
-    timesync_message,
-    withhold_reason,
-)
+from scenematch.bridges.mavlink_out import command_message, fix_message, pose_covariance, timesync_message
 from scenematch.bridges.mavlink_requests import AutopilotRequests
 from scenematch.bridges.mavlink_status import MIN_RATE_HZ
-from scenematch.bridges.packets import (
-    AUTOPILOT_COMPONENT,
-    BRIDGE_COMPONENT,
-    PacketDecoder,
-    PacketEncoder,
-    read_key,
-    signing_time,
-)
+from scenematch.bridges.packets import AUTOPILOT_COMPONENT, BRIDGE_COMPONENT, PacketDecoder, read_key, signing_time
 from scenematch.bridges.parameters import MESSAGES, MavlinkOptions, parameter_file
 from scenematch.bridges.pictures import replay
 from scenematch.bridges.vehicle import NedOrigin, VehicleState, north_east_m
@@ -82,7 +65,7 @@ def sending(**changes):
         "fix": fix(), "captured_ns": 12_345_678_901, "age_ms": 80.0, "vehicle": VEHICLE, "origin": ORIGIN,
         "velocity": GroundVelocity(1.5, -2.5, 0.7), "reset_counter": 3, "unix_ns": 1_700_000_000_123_000_000,
     }  # fmt: skip
-    return FixReport(**(values | changes))
+    return mavlink_out.FixReport(**(values | changes))
 
 
 def autopilot(key=None, system=1, component=1):
@@ -100,10 +83,10 @@ SENT = {
     f"{firmware}-{kind}": fix_message(sending(), MavlinkOptions(firmware=firmware, message=kind))
     for firmware, kind in KINDS
 } | {
-    "heartbeat": heartbeat_message(),
+    "heartbeat": mavlink_out.heartbeat_message(),
     "timesync-question": timesync_message(12_345_678_901),
     "timesync-answer": timesync_message(12_345_678_901, 5_000_000_007),
-    "set_gps_global_origin": set_origin_message(1, ORIGIN, 12_345_678_901),
+    "set_gps_global_origin": mavlink_out.set_origin_message(1, ORIGIN, 12_345_678_901),
     "ask-origin": command_message(1, mavlink.MAV_CMD_REQUEST_MESSAGE, 49),
     "ask-attitude": command_message(1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 1e6 / 50),
 }
@@ -115,12 +98,12 @@ def golden(name):
 
 @pytest.mark.parametrize("name", SENT)
 def test_bytes_are_the_golden_ones(name):
-    assert PacketEncoder(1).encode(SENT[name]).hex() == golden(name)
+    assert packets.PacketEncoder(1).encode(SENT[name]).hex() == golden(name)
 
 
 def test_signed_bytes_are_the_golden_ones(monkeypatch):
     monkeypatch.setattr("scenematch.bridges.packets.signing_time", lambda: 10 * 365 * 86400 * 100_000)
-    made = PacketEncoder(1, KEY).encode(fix_message(sending(), MavlinkOptions()))
+    made = packets.PacketEncoder(1, KEY).encode(fix_message(sending(), MavlinkOptions()))
     assert made.hex() == golden("ardupilot-signed")
 
 
@@ -203,7 +186,8 @@ def test_a_whole_pose_is_sent_with_the_attitude_that_was_measured(message):
     expected_deg2 = [1.04, 0.01, 0.0, 1.09, 0.0, 1.25]
     assert np.array(getattr(m, covariance)[15:]) * math.degrees(1.0) ** 2 == pytest.approx(expected_deg2)
     assert getattr(gimbal, covariance) == getattr(own, covariance)
-    assert withhold_reason(sending(fix=replace(whole, attitude_covariance_deg2=angles_deg2 * math.nan)), options)
+    vague = replace(whole, attitude_covariance_deg2=angles_deg2 * math.nan)
+    assert mavlink_out.withhold_reason(sending(fix=vague), options)
 
 
 def test_odometry_to_px4_may_have_no_velocity():
@@ -236,7 +220,7 @@ def test_gps_input_tells_what_is_poor_and_what_is_unknown():
     ],
 )
 def test_what_would_mislead_is_withheld(changes, message, why):
-    assert withhold_reason(sending(**changes), MavlinkOptions(message=message)) == why
+    assert mavlink_out.withhold_reason(sending(**changes), MavlinkOptions(message=message)) == why
 
 
 def test_velocity_is_that_of_the_last_fixes_and_forgets_at_a_reset():
@@ -347,7 +331,7 @@ def test_beside_a_camera_with_the_usual_id_the_bridge_takes_another(bridge, came
         TO_THE_WEST,
         from_camera(odometry(2.0, 1.0, 0.0, by=by), camera),
         from_camera(odometry(9.0, 9.0, 9.0, by=by), bridge),
-        from_camera(no_position_message(1), bridge),
+        from_camera(mavlink_out.no_position_message(1), bridge),
     ]
     vehicle = heard(*messages, bridge_component=bridge)
     assert (vehicle.east_velocity_mps, vehicle.north_velocity_mps) == pytest.approx((-2.0, 1.0), abs=1e-6)

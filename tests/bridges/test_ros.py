@@ -15,10 +15,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from engine.camera import Camera
+from engine import Attitude, Camera, LiveOptions, NoFix, Reason, Window
 from engine.errors import BackendError, CalibrationError, OptionError, TelemetryError
-from engine.navigation.live import LiveOptions
-from engine.values import Attitude, NoFix, Reason, Window
 from scenematch import CameraInput, MapInput, RosSettings, run_ros_bridge
 from scenematch.bridges.ros import OUTPUTS, RosBridge
 from scenematch.bridges.ros_in import RosTelemetry, RosTopics
@@ -27,16 +25,8 @@ from scenematch.bridges.vehicle import NedOrigin, VehicleState, north_east_m
 from scenematch.cli.app import run as main
 from scenematch.cli.argument_names import ros_arguments_last
 from scenematch.files.quaternions import quaternion_xyzw
-from scenematch.files.ros.messages import (
-    NO_POSITION,
-    attitude_from_message,
-    body_velocity_from_message,
-    camera_from_message,
-    image_from_message,
-    position_from_message,
-    range_from_message,
-    stamp_ns,
-)
+from scenematch.files.ros import messages as ros_messages
+from scenematch.files.ros.messages import body_velocity_from_message, camera_from_message, image_from_message
 from tests.support.fixes import a_fix
 from tests.support.ground import body_axes
 from tests.support.odometries import odometry_message
@@ -182,11 +172,11 @@ def test_quaternions_turn_forward_left_up_to_east_north_up():
 def test_an_imu_without_orientation_says_nothing(maker):
     message = maker.imu(NOW_NS, "", 1, 2, 3)
     message.orientation_covariance = np.array([-1.0, *(0.0,) * 8])
-    assert attitude_from_message(message) is None
+    assert ros_messages.attitude_from_message(message) is None
     for values in ((0, 0, 0, 0), (0, 0, math.nan, 1), (0, 0, 3, 1)):
         message = maker.imu(NOW_NS, "", 1, 2, 3)
         message.orientation = maker.make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", values, strict=True)))
-        assert attitude_from_message(message) is None
+        assert ros_messages.attitude_from_message(message) is None
 
 
 def a_range(maker, range_m):
@@ -199,21 +189,21 @@ def a_range(maker, range_m):
 def test_ranges_beyond_reach_and_of_any_sensor_are_unknown(maker, range_m, stated):
     """MAVROS' rangefinder states 0 to 1000 m of every sensor, and one of 50 m reports 50 m from 150."""
     message = a_range(maker, range_m)
-    assert range_from_message(message) == stated
+    assert ros_messages.range_from_message(message) == stated
     message.min_range, message.max_range = 0.0, 1000.0
-    assert range_from_message(message) is None
+    assert ros_messages.range_from_message(message) is None
 
 
 def test_positions_carry_the_worse_axis(ros, maker):
     turn = Rotation.from_euler("z", 30, degrees=True).as_matrix()
     covariance = turn @ np.diag([4.0, 25.0, 9.0]) @ turn.T
     message = wired(ros, maker.position(NOW_NS, "", 33.5, -72.25, covariance))
-    assert position_from_message(message) == pytest.approx((33.5, -72.25, 5.0))
+    assert ros_messages.position_from_message(message) == pytest.approx((33.5, -72.25, 5.0))
     assert math.isnan(message.altitude)
     message.position_covariance_type = 0
-    assert position_from_message(message) == (33.5, -72.25, None)
-    message.status.status = NO_POSITION
-    assert position_from_message(message) is None
+    assert ros_messages.position_from_message(message) == (33.5, -72.25, None)
+    message.status.status = ros_messages.NO_POSITION
+    assert ros_messages.position_from_message(message) is None
 
 
 # ------------------------------------------------------------------------------------------------ telemetry
@@ -351,7 +341,7 @@ def pose_of(maker, fix, vehicle, site, *, ros=None, **options):
     """Position, quaternion and covariance (6, 6) of the message of a fix."""
     message = pose(maker, fix, vehicle, NOW_NS, site, RosOptions(**options))
     message = message if ros is None else wired(ros, message)
-    assert (stamp_ns(message), message.header.frame_id) == (NOW_NS, "map")
+    assert (ros_messages.stamp_ns(message), message.header.frame_id) == (NOW_NS, "map")
     at, turn = message.pose.pose.position, message.pose.pose.orientation
     covariance = np.asarray(message.pose.covariance).reshape(6, 6)
     return (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w), covariance
@@ -448,7 +438,7 @@ def test_a_fix_is_published_with_the_stamp_of_its_capture(ros, maker, node, sim_
     for output, kind in OUTPUTS.items():
         (message,) = (wired(ros, m) for m in node.of(output))  # each can be sent
         assert message.__msgtype__ == kind
-        assert stamp_ns(message) == captured_ns
+        assert ros_messages.stamp_ns(message) == captured_ns
     assert seen.frames[0].heading_deg == pytest.approx(3.0)
     fix, (place,) = fix_on(sim_site), node.of("fix")
     assert (place.latitude, place.longitude) == (fix.lat_deg, fix.lon_deg)
@@ -799,7 +789,7 @@ def test_the_ros1_node_hears_and_publishes(monkeypatch, sim_site):
     assert {topic: len(sent) for topic, sent in rospy.published.items()} == {
         "~pose": 1, "~fix": 1, "/diagnostics": 1,
     }  # fmt: skip
-    assert stamp_ns(rospy.published["~pose"][0]) == NOW_NS
+    assert ros_messages.stamp_ns(rospy.published["~pose"][0]) == NOW_NS
     # By rospy's own buffer pictures would grow old in the socket.
     assert rospy.subscribed[RosTopics().image] == {"queue_size": 1, "buff_size": 2**24}
     assert "expected a ROS master at http://here" in refusal(ros1.Node, "again", error=BackendError)

@@ -58,9 +58,8 @@ def test_what_draws_names_its_extra_before_it_begins(flight, tmp_path, monkeypat
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     out = tmp_path / "out"
     assert run(["map", "audit", str(flight / "map.tif"), f"--out={out}"]) == 1
-    assert capsys.readouterr().err == (
-        "scenematch: expected matplotlib to be installed, got none: pip install 'scenematch-engine[desk]'\n"
-    )
+    missing = "expected matplotlib to be installed, got none: pip install 'scenematch-engine[desk]'"
+    assert capsys.readouterr().err == f"scenematch: {missing}\n"
     assert not out.exists()
 
 

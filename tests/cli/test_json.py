@@ -48,12 +48,7 @@ def test_an_error_names_its_argument(arguments, argument, code, capsys, tmp_path
 
 @pytest.mark.parametrize(
     "url",
-    [
-        "https://tiles.example.org/a[b]/map.tif",
-        "s3://bucket//key",
-        "file:///[red]m[/red].tif",
-        "rtsp://[::1]:8554/x?a=b",
-    ],
+    ["https://a.org/a[b]/map.tif", "s3://bucket//key", "file:///[red]m[/red].tif", "rtsp://[::1]:8554/x?a=b"],
 )
 def test_a_url_is_repeated_as_it_was_typed(url, capsys):
     for arguments in (
@@ -69,8 +64,6 @@ def test_files_that_commands_write_are_named(tmp_path, capsys):
     parameters = tmp_path / "p.param"
     command = ["bridge", "mavlink", "--firmware=px4", f"--write-params={parameters}"]
     assert run([*command, "--settings=parameters.delay_ms=90", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {
-        "parameters": str(parameters), "delay_ms": 90
-    }  # fmt: skip
+    assert json.loads(capsys.readouterr().out) == {"parameters": str(parameters), "delay_ms": 90}
     assert "EKF2_AGP0_DELAY\t90" in parameters.read_text(encoding="utf-8")
     assert spoken(capsys, command, 2)["argument"] == "--write-params"

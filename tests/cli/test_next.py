@@ -75,9 +75,8 @@ def test_compare_names_a_file_that_it_wrote(flight, tmp_path, capsys, runs):
 
 @pytest.mark.parametrize(("availability", "command"), [(0.9, "export"), (0.0, "check")])
 def test_a_closed_loop_without_a_fix_is_not_exported(tmp_path, capsys, monkeypatch, availability, command):
-    monkeypatch.setattr(
-        "scenematch.runs.closed_loop.fly_closed_loop", lambda *_, **__: {"availability": availability}
-    )
+    flown = {"availability": availability}
+    monkeypatch.setattr("scenematch.runs.closed_loop.fly_closed_loop", lambda *_, **__: flown)
     assert parsed(next_of(capsys, ["simulate", f"--out={tmp_path / 'o'}", "--closed-loop"])) == command
 
 

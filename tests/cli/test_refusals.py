@@ -41,16 +41,9 @@ LOCATE = ["locate", "i.jpg", "--map=m.tif", "--camera=c.yaml"]
         *((SIMULATE, "--camera-pitch-deg", value) for value in ("nan", "-91", "0")),
         ([*SIMULATE, "--map=m.tif"], "--relief-m", "5"),
         (SIMULATE, "--condition", "eclipse"),
-        *(
-            (LOOP, f"--{name}", value)
-            for name, value in (
-                ("fault", "lost"),
-                ("method", "orb"),
-                ("minutes", "0"),
-                ("frames", "3"),
-                ("camera-pitch-deg", "-45"),
-            )
-        ),
+        *((LOOP, f"--{name}", value) for name, value in (("fault", "lost"), ("method", "orb"), ("minutes", "0"))),
+        (LOOP, "--frames", "3"),
+        (LOOP, "--camera-pitch-deg", "-45"),
         *((command, "--device", "gpu") for command in (PLAYED, ROS, TRACK, LOCATE)),
         (PLAYED, "--firmware", "x"),
         *((PLAYED, "--connect", value) for value in ("nonsense", "udpin:0.0.0.0:14550")),

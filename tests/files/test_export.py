@@ -178,9 +178,8 @@ def test_the_command_refuses_in_one_line(tmp_path, capfd):
     assert "no such file" in refusal_of(capfd, export_gpx, 1)
     write_track(tmp_path / "track.csv", [refusal(0)])
     assert "expected a track with a fix, got 1 rows without" in refusal_of(capfd, export_gpx, 1)
-    assert refusal_of(capfd, [*export_gpx, "--format=shp"]).startswith(
-        "--format: expected one of gpx, geojson, tum"
-    )
+    line = refusal_of(capfd, [*export_gpx, "--format=shp"])
+    assert line.startswith("--format: expected one of gpx, geojson, tum")
     write_track(tmp_path / "track.csv", ROWS)
     out = tmp_path / "none" / "x.gpx"
     assert "cannot be written" in refusal_of(capfd, [*export_gpx, f"--out={out}"], 1)

@@ -10,17 +10,11 @@ from PIL import Image
 
 from engine import CalibrationError, Camera, MapError
 from engine.values import NoFix, Prior, Reason, Truth, Window
+from scenematch.files import telemetry as telemetry_files
 from scenematch.files.flight import open_flight
 from scenematch.files.frames import open_frames, read_image
 from scenematch.files.geotiff import write_geotiff
-from scenematch.files.telemetry import (
-    BOUNDS,
-    DEFAULT_PRIOR_SIGMA_M,
-    TelemetryRow,
-    ground_amsl_m,
-    read_telemetry,
-    write_telemetry,
-)
+from scenematch.files.telemetry import BOUNDS, DEFAULT_PRIOR_SIGMA_M, TelemetryRow, read_telemetry, write_telemetry
 from scenematch.files.track import COLUMNS, NOTE_COLUMNS, TrackRow, read_track, track_row, write_track
 from scenematch.files.truth import interpolate_truth, read_truth, write_truth
 from tests.support.fixes import a_fix
@@ -75,13 +69,7 @@ def test_telemetry_round_trip(tmp_path):
     """With values at the ends of their ranges, unknown cells, stamps before 1970 and a name that needs quotes."""
     path, second = tmp_path / "telemetry.csv", 10**9
     known = {name: 1.25 + k for k, name in enumerate(BOUNDS)}
-    ends = {
-        "heading_deg": 359.9,
-        "roll_deg": -180.0,
-        "pitch_deg": 90.0,
-        "lat_deg": -90.0,
-        "lon_deg": 179.123456789,
-    }
+    ends = {"heading_deg": 359.9, "roll_deg": -180, "pitch_deg": 90, "lat_deg": -90, "lon_deg": 179.123456789}
     rows = [
         TelemetryRow(timestamp_ns=-(2**62) // second * second, frame='a,"b".jpg', **known),
         TelemetryRow(timestamp_ns=-second, frame="b.jpg"),
@@ -150,8 +138,8 @@ def test_missing_telemetry_and_a_folder_in_its_place_are_refused(tmp_path):
 def test_ground_is_the_median_difference_of_the_two_heights():
     pairs = [(200.0, 150.0), (210.0, 159.0), (300.0, 100.0), (None, 5.0), (5.0, None)]
     rows = [TelemetryRow(timestamp_ns=0, frame="a", alt_amsl_m=a, height_agl_m=h) for a, h in pairs]
-    assert ground_amsl_m(rows) == 51.0
-    assert ground_amsl_m(rows[3:]) is None
+    assert telemetry_files.ground_amsl_m(rows) == 51.0
+    assert telemetry_files.ground_amsl_m(rows[3:]) is None
 
 
 # ---------------------------------------------------------------------------------------------------- truth
@@ -336,12 +324,6 @@ def test_a_row_that_names_no_picture_is_refused_before_the_flight(folder, save):
     assert "telemetry.csv: line 3, frame: expected one of 3 pictures, 1.png to 10.png, got '4.png'" in message
 
 
-def test_a_video_flight_names_frames_by_index(video, save):
-    flight = open_flight(video, save("timestamp_ns,frame\n0,0\n1,5\n2,10\n"))
-    assert [round(float(item.frame.image.mean()) / 20) for item in flight] == [0, 5, 10]
-    assert flight.unused == 9
-
-
 @pytest.mark.parametrize("name", ["flight.ts", "flight.klv", "GX010001.MP4"])
 def test_metadata_in_a_video_is_refused_with_the_way_out(folder, tmp_path, name):
     """The first bytes are those of a transport stream and of a UAS data link's packet (MISB ST 0601)."""
@@ -392,17 +374,10 @@ def test_geotiff_refuses_what_it_cannot_write(tmp_path, name, crs):
 
 # ---------------------------------------------------------------------------------------------------- track
 
-FIX = a_fix(
-    timestamp_ns=107_802_500_000,
-    lat_deg=32.7931868031,
-    lon_deg=34.9888531542,
-    east_m=-12.34567,
-    north_m=0.00004,
-    covariance_m2=np.array([[4.0, -0.5, 0.0], [-0.5, 2.25, 0.0], [0.0, 0.0, 9.0]]),
-    score=0.87654321,
-    window=Window(3, 4, 420, 415),
-    map_xy_px=(1.0, 2.0),
-)
+PLACE = {"lat_deg": 32.7931868031, "lon_deg": 34.9888531542, "east_m": -12.34567, "north_m": 0.00004}
+COVARIANCE_M2 = np.array([[4.0, -0.5, 0.0], [-0.5, 2.25, 0.0], [0.0, 0.0, 9.0]])
+SEEN = {"timestamp_ns": 107_802_500_000, "score": 0.87654321, "window": Window(3, 4, 420, 415)}
+FIX = a_fix(**PLACE, **SEEN, covariance_m2=COVARIANCE_M2)
 REFUSAL = NoFix(reason=Reason.AMBIGUOUS, timestamp_ns=None, method="sift", score=-0.00001)
 
 

@@ -9,17 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.inputs.log_files import (
-    ELSE,
-    GPS_MS,
-    GPS_WEEK,
-    UTC_NS,
-    S,
-    dataflash_flight,
-    ulog_flight,
-    ulog_message,
-    write_dataflash,
-)
+from bench.inputs import log_files
+from bench.inputs.log_files import ELSE, UTC_NS, S, dataflash_flight, ulog_flight, ulog_message, write_dataflash
 from engine.errors import OptionError
 from scenematch.cli.app import run
 from scenematch.files.flight import open_flight
@@ -95,9 +86,8 @@ def test_of_messages_that_are_not_good_none_is_used(tmp_path):
 
 
 def test_without_an_estimator_the_receiver_says_where_and_how_fast(tmp_path):
-    gps = [
-        ("GPS", k * 500_000, 0, 3, GPS_MS, GPS_WEEK, 325_000_000, -352_500_000, 71_250, 8.0, 210.0) for k in (1, 2)
-    ]
+    said = 0, 3, log_files.GPS_MS, log_files.GPS_WEEK, 325_000_000, -352_500_000, 71_250, 8.0, 210.0
+    gps = [("GPS", us, *said) for us in (500_000, 1_000_000)]
     (row,), heights = at(open_log(write_dataflash(tmp_path / "1.bin", gps)), 0.75)
     assert (row.lat_deg, row.lon_deg, row.alt_amsl_m) == pytest.approx((32.5, -35.25, 712.5))
     assert (row.east_velocity_mps, row.north_velocity_mps) == pytest.approx((-4.0, -8.0 * math.sqrt(0.75)))

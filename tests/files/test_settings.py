@@ -42,14 +42,10 @@ def test_values_arrive(path):
     found = loaded(path, text)
     assert (found.method, found.ncc.exclusion_m, found.errors.map_m) == ("sift", 2.0, 6.5)
     assert found.navigator.odometry is True
-    assert found.telemetry_columns == {"height_agl_m": "altitude_agl [m]"}
-    assert changed(found) == {
-        "method": "sift",
-        "ncc.exclusion_m": 2.0,
-        "errors.map_m": 6.5,
-        "navigator.odometry": True,
-        "telemetry_columns": {"height_agl_m": "altitude_agl [m]"},
-    }
+    columns = {"height_agl_m": "altitude_agl [m]"}
+    assert found.telemetry_columns == columns
+    options = {"method": "sift", "ncc.exclusion_m": 2.0, "errors.map_m": 6.5, "navigator.odometry": True}
+    assert changed(found) == options | {"telemetry_columns": columns}
     assert changed(TrackSettings()) == {}
 
 

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from engine import Camera, Fix, MatcherOptions, NoFix, Prior, SceneMatcher
+from engine import Camera, Fix, MatcherOptions, NccOptions, NoFix, Prior, SceneMatcher, Window
 from engine.geo import enu_from_body
 from engine.kernels.dense import EnhancedFrame, GaussianPrior, Pose, Samples, correlation_at, covariance_of, refine
 from engine.maps.prepared import PreparedMap
 from engine.maps.samples import SampleMap
-from engine.options import NccOptions
-from engine.values import Window
 from tests.support.rasters import whole
 from tests.support.towns import site_of
 

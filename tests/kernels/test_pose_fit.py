@@ -48,6 +48,5 @@ def test_normal_equations_are_those_of_finite_differences(points):
     weighted = np.tile(weights * agreement / variance, 2)
     assert 0 < np.count_nonzero(agreement) < len(agreement)
     np.testing.assert_allclose(normal, (jacobian.T * weighted) @ jacobian, rtol=1e-5, atol=1e-3)
-    np.testing.assert_allclose(
-        gradient, jacobian.T @ (weighted * (pixels - view[1]).ravel()), rtol=1e-4, atol=1e-4
-    )
+    expected = jacobian.T @ (weighted * (pixels - view[1]).ravel())
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4)

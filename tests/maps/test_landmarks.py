@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from engine import OrthoMap
+from engine import OrthoMap, Window
 from engine.features import sift
 from engine.maps import landmark_cache, landmarks
 from engine.maps.landmarks import CELL_PX, MAX_PER_CELL, LandmarkMap, as_picture
 from engine.maps.tiles import TILE_PX
 from engine.runtime.device import CPU
-from engine.values import Window
 from tests.support.ground import Ground
 from tests.support.rasters import from_corner, whole, write_raster
 
@@ -123,9 +122,7 @@ def test_memory_is_bounded_and_what_was_given_up_comes_back_the_same(site, marks
     small = LandmarkMap(site, CPU)
     windows = [Window(x, y, 80, 80) for y in (20, 300, 470) for x in (20, 300, 510)]
     for window in [*windows, *windows]:
-        np.testing.assert_array_equal(
-            table(small.find(window, 0, upright=True)), table(marks.find(window, 0, upright=True))
-        )
+        np.testing.assert_array_equal(*(table(one.find(window, 0, upright=True)) for one in (small, marks)))
         kept = [len(tile["rank"]) for tile in small.tiles.values()]
         assert sum(kept) <= 700 or len(kept) == len(small._keys(window, 0, True))
 

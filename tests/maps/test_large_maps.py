@@ -11,9 +11,8 @@ from affine import Affine
 from rasterio.enums import Resampling
 from rich.console import Console
 
-from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher
+from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher, Window
 from engine.maps import metric_copy
-from engine.values import Window
 from scenematch.cli import console
 from scenematch.cli.app import run
 from scenematch.runs.inputs import check_start
@@ -55,9 +54,7 @@ def prior_of(flight, sigma_m=10.0):
 
 
 @pytest.mark.parametrize("method", ["ncc", "sift"])
-def test_a_frame_is_found_where_the_small_map_has_it_in_a_part_of_the_memory(
-    large_path, small, sim_flight, method
-):
+def test_a_frame_is_found_where_the_small_map_has_it_in_part_of_the_memory(large_path, small, sim_flight, method):
     """The grey levels and validity of the whole would take 578 MB."""
     frame, prior, camera = sim_flight.frames[5], prior_of(sim_flight), sim_flight.camera
     at_home = SceneMatcher(small, camera, method, "cpu").locate(frame, prior)
@@ -97,9 +94,7 @@ def test_what_holds_no_map_is_nodata_and_the_warm_up_finds_a_place_that_does(lar
 # ------------------------------------------------------------------------------------------------- searching
 
 
-def test_without_a_place_to_begin_at_only_a_map_that_is_too_large_is_refused(
-    large, small, sim_flight, monkeypatch
-):
+def test_without_a_place_to_begin_only_a_map_that_is_too_large_is_refused(large, small, sim_flight, monkeypatch):
     check_start(None, small)
     monkeypatch.setattr("engine.orthomap.SEARCH_LIMIT_PX", 1_000_000)
     for method in ("ncc", "sift", "auto"):
@@ -271,12 +266,8 @@ def test_a_copy_says_how_far_it_is_and_one_that_is_there_says_nothing(opened, ti
 
 def test_what_a_copy_is_padded_by_is_no_nodata(tmp_path, tiny_limits):
     """Tiles of a GeoTIFF have sides of 16 pixels, and a copy's overviews halve them."""
-    path = write_raster(
-        tmp_path / "map.tif",
-        np.full((300, 301), 90, np.uint8),
-        crs=UTM,
-        transform=Affine(1, 0, 607400, 0, -1, 5345369),
-    )
+    corner = Affine(1, 0, 607400, 0, -1, 5345369)
+    path = write_raster(tmp_path / "map.tif", np.full((300, 301), 90, np.uint8), crs=UTM, transform=corner)
     site = OrthoMap.open(path, cache_dir=tmp_path / "cache")
     assert site.info()["source_nodata_share"] == site.info()["nodata_share"] == 0.0
 

@@ -14,10 +14,8 @@ from pyproj import Geod, Proj, Transformer
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.warp import calculate_default_transform, reproject
 
-from engine.errors import DtypeError, MapError, OptionError, ShapeError
+from engine import DtypeError, MapError, OptionError, OrthoMap, ShapeError, Window
 from engine.maps.accuracy import GEOREFERENCE_TAG, SLOPE_TAG
-from engine.orthomap import OrthoMap
-from engine.values import Window
 from scenematch.files.geotiff import write_geotiff
 from tests.support.rasters import whole, write_raster
 from tests.support.refusals import refusal
@@ -126,9 +124,8 @@ def centroid(site, xy):
 @pytest.mark.parametrize("crs", [UTM, "EPSG:4326", "EPSG:3857", "rotated"])
 def test_features_lie_in_one_place_whatever_the_file_is_stored_in(tmp_path, crs):
     image, centres = blobs(250, 200)
-    lon, lat = Transformer.from_crs(UTM, 4326, always_xy=True).transform(
-        WEST + (centres[:, 0] + 0.5) * STEP_M, NORTH - (centres[:, 1] + 0.5) * STEP_M
-    )
+    east, north = WEST + (centres[:, 0] + 0.5) * STEP_M, NORTH - (centres[:, 1] + 0.5) * STEP_M
+    lon, lat = Transformer.from_crs(UTM, 4326, always_xy=True).transform(east, north)
     to = UTM if crs == "rotated" else crs
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PendingDeprecationWarning)
@@ -362,14 +359,12 @@ def test_surface_of_another_grid_lies_at_the_same_place(tmp_path, crs, dtype):
 def test_surface_nodata_and_what_lies_outside_is_ground(tmp_path, nodata):
     heights = np.full((40, 40), 100.0, np.float32)
     heights[:, :20] = 40.0
-    heights[10:20, 10:20] = -9999.0 if nodata is None else nodata  # an untagged -9999 is no height either
+    heights[10:20, 10:25] = -9999.0 if nodata is None else nodata  # an untagged -9999 is no height either
     path = write(tmp_path / "map.tif", noise(60, 60))
     site = OrthoMap.open(path, write(tmp_path / "dsm.tif", heights, nodata=nodata))
     assert site.ground_m == 40.0
-    beside_nodata = [19.5, 15]
-    assert np.array_equal(
-        site.surface_at([[30, 5], beside_nodata, [15, 15], [50, 5], [5, 50]]), [100, 40, 40, 40, 40]
-    )
+    at = [[30, 5], [24.5, 15], [22, 9.5], [22, 19.5], [15, 15], [50, 5], [5, 50]]  # by nodata, in it and outside
+    assert site.surface_at(at).tolist() == [100, 40, 40, 40, 40, 40, 40]
     assert site.info()["surface_range_m"] == [40.0, 100.0]
 
 

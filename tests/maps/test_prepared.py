@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from engine import OrthoMap
+from engine import OrthoMap, Window
 from engine.kernels.scores import enhance
 from engine.maps import prepared, tiles
 from engine.maps.prepared import PreparedMap, Region
 from engine.ncc_fft import prepare
-from engine.values import Window
 from tests.support.threads import called_at_once
 
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])

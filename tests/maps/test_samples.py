@@ -5,11 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
-from engine import OrthoMap
+from engine import OrthoMap, Window
 from engine.maps import tiles
 from engine.maps.samples import BLOCK_PX, SampleMap
 from engine.maps.tiles import TILE_PX
-from engine.values import Window
 
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])
 

@@ -9,10 +9,8 @@ import pytest
 from affine import Affine
 from rasterio.shutil import copy
 
-from engine.errors import MapError
+from engine import MapError, OrthoMap, Window
 from engine.maps.accuracy import GEOREFERENCE_TAG
-from engine.orthomap import OrthoMap
-from engine.values import Window
 from tests.support.rasters import write_raster
 from tests.support.refusals import refusal
 
@@ -57,9 +55,7 @@ def plain(tmp_path_factory, picture):
 
 
 @pytest.mark.parametrize("nodata", [None, 1])
-def test_a_folder_of_tiles_is_the_picture_that_it_was_cut_from_and_a_gap_is_nodata(
-    tmp_path, plain, picture, nodata
-):
+def test_a_folder_of_tiles_is_the_picture_it_was_cut_from_and_a_gap_is_nodata(tmp_path, plain, picture, nodata):
     whole, cut = OrthoMap.open(plain), OrthoMap.open(tiles_of(tmp_path / "tiles", picture, nodata=nodata))
     assert (cut.width_px, cut.height_px, cut.bounds_deg) == (whole.width_px, whole.height_px, whole.bounds_deg)
     there = np.ones((SIDE, SIDE), np.bool_)

@@ -12,10 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engine import Attitude, Camera, Frame, MatcherOptions, SceneMatcher
+from engine import Attitude, Camera, Frame, MatcherOptions, NccOptions, SceneMatcher, SiftOptions
 from engine.matching.align import FRACTION, MAX_RAY_DEG, rectify, view_of
 from engine.matching.oblique import largest_rectangle
-from engine.options import NccOptions, SiftOptions
 from tests.support.fixes import px_off
 from tests.support.ground import rays_of
 

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import SceneMatcher
+from engine import Fix, NoFix, Reason, SceneMatcher
 from engine.matching.evidence import Evidence, probability
 from engine.matching.ladder import Rung, climb
 from engine.matching.ncc import Ncc
 from engine.matching.sift import Sift
-from engine.values import Fix, NoFix, Reason
 
 
 @pytest.fixture

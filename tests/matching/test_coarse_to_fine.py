@@ -13,7 +13,7 @@ import pytest
 import torch
 from scipy.signal import correlate
 
-from engine import Fix, MatcherOptions, NccOptions, SceneMatcher, ShapeError, ncc_fft
+from engine import Fix, MatcherOptions, NccOptions, Reason, SceneMatcher, ShapeError, ncc_fft
 from engine.budget import Budget, Deadline
 from engine.kernels import coarse_to_fine
 from engine.kernels.coarse_to_fine import EarlyStop
@@ -21,7 +21,6 @@ from engine.kernels.scores import enhance
 from engine.kernels.sums import counts
 from engine.matching.correlation import _EVERY_PLACE
 from engine.ncc_fft import find_peak, match_template, prepare
-from engine.values import Reason
 from tests.support.ground import CAMERA, Ground
 from tests.support.towns import drawn_town
 

@@ -9,16 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engine import Reason
+from engine.matching import evidence as evidences
 from engine.matching.candidates import PeakCandidate, PoseCandidate
-from engine.matching.evidence import (
-    Evidence,
-    independent_places,
-    nats_of,
-    needed_nats,
-    prior_chi_square,
-    probability,
-    surprise_of,
-)
+from engine.matching.evidence import Evidence, independent_places, needed_nats, prior_chi_square, probability
 from engine.matching.refusals import of_candidate
 from engine.values import Peak
 from tests.support.fixes import a_fix
@@ -62,7 +55,7 @@ def test_every_place_has_a_probability(surprise, rival, places, prior_chi_square
 
 @given(st.floats(-25, 25))
 def test_a_probability_tells_its_evidence(nats):
-    assert nats_of(probability(nats)) == pytest.approx(nats, abs=1e-3)
+    assert evidences.nats_of(probability(nats)) == pytest.approx(nats, abs=1e-3)
 
 
 @given(st.floats(1e-12, 0.5), st.floats(0, 300), known, known)
@@ -138,8 +131,8 @@ def test_the_rate_of_alarms_is_what_the_evidence_allows():
 
 
 def test_a_score_is_counted_in_sigmas_of_fishers_z():
-    assert surprise_of(0.5, 0.1) == pytest.approx((math.atanh(0.5) / 0.1) ** 2 / 2.0)
-    assert surprise_of(-0.5, 0.1) == 0.0
+    assert evidences.surprise_of(0.5, 0.1) == pytest.approx((math.atanh(0.5) / 0.1) ** 2 / 2.0)
+    assert evidences.surprise_of(-0.5, 0.1) == 0.0
     assert independent_places(1600.0) == pytest.approx(100.0)
     assert independent_places(0.0) == pytest.approx(math.e)
 

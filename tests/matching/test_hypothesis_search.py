@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, MatcherOptions, NoFix, Prior, SceneMatcher
+from engine import Fix, MatcherOptions, NccOptions, NoFix, Prior, SceneMatcher
 from engine.matching import hypothesis_search
-from engine.options import NccOptions
 from engine.window import SPREAD_SIGMAS
 from scenematch.simulator import FlightStyle, SensorNoise, plan_flight
 from tests.support.towns import drawn_flight, drawn_town, site_of
@@ -118,9 +117,7 @@ def looked_on(monkeypatch):
     return levels
 
 
-def test_a_place_beyond_doubt_at_a_quick_look_is_that_of_the_thorough_one(
-    matcher, site, flight, looked_on, monkeypatch
-):
+def test_a_place_beyond_doubt_is_that_of_a_thorough_search(matcher, site, flight, looked_on, monkeypatch):
     unknown = replace(flight.frames[5], **ANY_HEADING)
     quick = matcher().locate(unknown)
     levels = list(looked_on)
@@ -133,7 +130,7 @@ def test_a_place_beyond_doubt_at_a_quick_look_is_that_of_the_thorough_one(
     assert turn_between(quick.attitude.heading_deg, thorough.attitude.heading_deg) < 0.1
 
 
-def test_a_place_in_doubt_at_a_quick_look_is_looked_for_thoroughly(matcher, mirrored_site, flight, looked_on):
+def test_a_place_in_doubt_is_searched_thoroughly(matcher, mirrored_site, flight, looked_on):
     result = matcher(mirrored_site).locate(replace(flight.frames[5], heading_sigma_deg=20.0 / SPREAD_SIGMAS))
     assert isinstance(result, NoFix)
     assert len(looked_on) == 2

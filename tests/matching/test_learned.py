@@ -12,16 +12,13 @@ import pytest
 import torch
 from torch import nn
 
-from engine import Frame, MatcherOptions, NoFix, Prior, Reason, SceneMatcher, Window
-from engine.errors import OptionError
+from engine import Frame, LearnedOptions, MatcherOptions, NoFix, OptionError, Prior, Reason, SceneMatcher, Window
 from engine.features import sift
 from engine.learned.keypoints import Keypoints
 from engine.learned.matchers import KeypointMatcher
 from engine.maps import keypoints as index
 from engine.maps.keypoints import KeypointMap
-from engine.options import LearnedOptions
-from scenematch.runs.comparison import parse_runs
-from scenematch.runs.settings import TrackSettings, load_settings
+from scenematch import TrackSettings, load_settings, parse_runs
 from tests.support.fixes import px_off
 from tests.support.ground import Ground
 

@@ -4,23 +4,19 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from engine import SceneMatcher
-from engine.budget import Budget
+from engine import Budget, Fix, Frame, MatcherOptions, NoFix, Prior, Reason, SceneMatcher, SiftOptions
 from engine.errors import BackendError, CalibrationError, OptionError
-from engine.options import MatcherOptions, SiftOptions
 from engine.runtime import workers as processes
 from engine.runtime.step_costs import Costs
-from engine.values import Fix, Frame, NoFix, Prior, Reason
 from tests.support.fixes import values_of
 from tests.support.threads import called_at_once
+from tests.support.waiting import is_running, wait_until
 
 PLACES = [np.array([300.0 + 6.0 * k, 290.0 + 4.0 * (k % 3)]) for k in range(6)]
 
@@ -34,10 +30,8 @@ def _started_at_once(monkeypatch):
 @pytest.fixture(scope="module")
 def questions(ground, camera):
     """Frames with their priors: places in a row, ways to be refused, and a search of the map."""
-    frames = [
-        ground.frame(camera, nadir, heading_deg=20.0 * k, roll_deg=2.0, pitch_deg=-1.0, timestamp_ns=k)
-        for k, nadir in enumerate(PLACES)
-    ]
+    angles = [{"heading_deg": 20.0 * k, "roll_deg": 2.0, "pitch_deg": -1.0} for k in range(len(PLACES))]
+    frames = [ground.frame(camera, nadir, timestamp_ns=k, **angles[k]) for k, nadir in enumerate(PLACES)]
     priors = [ground.prior(nadir) for nadir in PLACES]
     flat = Frame(np.full((300, 300), 90, np.uint8), 100, 150.0, 0.0, 0.0, 0.0)
     frames += [flat, replace(frames[0], height_agl_m=None), frames[1], frames[2]]
@@ -185,14 +179,4 @@ def test_workers_end_with_their_parent():
         pids = {int(parent.stdout.readline()) for _ in range(12)} - {parent.pid}
         parent.kill()
     assert len(pids) > 1
-    until = time.monotonic() + 10.0
-    while any(Path(f"/proc/{pid}").exists() and "Z" not in _state(pid) for pid in pids):
-        assert time.monotonic() < until
-        time.sleep(0.05)
-
-
-def _state(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().split()[2]
-    except OSError:
-        return "Z"
+    wait_until(lambda: not any(map(is_running, pids)), 10.0)

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from engine import Camera
+from engine import Attitude, Camera
 from engine.geo import enu_from_body
 from engine.matching.align import MAX_FIELD_DEG, SIDE_STEP_PX, ground_bounds_px, orthorectify, view_of
-from engine.values import Attitude
 
 CAMERA = Camera.from_fov(320, 240, 60.0)
 JACOBIAN = np.diag([0.5, -0.5])
@@ -54,9 +53,7 @@ def test_a_pixel_comes_from_where_its_ground_point_is_seen(attitude, within_px):
 
 def test_over_a_plateau_it_is_drawn_as_from_so_much_lower():
     attitude = Attitude(3.0, -4.0, 33.0)
-    photo = orthorectify(
-        GRAY, CAMERA, attitude, 120.0, JACOBIAN, lambda offsets: np.full(offsets.shape[:-1], 30.0)
-    )
+    photo = orthorectify(GRAY, CAMERA, attitude, 120.0, JACOBIAN, lambda px: np.full(px.shape[:-1], 30.0))
     at = places(photo)
     assert np.abs(photo.to_frame(at) - projected(attitude, 120.0, at + photo.offset_px, up_m=30.0)).max() < 0.1
 

@@ -13,10 +13,8 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from engine.camera import Camera
-from engine.errors import OptionError
+from engine import Camera, OptionError, OrthoMap
 from engine.geo import LocalFrame
-from engine.orthomap import OrthoMap
 from scenematch.bridges.ros import RosTopics
 from scenematch.bridges.vehicle import NedOrigin, north_east_m
 from scenematch.files.geotiff import write_geotiff

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Budget, Fix, Frame, MatcherOptions, Navigator, OrthoMap, SceneMatcher
+from engine import Budget, Fix, Frame, MatcherOptions, Navigator, NccOptions, OrthoMap, SceneMatcher
 from engine.budget import Deadline
 from engine.kernels.dense import Pose
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
-from engine.options import NccOptions
 from tests.support.fixes import px_off
 from tests.support.ground import pixels_of, rays_of
 

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from engine import Fix, Frame, OrthoMap, Prior, SceneMatcher
-from engine.values import Window
+from engine import Fix, Frame, OrthoMap, Prior, SceneMatcher, Window
 
 TILE_PX, TILES = 101, 8  # no multiple of the coarser levels' pixels, on which each tile is sampled differently
 HEIGHT_M, HEADING_DEG = 140.0, 30.0

@@ -148,9 +148,7 @@ def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(make, frame, prio
 
 
 @pytest.mark.parametrize("finer", [(), (1,), (1, 0)])
-def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_coarser_level(
-    make, frame, prior, monkeypatch, finer
-):
+def test_a_coarse_fix_that_is_not_confirmed_is_uncertain_at_any_level(make, frame, prior, monkeypatch, finer):
     """And no level is correlated twice."""
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
     monkeypatch.setattr(Refinement, "refine", lambda _self, found: found)
@@ -188,9 +186,7 @@ def test_refinement_at_once_is_begun_only_where_there_is_time_for_it(make, frame
 @pytest.mark.parametrize(
     ("method", "step", "work"), [("ncc", "refinement at once", 9e4), ("sift", "sift by few features", 3e4)]
 )
-def test_a_short_way_that_was_too_dear_once_is_tried_again(
-    site, camera, frame, prior, monkeypatch, method, step, work
-):
+def test_a_short_way_once_too_dear_is_tried_again(site, camera, frame, prior, monkeypatch, method, step, work):
     """Without it every frame takes the long way, which is dearer yet."""
     monkeypatch.setattr(Costs, "load", lambda _self: 1.0)  # whatever else this machine does
     matcher = SceneMatcher(site, camera, method, "cpu")

@@ -6,14 +6,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from engine import Budget, Fix, SceneMatcher
+from engine import Budget, Fix, MatcherOptions, SceneMatcher, SiftOptions
 from engine.budget import Deadline
 from engine.matching import feature_matching
 from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.refinement import Refinement
 from engine.matching.sift import Sift
 from engine.matching.views import drawn_px
-from engine.options import MatcherOptions, SiftOptions
 from tests.matching.test_scheduler import FixedCosts, out_of_time
 
 NADIR = np.array([310.0, 305.0])
@@ -83,9 +82,7 @@ def test_doubtful_few_features_give_way_to_all(ground, camera, matcher, monkeypa
 
 
 @pytest.mark.parametrize("abandoned", [False, True])
-def test_where_refinement_fails_or_is_abandoned_all_features_give_the_pose(
-    ground, camera, matcher, plain, monkeypatch, abandoned
-):
+def test_without_refinement_all_features_give_the_pose(ground, camera, matcher, plain, monkeypatch, abandoned):
     frame, prior = shot(ground, camera), ground.prior(NADIR)
     expected = plain.locate(frame, prior)
     refuse_to_refine(monkeypatch)

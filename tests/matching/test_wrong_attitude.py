@@ -68,9 +68,7 @@ def test_a_heading_that_the_matches_refute_makes_the_tilt_as_doubtful(ground, si
 
 
 @pytest.mark.parametrize("nadir_px", [(310.0, 305.0), (290.0, 320.0), (330.0, 280.0)])
-def test_a_pose_by_features_that_the_picture_does_not_confirm_rests_on_no_told_tilt(
-    ground, matchers, camera, monkeypatch, nadir_px
-):
+def test_an_unconfirmed_pose_by_features_rests_on_no_told_tilt(ground, matchers, camera, monkeypatch, nadir_px):
     """Most of the picture is noise; a tilt wrong by 7 degrees, held to 0.4, would move the pose by a metre."""
     monkeypatch.setattr(Sift, "refined", lambda *_: None)
     frame, nadir = ground.frame(camera, np.array(nadir_px), 150.0, **TRUE), np.array(nadir_px)
@@ -84,14 +82,11 @@ def test_a_pose_by_features_that_the_picture_does_not_confirm_rests_on_no_told_t
 
 @pytest.mark.parametrize("method", ["ncc", "auto"])
 @pytest.mark.parametrize("pitch_deg", [6.0, 9.0, 12.0])
-def test_over_a_map_alone_a_camera_that_only_says_it_is_level_gives_no_wrong_fix(
-    ground, camera, method, pitch_deg
-):
+def test_over_a_map_alone_a_camera_that_says_it_is_level_gives_no_wrong_fix(ground, camera, method, pitch_deg):
     """Taken for a slope of the ground, its tilt would move the fix by 16 to 32 m."""
     frame = replace(ground.frame(camera, NADIR, 150.0, pitch_deg=pitch_deg), pitch_deg=0.0)
-    result = SceneMatcher(ground.map_of(georeference_sigma_m=0.1), camera, method, "cpu").locate(
-        frame, ground.prior(NADIR)
-    )
+    matcher = SceneMatcher(ground.map_of(georeference_sigma_m=0.1), camera, method, "cpu")
+    result = matcher.locate(frame, ground.prior(NADIR))
     assert isinstance(result, NoFix) or ground.chi_square(result, NADIR) < 9.0
 
 
@@ -106,25 +101,6 @@ def test_a_tilt_of_the_wrong_sign_never_displaces_a_fix(ground, matchers, camera
         assert np.hypot(*ground.off_m(answer, NADIR)) < 1.0
     else:
         assert answer.reason in (Reason.BAD_POSE, Reason.LOW_SCORE, Reason.AMBIGUOUS)
-
-
-@pytest.mark.slow
-def test_no_tilt_that_is_stated_wrongly_displaces_a_fix(ground, matchers, camera):
-    """Of 30 tilts of 6 to 16 degrees, stated with other signs, swapped, or as zero."""
-    rng, fixed = np.random.default_rng(3), 0
-    stated = [lambda r, p: (-r, -p), lambda r, p: (p, r), lambda r, p: (r, -p), lambda r, p: (0.0, 0.0)]
-    for k in range(30):
-        nadir, tilt, way = rng.uniform(260, 360, 2), rng.uniform(6, 16), rng.uniform(0, 2 * math.pi)
-        true = (tilt * math.cos(way), tilt * math.sin(way))
-        right, wrong = (
-            dict(zip(("roll_deg", "pitch_deg"), angles, strict=True)) for angles in (true, stated[k % 4](*true))
-        )
-        frame = ground.frame(camera, nadir, 150.0, heading_deg=rng.uniform(0, 360), **right)
-        fix = matchers["ncc"].locate(replace(frame, **wrong), ground.prior(nadir))
-        if isinstance(fix, Fix):
-            fixed += 1
-            assert np.hypot(*ground.off_m(fix, nadir)) < 1.0
-    assert fixed >= 27
 
 
 @pytest.mark.parametrize("knows_better", [True, False, None])
@@ -156,10 +132,8 @@ def test_a_pose_that_is_hardly_confirmed_gives_way_to_one_that_is(ground, site, 
         (14.0, None, "unconfirmed", 14.0 + math.log(0.02)),
     ],
 )
-def test_a_refined_pose_is_evidence_for_the_place_and_without_it_only_the_prior_confirms_the_attitude(
-    ground, site, camera, monkeypatch, nats, refined_nats, stage, left
-):
-    """The usual risk asks for 9.2 nats."""
+def test_a_refined_pose_is_evidence_of_place(ground, site, camera, monkeypatch, nats, refined_nats, stage, left):
+    """Without it the prior alone confirms the attitude. The usual risk asks for 9.2 nats."""
     monkeypatch.setattr(Ncc, "find", weakened(nats))
     monkeypatch.setattr(Ncc, "match_structure", lambda *_: None)
     monkeypatch.setattr(Refinement, "refine_at_once", lambda _self, _fix: None)
@@ -194,9 +168,7 @@ def refined(fix, score):
     return Refined(replace(fix, stage="refined", score=score), None, None, None, is_consistent=True)
 
 
-def test_a_refined_pose_does_not_stand_for_the_structure_that_a_search_must_show(
-    ground, site, camera, monkeypatch
-):
+def test_a_refined_pose_does_not_replace_the_structure_that_a_search_must_show(ground, site, camera, monkeypatch):
     """Of a place found without a prior, the best of a whole map."""
     monkeypatch.setattr(Evidence, "nats", 20.0)
     monkeypatch.setattr(Ncc, "match_structure", lambda *_: None)
@@ -207,9 +179,7 @@ def test_a_refined_pose_does_not_stand_for_the_structure_that_a_search_must_show
 
 
 @pytest.mark.parametrize(("pose_nats", "stage"), [(11.0, "refined"), (8.0, "fine")])
-def test_a_pose_must_outdo_chance_at_its_place_and_not_among_all_places_of_the_window(
-    ground, camera, monkeypatch, pose_nats, stage
-):
+def test_a_pose_must_outdo_chance_at_its_place_alone(ground, camera, monkeypatch, pose_nats, stage):
     """The peak has settled the place: a blurred map shows a weak pose there, whose tilt counts all the same."""
     monkeypatch.setattr(Ncc, "find", weakened(14.0))
     monkeypatch.setattr(Refinement, "refine_pose", lambda _, fix: refined(fix, 0.3))

@@ -9,19 +9,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from engine.errors import StateError, TelemetryError
-from engine.navigation.live import Live, LiveOptions
-from engine.options import NavigatorOptions
+from engine import Live, LiveOptions, NavigatorOptions, StateError, TelemetryError
 from engine.values import Fix, Frame, NoFix, Prior, Reason
 from tests.support.fixes import a_fix
 from tests.support.waiting import wait_until
 
-IMAGE = np.zeros((4, 4), np.uint8)
-OPTIONS = NavigatorOptions(max_speed_mps=16.0)
-
 
 def frame(number: int) -> Frame:
-    return Frame(IMAGE, number)
+    return Frame(np.zeros((4, 4), np.uint8), number)
 
 
 def fix(of: Frame) -> Fix:
@@ -43,7 +38,7 @@ class Navigators:
         if callable(odd):
             odd()
             odd = {}
-        return SimpleNamespace(update=partial(self.update, odd), options=OPTIONS)
+        return SimpleNamespace(update=partial(self.update, odd), options=NavigatorOptions(max_speed_mps=16.0))
 
     def update(self, odd, frame, prior=None, budget=None):
         self.budgets.append(budget.total_ms)

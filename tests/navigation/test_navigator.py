@@ -6,9 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Navigator, NavigatorState
-from engine.budget import Budget
-from engine.errors import TelemetryError
+from engine import Budget, Navigator, NavigatorState, TelemetryError
 from engine.options import NavigatorOptions
 from engine.values import Attitude, Fix, NoFix, Prior, Reason
 from scenematch.runs.paper_recipe import ACCEPT_ALL

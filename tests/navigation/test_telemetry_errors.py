@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine import Camera, Navigator, Prior, SceneMatcher
-from engine.assumed_errors import AssumedErrors
+from engine import AssumedErrors, Attitude, Camera, Fix, Frame, Navigator, Prior, SceneMatcher
 from engine.navigation.telemetry_errors import TelemetryErrors, considered
 from engine.options import NavigatorOptions
-from engine.values import Attitude, Fix, Frame
 from scenematch.runs.paper_recipe import ACCEPT_ALL
 from scenematch.simulator import plan_flight
 from tests.support.fields import fields_of
@@ -23,7 +21,6 @@ from tests.support.towns import drawn_town
 IMAGE = np.zeros((4, 4), np.uint8)
 HEIGHT_M, INTERVAL_S = 150.0, 0.1
 ASSUMED = AssumedErrors()
-CAMERA = Camera.from_fov(4, 4, 60.0)
 ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 CALM = Frame(IMAGE, None, HEIGHT_M, 40.0, 0.0, 0.0)
 
@@ -99,7 +96,7 @@ def test_a_corrected_height_makes_a_fix_less_certain_the_more_the_camera_looks_a
     grown_m = []
     for pitch_deg in (0.0, 45.0):
         tilted, looked = replace(fix, attitude=Attitude(0.0, pitch_deg, 0.0)), replace(shown, pitch_deg=pitch_deg)
-        variance_m2 = considered(tilted, frame, looked, CAMERA).covariance_m2[0, 0]
+        variance_m2 = considered(tilted, frame, looked, Camera.from_fov(4, 4, 60.0)).covariance_m2[0, 0]
         grown_m.append(math.sqrt(variance_m2 - fix.covariance_m2[0, 0]))
     edge = math.tan(math.radians(2.0))
     assert grown_m == pytest.approx([10.0 * edge, 10.0 * (1.0 + edge)])

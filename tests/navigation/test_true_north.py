@@ -72,9 +72,7 @@ def test_a_heading_that_was_searched_for_is_the_true_one(make, polar, frame, kno
 
 
 def test_an_explanation_lays_the_frame_by_its_true_heading(make, frame):
-    scores = [
-        make("ncc").explain(stated, Window(300, 100, 340, 400)).surface.score
-        for stated in (frame, replace(frame, heading_deg=PLANE_DEG))
-    ]
+    window, told = Window(300, 100, 340, 400), (frame, replace(frame, heading_deg=PLANE_DEG))
+    scores = [make("ncc").explain(stated, window).surface.score for stated in told]
     assert scores[0] > 0.97
     assert scores[1] < 0.93

@@ -7,10 +7,9 @@ from dataclasses import replace
 import pytest
 
 from engine import OptionError
-from scenematch import FlightFiles, TrackSettings, track
+from scenematch import FlightFiles, TrackSettings, parse_runs, track
 from scenematch.cli.app import run
 from scenematch.files.track import read_track
-from scenematch.runs.comparison import parse_runs
 from tests.support.commands import file_options, refusal
 
 

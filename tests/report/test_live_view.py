@@ -230,12 +230,8 @@ def test_the_bridges_tell_the_watcher_every_answer(bridge, sim_site):
         from scenematch.bridges.links import Connection
         from scenematch.bridges.parameters import MavlinkOptions
 
-        made = mavlink.MavlinkBridge(
-            Connection("udpin", "127.0.0.1", 0),
-            quiet,
-            MavlinkOptions(),
-            watch=lambda answer, _: stated.append(answer),
-        )
+        link, options = Connection("udpin", "127.0.0.1", 0), MavlinkOptions()
+        made = mavlink.MavlinkBridge(link, quiet, options, watch=lambda answer, _: stated.append(answer))
     else:
         made = RosBridge(StandInNode(maker_of("ros2")), sim_site, quiet, RosOptions(), watch=stated.append)
     made.deliver(answer)
@@ -275,7 +271,7 @@ def test_what_cannot_be_watched_is_refused_in_one_line_before_any_work(tmp_path,
 def test_the_viewer_draws_it_without_a_complaint(runs, tmp_path):
     picture = tmp_path / "view.png"
     recording = runs / "ncc.rrd"
-    with browser.serve_recording(recording) as address, browser.open_browser(browser.SOFTWARE_GL) as page:
+    with browser.serve_recording(recording) as address, browser.open_browser(browser.WITH_GL) as page:
         page.open(address, 1200, 800)
         page.wait_until_still()
         page.save(picture)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from rasterio import Affine
 
-from engine import OrthoMap
-from engine.values import Window
+from engine import OrthoMap, Window
 from scenematch.report.page_map import map_colours
 from tests.support.rasters import write_raster
 

@@ -22,19 +22,11 @@ def truth_at(east_m, north_m, second, **known):
 
 def fix_at(east_m, north_m, second, sigma_m=(1.0, 1.0), covariance_m2=0.0, **known):
     lat, lon = HERE.geodetic_from_enu(east_m, north_m)
-    return TrackRow(
-        timestamp_ns=second * SECOND_NS,
-        frame=f"{second:06d}.jpg",
-        status="fix",
-        lat_deg=float(lat),
-        lon_deg=float(lon),
-        east_m=east_m,
-        north_m=north_m,
-        sigma_east_m=sigma_m[0],
-        sigma_north_m=sigma_m[1],
-        covariance_en_m2=covariance_m2,
-        **({"method": "ncc", "latency_ms": 10.0, "deadline_met": True} | known),
-    )
+    place = {"lat_deg": float(lat), "lon_deg": float(lon), "east_m": east_m, "north_m": north_m}
+    sigmas = {"sigma_east_m": sigma_m[0], "sigma_north_m": sigma_m[1], "covariance_en_m2": covariance_m2}
+    told = {"method": "ncc", "latency_ms": 10.0, "deadline_met": True} | known
+    frame = {"timestamp_ns": second * SECOND_NS, "frame": f"{second:06d}.jpg", "status": "fix"}
+    return TrackRow(**frame, **place, **sigmas, **told)
 
 
 def refusal_at(second, reason="ambiguous", **known):

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine import Fix, NoFix, OptionError, OrthoMap, Prior
+from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, Window
 from engine.options import NccOptions, SiftOptions
-from engine.values import Reason, Window
 from scenematch import TrackSettings, evaluate
 from scenematch.cli.app import run
 from scenematch.files.settings import changed, nested, options_from_mapping
@@ -32,22 +31,10 @@ pytestmark = pytest.mark.usefixtures("bare_runs")
 
 def summary_of(**known):
     """Ten frames, nine of them fixed and right, but for what is given."""
-    return {
-        "frames": 10,
-        "fixes": 9,
-        "reasons": {"ambiguous": 1},
-        "latency_ms": {"p95": 9.94},
-        "deadlines_missed": 0,
-        "scored_fixes": 9,
-        "median_m": 0.12,
-        "max_m": 0.42,
-        "wrong_over_10m": 0,
-        "false_fixes": 0,
-        "beyond_3_sigma": 0,
-        "nees_mean": 1.9,
-        "stated_sigma_median_m": 0.4,
-        "settings": {"budget_ms": 40.0},
-    } | known
+    counts = {"frames": 10, "fixes": 9, "reasons": {"ambiguous": 1}, "deadlines_missed": 0, "scored_fixes": 9}
+    errors = {"median_m": 0.12, "max_m": 0.42, "wrong_over_10m": 0, "false_fixes": 0}
+    sigmas = {"beyond_3_sigma": 0, "nees_mean": 1.9, "stated_sigma_median_m": 0.4}
+    return counts | errors | sigmas | {"latency_ms": {"p95": 9.94}, "settings": {"budget_ms": 40.0}} | known
 
 
 @pytest.mark.parametrize(
@@ -310,9 +297,7 @@ def test_seconds_and_numbers_of_frames_are_not_drawn_over_one_axis(flown, tmp_pa
     assert "Stated sigma (m)" not in mixed.read_text(encoding="utf-8")
 
 
-def test_a_page_for_a_folder_that_is_not_there_is_refused_before_anything_is_drawn(
-    flown, tmp_path, monkeypatch, capsys
-):
+def test_a_page_for_no_folder_is_refused_before_anything_is_drawn(flown, tmp_path, monkeypatch, capsys):
     other = shutil.copytree(flown, tmp_path / "other")
     monkeypatch.setattr("scenematch.runs.evaluation.draw_together", lambda *_, **__: pytest.fail("drawn"))
     page = tmp_path / "nofolder" / "x.html"

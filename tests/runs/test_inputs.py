@@ -179,9 +179,8 @@ def test_a_live_camera_by_its_field_of_view_has_the_size_of_its_first_picture(tm
     picture, messages = tmp_path / "1.jpg", []
     Image.fromarray(noise()).save(picture)
     source = f"exec:{shlex.join(['cat', str(picture)])}"
-    files = BridgeFiles(
-        map=MapInput("m.tif"), camera_source=source, camera=CameraInput(hfov_deg=90.0, mount="nadir-tail")
-    )
+    lens = CameraInput(hfov_deg=90.0, mount="nadir-tail")
+    files = BridgeFiles(map=MapInput("m.tif"), camera_source=source, camera=lens)
     camera = files.load_camera(SimpleNamespace(message=messages.append))
     assert (camera.width_px, camera.height_px, camera.matrix[0, 0]) == (80, 60, pytest.approx(40.0))
     assert np.array_equal(camera.mount, mount_rotation("nadir-tail"))
@@ -243,9 +242,8 @@ def calibration(tmp_path):
 
 
 def test_a_calibration_is_scaled_on_request_and_said(photos, calibration):
-    files = FlightFiles.from_flat(
-        map="m.tif", frames=photos, camera=calibration, scale_calibration=True, mount="nadir-tail"
-    )
+    given = {"camera": calibration, "scale_calibration": True, "mount": "nadir-tail"}
+    files = FlightFiles.from_flat(map="m.tif", frames=photos, **given)
     messages = []
     progress = SimpleNamespace(message=messages.append)
     camera = files.load_camera(files.open_flight(), progress)
@@ -268,9 +266,7 @@ def test_without_the_request_another_size_is_refused_and_the_request_named(photo
 def test_nothing_to_scale_and_another_shape_are_refused(photos, calibration):
     with pytest.raises(OptionError, match="scale_calibration: expected with `camera`"):
         FlightFiles.from_flat(map="m.tif", frames=photos, scale_calibration=True)
-    calibration.write_text(
-        calibration.read_text().replace("image_height: 480", "image_height: 360"), encoding="utf-8"
-    )
+    calibration.write_text(calibration.read_text().replace("image_height: 480", "image_height: 360"))
     files = FlightFiles.from_flat(map="m.tif", frames=photos, camera=calibration, scale_calibration=True)
     with pytest.raises(CalibrationError, match="a part may have been cut off"):
         load(files)

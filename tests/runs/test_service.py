@@ -19,15 +19,12 @@ import pytest
 from engine import OptionError, SceneMatcher
 from engine.navigation.live import Counts
 from engine.runtime.realtime import _FIFO_CURE, _MEMORY_CURE
+from scenematch import BridgeFiles, FlightFiles, Progress, RosSettings, run_ros_bridge
 from scenematch.bridges.camera_stream import _IDLE_S, _REOPEN_S, _TIMEOUTS
 from scenematch.bridges.ros import RosStatus, RosTopics
 from scenematch.runs import mavlink_bridge, service
-from scenematch.runs.bridge_files import BridgeFiles
-from scenematch.runs.inputs import FlightFiles
 from scenematch.runs.last_fix import LastFix, last_fix_file
 from scenematch.runs.mavlink_bridge import BridgeSettings, MavlinkSettings, run_mavlink_bridge
-from scenematch.runs.output import Progress
-from scenematch.runs.ros_bridge import RosSettings, run_ros_bridge
 from scenematch.runs.service import _BEATS, running_service, status_reporter
 from tests.support.paths import ROOT
 from tests.support.ros import StandInNode, maker_of
@@ -131,9 +128,7 @@ def test_a_manager_that_does_not_read_stops_nobody(manager):
     assert time.monotonic() - begin_s < 60.0
 
 
-def test_a_bridge_is_ready_when_its_link_is_open_and_its_loop_feeds_the_watchdog(
-    manager, flight_in, tmp_path, monkeypatch
-):
+def test_a_bridge_with_an_open_link_is_ready_and_feeds_the_watchdog(manager, flight_in, tmp_path, monkeypatch):
     monkeypatch.setenv("WATCHDOG_USEC", "800000")  # no more beats than the socket's queue holds
     monkeypatch.setattr(mavlink_bridge, "end_on_sigterm", lambda: None)
     monkeypatch.setattr(mavlink_bridge, "_AUTOPILOT_TIMEOUT_S", 0.5)
@@ -243,9 +238,8 @@ def test_the_units_command_is_one_of_the_command_line(unit):
     program, *words = unit["ExecStart"].split()
     assert program.endswith("/scenematch")
     assert run([*words, "--help"]) == 0
-    asked = [
-        word.replace("/srv/scenematch", "/nowhere").replace("realtime=true", "realtime=false") for word in words
-    ]
+    elsewhere = " ".join(words).replace("/srv/scenematch", "/nowhere")
+    asked = elsewhere.replace("realtime=true", "realtime=false").split()
     assert run(asked) == 1  # every option is known: what is wrong is the map, which is not there
 
 

@@ -18,7 +18,6 @@ from tests.support.commands import file_options, refusal
 from tests.support.runs import bare_runs
 
 FOLDER = {"frames", "telemetry.csv", "truth.csv", "camera.yaml", "map.tif", "dsm.tif"}
-LOOP = {"track.csv", "loop.csv", "summary.json", "loop.json"}
 pytestmark = pytest.mark.usefixtures("bare_runs")
 
 
@@ -84,7 +83,7 @@ def test_a_map_of_ones_own_is_the_world_and_the_day_changes_its_pictures(folder,
 @pytest.mark.slow
 def test_a_closed_loop_leaves_a_flight_folder_with_its_results(loop):
     names = {path.name for path in loop.iterdir()}
-    assert names >= FOLDER | LOOP
+    assert names >= FOLDER | {"track.csv", "loop.csv", "summary.json", "loop.json"}
     flight = open_flight(loop / "frames", loop / "telemetry.csv", Camera.load(loop / "camera.yaml"))
     rows, truth = read_track(loop / "track.csv"), read_truth(loop / "truth.csv")
     assert len(flight) == len(rows) == 30

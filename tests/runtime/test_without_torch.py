@@ -10,7 +10,6 @@ from tests.support.interpreters import done_by
 from tests.support.paths import ROOT
 
 ENGINE = ROOT / "engine"
-SAY = "\nimport sys; print('TORCH', 'torch' in sys.modules)"
 FLIGHT = """
 import sys, numpy as np
 from engine import Budget, Camera, Fix, Navigator, SceneMatcher
@@ -34,7 +33,7 @@ for method in sys.argv[1:]:
 
 
 def run(program, *words):
-    return done_by(program + SAY, *words).stdout.split()
+    return done_by(program + "\nimport sys; print('TORCH', 'torch' in sys.modules)", *words).stdout.split()
 
 
 def imported(node: ast.AST) -> Iterator[str]:

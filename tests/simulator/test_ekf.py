@@ -9,18 +9,9 @@ import pytest
 
 from engine import Attitude, StateError
 from engine.geo import enu_from_body
-from scenematch.simulator import ekf
+from scenematch.simulator import ekf, quadrotor
 from scenematch.simulator.ekf import STATES, FilterState, History, fuse_fix, fuse_heading, fuse_height
-from scenematch.simulator.quadrotor import (
-    STEP_S,
-    IdealImu,
-    WindField,
-    advance,
-    hovering,
-    rotation,
-    rotation_vector,
-    shaken,
-)
+from scenematch.simulator.quadrotor import STEP_S, IdealImu, WindField, advance, hovering, rotation_vector, shaken
 from scenematch.simulator.sensors import Instruments, SensorSuite
 from tests.support.fixes import a_fix
 
@@ -37,23 +28,16 @@ SAMPLE = IdealImu(np.array([0.4, -0.3, -9.6]), np.array([0.2, -0.1, 0.3]))
 def some_belief() -> FilterState:
     rng = np.random.default_rng(2)
     spread = rng.normal(0.0, 0.3, (STATES, STATES))
-    return FilterState(
-        4.0,
-        np.array([10.0, -5.0, 120.0]),
-        np.array([6.0, 2.0, -0.5]),
-        enu_from_body(4.0, -9.0, 130.0),
-        np.array([0.05, -0.02, 0.03]),
-        np.array([0.001, 0.002, -0.001]),
-        0.4,
-        0.02,
-        spread @ spread.T + 0.01 * np.eye(STATES),
-    )
+    place_m, velocity_mps = np.array([10.0, -5.0, 120.0]), np.array([6.0, 2.0, -0.5])
+    biases = np.array([0.05, -0.02, 0.03]), np.array([0.001, 0.002, -0.001]), 0.4, 0.02
+    covariance = spread @ spread.T + 0.01 * np.eye(STATES)
+    return FilterState(4.0, place_m, velocity_mps, enu_from_body(4.0, -9.0, 130.0), *biases, covariance)
 
 
 def moved(estimate: FilterState, error: np.ndarray) -> FilterState:
     """The truth where the estimate is off by an error."""
     sums = {name: getattr(estimate, name) + error[part] for name, part in ADDITIVE.items()}
-    return replace(estimate, enu_from_body=rotation(error[ekf.TURN]) @ estimate.enu_from_body, **sums)
+    return replace(estimate, enu_from_body=quadrotor.rotation(error[ekf.TURN]) @ estimate.enu_from_body, **sums)
 
 
 def apart(truth: FilterState, estimate: FilterState) -> np.ndarray:

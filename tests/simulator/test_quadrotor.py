@@ -6,20 +6,9 @@ import numpy as np
 import pytest
 
 from engine.geo import attitude_from_rotation, enu_from_body
+from scenematch.simulator import quadrotor
 from scenematch.simulator.pilot import Pilot, plan_rounds, plan_route
-from scenematch.simulator.quadrotor import (
-    MAX_TILT_DEG,
-    SHAKE_DEG,
-    STEP_S,
-    IdealImu,
-    WindField,
-    advance,
-    aim,
-    hovering,
-    rotation,
-    rotation_vector,
-    shaken,
-)
+from scenematch.simulator.quadrotor import SHAKE_DEG, STEP_S, WindField, advance, aim, hovering, rotation, shaken
 from scenematch.simulator.sensors import Barometer, Compass, Imu, Instruments, SensorSuite
 from scenematch.simulator.vehicle import GRAVITY_MPS2, FlightStyle
 
@@ -32,7 +21,7 @@ def test_rotation_vectors_go_there_and_back(angle):
     axis = np.array([0.48, -0.6, 0.64])
     turned = rotation(angle * axis)
     np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(rotation_vector(turned), angle * axis, atol=1e-9)
+    np.testing.assert_allclose(quadrotor.rotation_vector(turned), angle * axis, atol=1e-9)
     np.testing.assert_allclose(turned @ axis, axis, atol=1e-12)
 
 
@@ -67,7 +56,7 @@ def test_the_attitude_gives_the_acceleration_that_is_asked_for(heading):
 def test_tilt_is_limited_and_thrust_never_pushes_down():
     for wanted in ([40.0, 0.0, 0.0], [3.0, 3.0, -30.0]):
         attitude, force = aim(np.array(wanted), 10.0)
-        assert math.degrees(math.acos(-attitude[2, 2])) <= MAX_TILT_DEG + 1e-9
+        assert math.degrees(math.acos(-attitude[2, 2])) <= quadrotor.MAX_TILT_DEG + 1e-9
         assert force[2] > 0.0
 
 
@@ -168,7 +157,7 @@ def test_rounds_last_as_long_as_they_should():
 
 
 STILL = hovering(np.array([10.0, -20.0, 120.0]), 359.5)
-NOTHING = IdealImu(np.zeros(3), np.zeros(3))
+NOTHING = quadrotor.IdealImu(np.zeros(3), np.zeros(3))
 
 
 def instruments(seed=0, **sensors):

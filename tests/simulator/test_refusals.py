@@ -8,9 +8,8 @@ import pytest
 
 from engine import Attitude, Camera, OptionError
 from scenematch.runs.simulation import WorldSettings
-from scenematch.simulator import Condition, FlightStyle, SensorNoise, build_town, plan_flight
+from scenematch.simulator import LIGHTS, Condition, FlightStyle, SensorNoise, build_town, plan_flight
 from scenematch.simulator.flight import paper_camera
-from scenematch.simulator.light import LIGHTS
 from scenematch.simulator.optics import through_lens
 from scenematch.simulator.render import Atmosphere, render_frame
 from tests.support.patches import CAMERA, ORIGIN, patch_world
@@ -19,10 +18,6 @@ from tests.support.towns import drawn_town
 LEVEL = Attitude(0.0, 0.0, 0.0)
 BENT = Camera(300, 300, CAMERA.matrix, distortion=np.array([0.1, 0, 0, 0, 0]))
 WIDE = Camera(300, 300, np.array([[60, 0, 149.5], [0, 60, 149.5], [0, 0, 1]]), "equidistant", np.zeros(4))
-SMALL = np.zeros((3, 3), np.float32)
-
-
-POSITIVE = (SensorNoise, FlightStyle)
 
 
 def numbers_of(kind):
@@ -61,7 +56,7 @@ def seen(height_agl_m=150.0, attitude=LEVEL, camera=CAMERA):
         (lambda: plan_flight(town=drawn_town(), style=FlightStyle(height_agl_m=400.0)),
          "town: expected a map larger"),
         *((partial(kind, **{name: value}), name)
-          for kind in POSITIVE for name in numbers_of(kind) for value in (-1.0, math.nan)),
+          for kind in (SensorNoise, FlightStyle) for name in numbers_of(kind) for value in (-1.0, math.nan)),
     ],
 )  # fmt: skip
 def test_an_option_that_cannot_be_is_refused(make, words):

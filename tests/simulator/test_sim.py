@@ -128,9 +128,8 @@ def test_the_nose_dips_to_speed_up_and_points_along_the_leg():
     assert 4.0 < braking.pitch_deg[0] < 7.2
     assert speeding.heading_deg[0] == pytest.approx(90.0, abs=2.0)
     np.testing.assert_allclose(motion.position_m[-1, :2], (200.0, 0.0), atol=1.5)
-    np.testing.assert_allclose(
-        np.diff(motion.position_m, axis=0)[100:-1] / COURSE_STEP_S, motion.velocity_mps[100:-2], atol=0.05
-    )
+    steps_m = np.diff(motion.position_m, axis=0)[100:-1]
+    np.testing.assert_allclose(steps_m / COURSE_STEP_S, motion.velocity_mps[100:-2], atol=0.05)
 
 
 def test_telemetry_errs_as_documented(sim_town):

@@ -1,7 +1,5 @@
 """A headless Chromium: what a page does in it, what it asks for, and pictures of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -23,12 +21,7 @@ FLAGS = (
     "--disable-sync", "--no-first-run", "--hide-scrollbars",
 )  # fmt: skip
 WITHOUT_GL = ("--disable-gpu",)
-SOFTWARE_GL = (
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-)
+WITH_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 _PATIENCE_S = 200.0
 _STILL_S = 3.0  # without a change, after which a viewer has drawn all that it has
 
@@ -121,7 +114,7 @@ class Browser:
 
 @contextmanager
 def open_browser(gl: tuple[str, ...] = WITHOUT_GL) -> Iterator[Browser]:
-    """A browser with a profile of its own, closed at the end; with ``SOFTWARE_GL`` it draws in 3D."""
+    """A browser with a profile of its own, closed at the end; with ``WITH_GL`` it draws in 3D."""
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 

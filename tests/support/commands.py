@@ -1,7 +1,5 @@
 """Commands of the command line: what there are, options of a flight's files, and the one line of a refusal."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

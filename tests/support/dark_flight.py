@@ -1,7 +1,5 @@
 """A flight with a frame that shows nothing, and what the page of its report is given."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

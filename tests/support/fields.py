@@ -1,7 +1,5 @@
 """Fields of values that hold arrays."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 

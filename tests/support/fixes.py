@@ -1,7 +1,5 @@
 """Fixes for tests that need one, whatever it says, and what is asked of one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

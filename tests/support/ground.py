@@ -4,8 +4,6 @@ Its pictures share no line with the engine: rays are turned vector by vector, pl
 own topocentric frame, and grey levels come from a spline, for the map and for the frames alike.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache

@@ -1,7 +1,5 @@
 """Landmarks of a map that are found once, however many matchers ask for them."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 from engine.maps.landmarks import LandmarkMap

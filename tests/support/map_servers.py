@@ -3,8 +3,6 @@
 It shares no code with what asks it. What should go wrong is put into ``trouble``.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import threading

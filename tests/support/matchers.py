@@ -1,7 +1,5 @@
 """A matcher for navigators that answers from a list, over a map that is none, and flights of frames by it."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from types import SimpleNamespace

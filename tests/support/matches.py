@@ -1,7 +1,5 @@
 """The accepted pairs of matched features."""
 
-from __future__ import annotations
-
 from engine.features import Matches
 
 

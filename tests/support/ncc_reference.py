@@ -1,7 +1,5 @@
 """NCC literally by the equation, in float64: the reference for the other kernels' tests."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray

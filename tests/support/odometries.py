@@ -1,7 +1,5 @@
 """Messages of other odometries, as those of cameras publish them, from what is true."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

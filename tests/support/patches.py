@@ -1,12 +1,9 @@
 """A world of one bright patch on a dark box: where its pixels must lie in a picture is known by other means."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from engine.camera import Camera
+from engine import Attitude, Camera
 from engine.geo import LocalFrame, enu_from_body
-from engine.values import Attitude
 from scenematch.simulator import World
 from scenematch.simulator.render import transformer
 

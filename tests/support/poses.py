@@ -1,7 +1,5 @@
 """Matches with a known pose and matches with none, drawn."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -63,16 +61,11 @@ def scene(
 
 def any_scene(rng: np.random.Generator, ground: str) -> Scene:
     """A camera 60 to 300 m up, 15 to 300 matches, noise of 0.3 to 1 px, up to 60 % of them wrong."""
-    return scene(
-        rng,
-        int(rng.integers(15, 301)),
-        noise_px=rng.uniform(0.3, 1.0),
-        wrong=rng.uniform(0, 0.6),
-        relief_m=40.0 if ground == "high relief" else 0.0,
-        tilt_deg=rng.uniform(10, 30) if ground == "tilted" else rng.uniform(0, 3),
-        height_m=rng.uniform(60, 300),
-        is_distorted=ground == "distorted",
-    )
+    count, noise_px, wrong = int(rng.integers(15, 301)), rng.uniform(0.3, 1.0), rng.uniform(0, 0.6)
+    tilt_deg = rng.uniform(10, 30) if ground == "tilted" else rng.uniform(0, 3)
+    view = {"tilt_deg": tilt_deg, "height_m": rng.uniform(60, 300), "is_distorted": ground == "distorted"}
+    relief_m = 40.0 if ground == "high relief" else 0.0
+    return scene(rng, count, noise_px=noise_px, wrong=wrong, relief_m=relief_m, **view)
 
 
 def attitude(rng: np.random.Generator, tilt_deg: float) -> Array:

@@ -37,14 +37,8 @@ class Pretended(Tensor):
 
     @staticmethod
     def __new__(cls, inner: Tensor) -> Pretended:
-        made = Tensor._make_wrapper_subclass(
-            cls,
-            inner.size(),
-            strides=inner.stride(),
-            storage_offset=inner.storage_offset(),
-            dtype=inner.dtype,
-            device=DEVICE,
-        )
+        layout = {"strides": inner.stride(), "storage_offset": inner.storage_offset()}
+        made = Tensor._make_wrapper_subclass(cls, inner.size(), **layout, dtype=inner.dtype, device=DEVICE)
         made.inner = inner
         return made
 
@@ -117,9 +111,8 @@ class Crossings(TorchDispatchMode):
                 self.uploads += [t.numel() for t in uploaded]
                 others = [t for t in others if all(t is not u for u in uploaded)]
         if mine and others:
-            raise RuntimeError(
-                f"{func}: expected all tensors on one device, got {[t.shape for t in others]} on cpu"
-            )
+            shapes = [t.shape for t in others]
+            raise RuntimeError(f"{func}: expected all tensors on one device, got {shapes} on cpu")
 
 
 # Arguments and results of an operation are tensors, numbers, and lists, tuples and dictionaries of them: the trees

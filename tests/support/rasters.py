@@ -1,7 +1,5 @@
 """Small rasters in files."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,8 +10,7 @@ from affine import Affine
 from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterWindow
 
-from engine import OrthoMap
-from engine.values import Window
+from engine import OrthoMap, Window
 
 
 def whole(site: OrthoMap, level: int = 0) -> Window:

@@ -1,7 +1,5 @@
 """Messages of both ROS by rosbags' types, and a node of a bridge that keeps what is published."""
 
-from __future__ import annotations
-
 import threading
 
 from rosbags.rosbag1 import Writer as Writer1

@@ -1,7 +1,5 @@
 """Runs of the commands without what costs most and no test of a command looks at."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

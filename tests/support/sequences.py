@@ -4,8 +4,6 @@ Gaps, duplicate and backward stamps, NaN priors, flat, black and saturated frame
 types, impossible telemetry.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

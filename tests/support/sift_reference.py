@@ -3,8 +3,6 @@
 Keypoints are rows x, y, growth, contrast, level, octave, in pixels of the octave, as in :mod:`engine.sift.loops`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Subtitles as DJI's drones write them beside a video."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tensors compared."""
 
-from __future__ import annotations
-
 import numpy as np
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Calls from several threads at once."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Simulated towns as maps."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import pickle

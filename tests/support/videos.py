@@ -1,7 +1,5 @@
 """Small videos for tests."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,9 +1,8 @@
 """Wait for what other threads and processes do."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 
 def wait_until(holds: Callable[[], object], timeout_s: float = 60.0) -> None:
@@ -12,3 +11,11 @@ def wait_until(holds: Callable[[], object], timeout_s: float = 60.0) -> None:
     while not holds():
         assert time.monotonic() < end
         time.sleep(0.01)
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process is not gone, nor dead and not yet reaped."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
