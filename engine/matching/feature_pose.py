@@ -6,7 +6,6 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,19 +13,20 @@ from numpy.typing import NDArray
 
 from engine.assumed_errors import AssumedErrors
 from engine.geo import attitude_from_rotation, wrap_difference_deg
+from engine.kernels.dense import Pose
 from engine.maps.landmarks import LandmarkMap
 from engine.matching import refusals
 from engine.matching.align import MIN_DOWN
 from engine.matching.candidates import PoseCandidate
 from engine.matching.covariance import tilt_covariance
-from engine.matching.evidence import Evidence, probability
+from engine.matching.evidence import RELIABILITY, Evidence, probability
 from engine.matching.feature_matching import VOTE_SHARE, Matched, match_views
-from engine.matching.pose import MIN_INLIERS, PoseStats, solve_pose
+from engine.matching.pose import MIN_INLIERS, AttitudePrior, PoseStats, solve_pose
 from engine.matching.query import Query
+from engine.matching.unknown_slope import from_level_ground, wide_slope_deg
 from engine.matching.views import TelemetryHypothesis, coarser_scale, level_at, view_in, views_of, x_axis_deg
 from engine.matching.votes import TURNS_DEG, Vote
 from engine.options import MIN_HEIGHT_M, PAPER_SCALE, SiftOptions
-from engine.orthomap import OrthoMap
 from engine.values import Attitude, Fix, NoFix, Reason, Window
 from engine.window import SPREAD_SIGMAS
 
@@ -201,32 +201,71 @@ class FeatureMatcher:
         poses that rest on it and on the matches, the more certain one counts.
         """
         query, options = self.query, self.options
-        pose = replace(options.pose, reprojection_px=found.tolerance_px)
-        matrix = query.camera.matrix
-        solve = partial(
-            solve_pose, found.points_m, found.points_px, matrix, pose, weights=found.weights, start=found.start
-        )
         if not options.use_attitude:
-            return solve()
+            return self._by_matches(found, None)
         errors = query.errors
         told_deg, sigma_deg = query.telemetry.grid_heading_deg, errors.heading_deg
         heading_deg, doubts_tilt = told_deg, self.doubts_tilt
         if heading_deg is None or hypothesis.x_axis_deg is None:
-            free = solve()
+            free = self._by_matches(found, None)
             if free is None:
                 return None
             heading_deg = attitude_from_rotation(free.rotation.T @ query.camera.mount.T)[2]
             if told_deg is not None:
                 doubts_tilt |= abs(wrap_difference_deg(heading_deg - told_deg)) > SPREAD_SIGMAS * sigma_deg
             sigma_deg = _MATCHED_HEADING_SIGMA_DEG
-        told = solve(prior=query.attitude_prior(heading_deg, sigma_deg, errors))
+        told = self._solved(found, heading_deg, sigma_deg, errors)
         if told is None or not doubts_tilt:
             return told
         doubting = replace(errors, tilt_deg=max(errors.tilt_deg, errors.unknown_tilt_deg))
-        seen = solve(prior=query.attitude_prior(heading_deg, sigma_deg, doubting))
+        seen = self._solved(found, heading_deg, sigma_deg, doubting)
         above_m = query.above_ground_m(query.site.pixel_from_enu(told.center_m[:2]), float(told.center_m[2]))
         told = _with_tilt_doubt(told, above_m, math.radians(doubting.tilt_deg))
         return min(filter(None, (told, seen)), key=lambda each: float(np.trace(each.covariance_center_m2)))
+
+    def _solved(
+        self, found: Matched, heading_deg: float, sigma_deg: float, errors: AssumedErrors
+    ) -> PoseStats | None:
+        """The pose with these errors of the attitude.
+
+        Over unknown ground a part of its tilt may be a slope's. How much, only a stated tilt tells, and that may
+        be wrong altogether.
+        """
+        query, unknown_deg = self.query, errors.unknown_tilt_deg
+
+        def attitude(tilt_deg: float) -> AttitudePrior:
+            return query.attitude_prior(heading_deg, sigma_deg, replace(errors, tilt_deg=tilt_deg))
+
+        if query.site.has_surface or not query.telemetry.has_tilt:
+            return self._by_matches(found, attitude(errors.tilt_deg))
+        wide_deg = wide_slope_deg(errors.unknown_slope_deg)
+        stats = self._by_matches(found, attitude(math.hypot(errors.tilt_deg, wide_deg)))
+        if stats is None:
+            return None
+        wrong = (1.0 - RELIABILITY) / 5.0  # heavy tails: a wrong attitude may be off by any angle
+        tilts = [(RELIABILITY, errors.tilt_deg), (4.0 * wrong, unknown_deg), (wrong, 2.0 * unknown_deg)]
+        over = from_level_ground(
+            Pose(stats.rotation, stats.center_m, np.zeros(2)),
+            stats.covariance,
+            found.points_m[stats.inliers].mean(axis=0),
+            [(probability, attitude(tilt_deg)) for probability, tilt_deg in tilts],
+            errors.unknown_slope_deg,
+        )
+        rotation, center_m = over.pose.rotation, over.pose.center_m
+        return replace(stats, rotation=rotation, center_m=center_m, covariance=over.covariance[:6, :6])
+
+    def _by_matches(self, found: Matched, prior: AttitudePrior | None) -> PoseStats | None:
+        """The pose that the matches agree on."""
+        pose = replace(self.options.pose, reprojection_px=found.tolerance_px)
+        return solve_pose(
+            found.points_m,
+            found.points_px,
+            self.query.camera.matrix,
+            pose,
+            weights=found.weights,
+            prior=prior,
+            start=found.start,
+        )
 
     def _fix(self, stats: PoseStats, window: Window) -> Fix | NoFix:
         """The camera's centre as a fix; refused if a drone over this map cannot be there."""
@@ -244,7 +283,7 @@ class FeatureMatcher:
         measured_m = query.above_ground_m(nadir, up)
         doubt_m = query.scale_doubt_m(measured_m, stats.rotation[2])
         above_m = up - float(site.surface_at(nadir))
-        stats = _with_tilt_doubt(stats, above_m, math.hypot(_slope_rad(site, query.errors), doubt_m / above_m))
+        stats = _with_tilt_doubt(stats, above_m, math.hypot(self._slope_rad, doubt_m / above_m))
         return query.fix(
             self.method,
             nadir,
@@ -257,6 +296,14 @@ class FeatureMatcher:
             turn_covariance_rad2=stats.covariance[3:, 3:],
             map_sigma_m=query.errors.map_m,
         )
+
+    @property
+    def _slope_rad(self) -> float:
+        """Standard deviation of the ground's slope that the pose does not hold yet."""
+        site, errors, known = self.query.site, self.query.errors, self.query.telemetry.has_tilt
+        is_in_pose = known and self.options.use_attitude
+        unknown_deg = 0.0 if is_in_pose else errors.unknown_slope_deg
+        return math.radians(errors.surface_slope_deg if site.has_surface else unknown_deg)
 
     def _with_confidence(
         self, fix: Fix, stats: PoseStats, vote: Vote | None, hypothesis: TelemetryHypothesis
@@ -290,8 +337,3 @@ def _with_tilt_doubt(stats: PoseStats, above_m: float, sigma_rad: float) -> Pose
     covariance[:2, :2] += (above_m * sigma_rad) ** 2 * np.eye(2)
     covariance[3:, 3:] += tilt_covariance(stats.rotation, sigma_rad)
     return replace(stats, covariance=covariance)
-
-
-def _slope_rad(site: OrthoMap, errors: AssumedErrors) -> float:
-    """Standard deviation of the ground's slope relative to that in the map's heights."""
-    return math.radians(errors.surface_slope_deg if site.has_surface else errors.unknown_slope_deg)

@@ -1,14 +1,19 @@
 """Over hills: the ground below is found under what stands on it, and a fix lies where the truth is."""
 
+import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from engine import Budget, Fix, Frame, MatcherOptions, Navigator, NccOptions, OrthoMap, SceneMatcher
 from engine.budget import Deadline
+from engine.camera import mount_rotation
+from engine.geo import enu_from_body
 from engine.kernels.dense import Pose
-from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
+from engine.matching.pose import AttitudePrior, solve_pose
+from engine.matching.unknown_slope import from_level_ground, over_unknown_slope, wide_slope_deg
 from tests.support.fixes import px_off
 from tests.support.ground import pixels_of, rays_of
 
@@ -151,8 +156,10 @@ def refined(measured):
 def test_exchanging_the_prior_equals_inference_with_each_and_their_mean_by_evidence(slope_deg):
     measured = picture() @ np.concatenate([[0.3, -0.2, 0.5, 0.004, -0.003, 0.01], tangent(np.array(slope_deg))])
     found = over_unknown_slope(*refined(measured), HEIGHT_M, 2.0)
-    parts = [inferred(measured, tangent(sigma)) for sigma in (0.35, 0.7, 1.4, 2.8)]
-    means, covariances, weights = map(np.array, zip(*parts, strict=True))
+    sigmas = (0.35, 0.7, 1.4, 2.8, 5.6)
+    parts = [inferred(measured, tangent(sigma)) for sigma in sigmas]
+    means, covariances, evidence = map(np.array, zip(*parts, strict=True))
+    weights = evidence / sigmas  # steep ground is rare
     expected = np.average(means, axis=0, weights=weights)
     off = means - expected
     spread = np.average(covariances + off[:, :, None] * off[:, None], axis=0, weights=weights)
@@ -160,6 +167,30 @@ def test_exchanging_the_prior_equals_inference_with_each_and_their_mean_by_evide
     np.testing.assert_allclose(found.pose.slope, expected[6:], atol=1e-5)
     np.testing.assert_allclose(found.covariance[:2, :2], spread[:2, :2], rtol=1e-3, atol=2e-3)
     assert found.covariance[2, 2] >= spread[2, 2]
+
+
+@pytest.mark.parametrize("told_off_deg", [0.0, 0.3])
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.03, -0.02), (-0.05, 0.08)])
+def test_a_slope_that_looks_like_a_tilt_is_told_from_it_by_the_stated_attitude(slope, told_off_deg):
+    """Solved as if the ground were level, the camera over the steepest of these is 14 m from where it is."""
+    rng = np.random.default_rng(0)
+    true = enu_from_body(4.0, -3.0, 20.0) @ mount_rotation()
+    points = np.column_stack([rng.uniform(-60.0, 60.0, (200, 2)), np.zeros(200)])
+    sloping = points + np.outer(points[:, :2] @ slope, [0.0, 0.0, 1.0])
+    center = np.array([8.0, -6.0, HEIGHT_M])
+    seen = (sloping - center) @ true
+    pixels = seen[:, :2] / seen[:, 2:] * 260.0 + 150.0 + rng.normal(0.0, 0.3, (200, 2))
+    told = true.T @ cv2.Rodrigues(np.radians([told_off_deg, 0.0, 0.0]))[0]
+    wide = AttitudePrior(told, math.hypot(0.37, wide_slope_deg(2.0)))
+    camera_matrix = np.array([[260.0, 0.0, 150.0], [0.0, 260.0, 150.0], [0.0, 0.0, 1.0]])
+    solved = solve_pose(points, pixels, camera_matrix, prior=wide)
+    level = Pose(solved.rotation, solved.center_m, np.zeros(2))
+    attitudes = [(0.99, AttitudePrior(told, 0.37)), (0.01, AttitudePrior(told, 4.0))]
+    over = from_level_ground(level, solved.covariance, np.zeros(3), attitudes, 2.0)
+    off_m = over.pose.center_m - center
+    assert off_m[:2] @ np.linalg.solve(over.covariance[:2, :2], off_m[:2]) < 6.0
+    assert np.hypot(*off_m[:2]) < 2.5  # the attitude may also be wrong altogether
+    np.testing.assert_allclose(over.pose.slope, slope, atol=0.02)
 
 
 @pytest.mark.parametrize(
