@@ -44,7 +44,7 @@ class Sighting:
 def sight(
     frames: Sequence[Frame], priors: Sequence[Prior | None], site: OrthoMap, camera: Camera
 ) -> tuple[list[Sighting], bool]:
-    """The poses of pictures by their features alone, else by correlation over headings and heights.
+    """The poses of pictures by their features alone, else from rough headings, else by correlation over these.
 
     Args:
         frames: a few, from all over the flight.
@@ -57,7 +57,7 @@ def sight(
     """
     mirrored = [_mirrored(frame) for frame in frames]
     most: list[Sighting] = []
-    for method, locate in (("sift", _by_features), ("ncc", _by_correlation)):
+    for method, locate in (("sift", _by_features), ("sift", _by_rough_headings), ("ncc", _by_correlation)):
         matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions())
         found = locate(matcher, frames, priors)
         if _is_enough(found, frames):
@@ -80,6 +80,21 @@ def _mirrored(frame: Frame) -> Frame:
 def _by_features(matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]) -> list[Sighting]:
     pictures = [Frame(frame.image) for frame in frames]
     return _located(matcher, range(len(frames)), pictures, priors)
+
+
+def _by_rough_headings(
+    matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]
+) -> list[Sighting]:
+    """As if heading and height were known roughly: features of one direction tell more places apart."""
+    usable = [k for k, f in enumerate(frames) if f.height_agl_m is not None and f.heading_deg is not None]
+    return _located(matcher, usable, [_rough(frames[k]) for k in usable], [priors[k] for k in usable])
+
+
+def _rough(frame: Frame) -> Frame:
+    """The frame with so uncertain a heading and height that the pose is the picture's."""
+    assert frame.height_agl_m is not None
+    sigma_m = 0.3 * frame.height_agl_m
+    return replace(frame, roll_deg=None, pitch_deg=None, heading_sigma_deg=30.0, height_sigma_m=sigma_m)
 
 
 def _by_correlation(
