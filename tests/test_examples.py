@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 import pytest
 
-from engine import Budget
+from engine import Budget, OptionError
+from scenematch import RecentValues
 from scenematch.files.flight import open_flight
 from scenematch.files.truth import read_truth
 from tests.support.fields import fields_of
@@ -206,3 +207,11 @@ def test_in_ros_the_topics_are_heard_and_every_picture_is_answered(flight, monke
     assert "/mavros/global_position/compass_hdg" not in topics
     assert [output for output, _ in node.published] == ["diagnostics"]  # a black picture has no pose
     assert re.search(r"answered=1\b", capsys.readouterr().out)
+
+
+def test_samples_of_another_length_are_refused_where_they_are_added():
+    values = RecentValues()
+    values.add(1, 2.0, 3.0)
+    with pytest.raises(OptionError, match=r"^values: expected 2, as before, got 1$"):
+        values.add(2, 2.0)
+    assert values.at(2) == (2.0, 3.0)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Proj
 
+from engine.errors import OptionError
 from engine.values import Attitude, Fix, Frame
 
 __all__ = ["NedOrigin", "VehicleState", "north_east_m"]
@@ -109,7 +110,13 @@ class RecentValues:
         self._samples: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_MAX_SAMPLES)
 
     def add(self, time_ns: int, *values: float) -> None:
-        """Add a sample; it is dropped if it is not finite or not newer than the last."""
+        """Add a sample; it is dropped if it is not finite or not newer than the last.
+
+        Raises:
+            OptionError: it has another number of values than the last.
+        """
+        if self._samples and len(values) != len(self._samples[-1][1]):
+            raise OptionError(f"values: expected {len(self._samples[-1][1])}, as before, got {len(values)}")
         newer = not self._samples or time_ns > self._samples[-1][0]
         if newer and all(map(math.isfinite, values)):
             self._samples.append((time_ns, values))
