@@ -34,7 +34,6 @@ from scenematch.files.truth import interpolate_truth
 from scenematch.report.metrics import FALSE_SIGMAS, WRONG_M, errors_en_m
 from scenematch.runs.arguments import parse_position
 from scenematch.runs.inputs import FlightInputs, open_inputs
-from scenematch.runs.paper_recipe import ACCEPT_ALL
 
 REAL = ("brighton", "seneca", "caliterra", "nust")
 DRAWN = {"gazebo-a1": 8, "gazebo-a2": 8, "gazebo-a1-evening": 8}
@@ -116,8 +115,7 @@ def _middles(name: str, inputs: FlightInputs, settings: TrackSettings) -> list[T
     """
     matcher = settings.matcher(inputs.site, inputs.camera)
     matcher.warmup()
-    options = ACCEPT_ALL if settings.profile == "paper" else settings.navigator
-    navigator = Navigator(matcher, parse_position("start", settings.start), None, options)
+    navigator = Navigator(matcher, parse_position("start", settings.start), None, settings.acceptance)
     results, spent_ms = answered(navigator.update, ((item.frame, item.prior) for item in inputs.flight))
     return rows_of([where_truth_is(name, inputs.site, inputs.camera, result) for result in results], spent_ms)
 

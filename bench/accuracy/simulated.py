@@ -20,7 +20,6 @@ from bench.command import parser_on_one_thread
 from bench.pages.text import fill, machine, paragraph, percent, table_of
 from engine import Navigator, SceneMatcher
 from scenematch.report.metrics import Ground, summarise
-from scenematch.runs.paper_recipe import ACCEPT_ALL
 from scenematch.runs.settings import TrackSettings
 from scenematch.simulator import FlightPlan, plan_flight
 
@@ -59,17 +58,15 @@ class Run:
     with_attitude: bool
 
 
-Ready = list[tuple[str, SceneMatcher]]
-"""Matchers with their profiles."""
+Ready = list[tuple[TrackSettings, SceneMatcher]]
+"""Matchers with their settings."""
 
 
 def matchers(plan: FlightPlan, ways: tuple[tuple[str, str], ...]) -> Ready:
     """Each way to match over the map of a town, warmed up."""
     site = plan.town.site()
-    made = [
-        (profile, TrackSettings(method=method, profile=profile, device="cpu").matcher(site, plan.camera))
-        for method, profile in ways
-    ]
+    settings = [TrackSettings(method=method, profile=profile, device="cpu") for method, profile in ways]
+    made = [(each, each.matcher(site, plan.camera)) for each in settings]
     for _, matcher in made:
         matcher.warmup()
     return made
@@ -82,12 +79,12 @@ def fly(
     truth, frames = plan.truth_rows(), list(plan.iter_frames())
     if not with_attitude:
         frames = [replace(frame, roll_deg=None, pitch_deg=None) for frame in frames]
-    for profile, matcher in ready:
-        navigator = Navigator(matcher, true_start(truth), options=ACCEPT_ALL if profile == "paper" else None)
+    for settings, matcher in ready:
+        navigator = Navigator(matcher, true_start(truth), options=settings.acceptance)
         rows = rows_of(*answered(navigator.update, ((frame,) for frame in frames)))
         ground = Ground(matcher.site.ground_m, plan.town.datum_amsl_m)
         summary = summarise(rows, truth, frame=matcher.site.frame, ground=ground)
-        yield Run(day, plan.seed, matcher.method, profile, summary, hills_m, with_attitude)
+        yield Run(day, plan.seed, settings.method, settings.profile, summary, hills_m, with_attitude)
 
 
 def flights(seeds: tuple[int, ...], frames: int | None) -> Iterator[Run]:

@@ -236,7 +236,7 @@ class FeatureMatcher:
         def attitude(tilt_deg: float) -> AttitudePrior:
             return query.attitude_prior(heading_deg, sigma_deg, replace(errors, tilt_deg=tilt_deg))
 
-        if query.site.has_surface or not query.telemetry.has_tilt:
+        if not self._divides_tilt:
             return self._by_matches(found, attitude(errors.tilt_deg))
         wide_deg = wide_slope_deg(errors.unknown_slope_deg)
         stats = self._by_matches(found, attitude(math.hypot(errors.tilt_deg, wide_deg)))
@@ -300,10 +300,16 @@ class FeatureMatcher:
     @property
     def _slope_rad(self) -> float:
         """Standard deviation of the ground's slope that the pose does not hold yet."""
-        site, errors, known = self.query.site, self.query.errors, self.query.telemetry.has_tilt
-        is_in_pose = known and self.options.use_attitude
-        unknown_deg = 0.0 if is_in_pose else errors.unknown_slope_deg
-        return math.radians(errors.surface_slope_deg if site.has_surface else unknown_deg)
+        if self._divides_tilt:
+            return 0.0
+        errors, has_surface = self.query.errors, self.query.site.has_surface
+        return math.radians(errors.surface_slope_deg if has_surface else errors.unknown_slope_deg)
+
+    @property
+    def _divides_tilt(self) -> bool:
+        """Whether a stated tilt divides that of a pose between the camera and ground of unknown slope."""
+        has_tilt = self.query.telemetry.has_tilt and self.options.use_attitude
+        return has_tilt and not self.query.site.has_surface
 
     def _with_confidence(
         self, fix: Fix, stats: PoseStats, vote: Vote | None, hypothesis: TelemetryHypothesis

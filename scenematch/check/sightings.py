@@ -57,15 +57,14 @@ def sight(
     """
     mirrored = [_mirrored(frame) for frame in frames]
     most: list[Sighting] = []
-    for method, locate in (("sift", _by_features), ("sift", _by_rough_headings), ("ncc", _by_correlation)):
+    for method, ways in (("sift", (_by_features, _by_rough_headings)), ("ncc", (_by_correlation,))):
         matcher = SceneMatcher(site, camera, method, "cpu", MatcherOptions())
-        found = locate(matcher, frames, priors)
-        if _is_enough(found, frames):
-            return found, False
-        reflected = locate(matcher, mirrored, priors)
-        if _is_enough(reflected, frames):
-            return reflected, True
-        most = max(most, found, key=len)
+        for locate, is_mirrored in product(ways, (False, True)):
+            found = locate(matcher, mirrored if is_mirrored else frames, priors)
+            if _is_enough(found, frames):
+                return found, is_mirrored
+            if not is_mirrored:
+                most = max(most, found, key=len)
     return most, False
 
 
@@ -86,8 +85,13 @@ def _by_rough_headings(
     matcher: SceneMatcher, frames: Sequence[Frame], priors: Sequence[Prior | None]
 ) -> list[Sighting]:
     """As if heading and height were known roughly: features of one direction tell more places apart."""
-    usable = [k for k, f in enumerate(frames) if f.height_agl_m is not None and f.heading_deg is not None]
+    usable = _with_pose(frames)
     return _located(matcher, usable, [_rough(frames[k]) for k in usable], [priors[k] for k in usable])
+
+
+def _with_pose(frames: Sequence[Frame]) -> list[int]:
+    """The frames that came with height and heading."""
+    return [k for k, f in enumerate(frames) if f.height_agl_m is not None and f.heading_deg is not None]
 
 
 def _rough(frame: Frame) -> Frame:
@@ -103,8 +107,7 @@ def _by_correlation(
     """Use the height and turn at which most of a few pictures match, then refine to whole poses."""
     if not matcher.site.has_surface:  # refinement needs one
         return []
-    known = [frame.height_agl_m is not None and frame.heading_deg is not None for frame in frames]
-    usable = [k for k, is_known in enumerate(known) if is_known and priors[k] is not None]  # else: the whole map
+    usable = [k for k in _with_pose(frames) if priors[k] is not None]  # else: the whole map
     probed = usable[:: max(1, len(usable) // _PROBED)][:_PROBED]
     best: tuple[int, float, float] = (0, 1.0, 0.0)
     until_s = time.monotonic() + _MOST_S

@@ -151,11 +151,16 @@ def track_row(
         latency_ms=latency_ms,
         deadline_met=deadline_met,
         state=state,
-        looks="; ".join(map(str, result.looks)) or None,
+        looks=looks_text(result) or None,
     )
     if isinstance(result, NoFix):
         return replace(row, reason=result.reason.value, detail=result.detail or None)
     return _with_fix(row, result)
+
+
+def looks_text(result: Fix | NoFix) -> str:
+    """The looks at a frame with the evidence after each, in nats."""
+    return "; ".join(map(str, result.looks))
 
 
 def _number(value: float | None) -> float | None:

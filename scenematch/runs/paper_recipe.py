@@ -27,14 +27,13 @@ from engine.matching.for_reports import (
 )
 from engine.matching.method import Method
 from engine.matching.query import Query
-from engine.options import NavigatorOptions
+from engine.options import PAPER_SCALE, NavigatorOptions
 from engine.values import MAX_SIGMA_M, Attitude, Reason, Result, Window
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Scores = NDArray[np.float32]
 
-SCALE = 0.5  # of the pictures in which SIFT looks
 RATIO = 0.8  # the paper gives none; Lowe's own
 REPROJECTION_PX = 4.0
 SIGMA_M = 2.4  # the paper states no covariance; this is the RMS error that it reports
@@ -172,7 +171,9 @@ def surface(template: Gray, search: Gray) -> Scores:
 def matches(gray: Gray, search: Gray) -> tuple[Array, Array] | None:
     """Points (M, 2) of the frame and of the window that SIFT matches at half scale; None without features."""
     detector = cv2.SIFT_create()
-    halves = [cv2.resize(p, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA) for p in (gray, search)]
+    halves = [
+        cv2.resize(p, None, fx=PAPER_SCALE, fy=PAPER_SCALE, interpolation=cv2.INTER_AREA) for p in (gray, search)
+    ]
     (frame_points, frame_words), (map_points, map_words) = (
         detector.detectAndCompute(half, None) for half in halves
     )
@@ -181,7 +182,7 @@ def matches(gray: Gray, search: Gray) -> tuple[Array, Array] | None:
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(frame_words, map_words, k=2)
     good = [best for best, second in pairs if best.distance < RATIO * second.distance]
     found = ([frame_points[m.queryIdx].pt for m in good], [map_points[m.trainIdx].pt for m in good])
-    frame_px, map_px = ((np.array(points).reshape(-1, 2) + 0.5) / SCALE - 0.5 for points in found)
+    frame_px, map_px = ((np.array(points).reshape(-1, 2) + 0.5) / PAPER_SCALE - 0.5 for points in found)
     return frame_px, map_px
 
 

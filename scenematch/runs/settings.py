@@ -87,6 +87,15 @@ class TrackSettings(MatcherOptions):
             method = RECIPES[self.method]
         return SceneMatcher(site, camera, method, self.device, self)
 
+    @property
+    def acceptance(self) -> NavigatorOptions:
+        """How the navigator accepts matches: the paper's recipe accepts all."""
+        if self.profile == "paper":
+            from scenematch.runs.paper_recipe import ACCEPT_ALL
+
+            return ACCEPT_ALL
+        return self.navigator
+
     def _check_columns(self) -> None:
         for name, theirs in self.telemetry_columns.items():
             check_choice("telemetry_columns", name, COLUMNS)

@@ -21,7 +21,6 @@ from scenematch.runs.checking import as_rows, diagnose_flight
 from scenematch.runs.inputs import FlightFiles, FlightInputs, open_inputs
 from scenematch.runs.live_viewing import NO_LIVE_VIEW, LiveViewTarget, open_view
 from scenematch.runs.output import SILENT, Progress, StrPath, check_folder, prepare_folder
-from scenematch.runs.paper_recipe import ACCEPT_ALL
 from scenematch.runs.record import PATHS, RunRecord
 from scenematch.runs.results import NOTES, OWNED, TRACK, ReportFrames, write_results
 from scenematch.runs.settings import TrackSettings
@@ -76,8 +75,7 @@ def track(
     with progress.task("compiling") as report_compiled:
         matcher.warmup(report_compiled)
     prepare_folder(out, force, OWNED)
-    options = ACCEPT_ALL if settings.profile == "paper" else settings.navigator
-    navigator = Navigator(matcher, start, budget, options)
+    navigator = Navigator(matcher, start, budget, settings.acceptance)
     description = f"{settings.method}, {settings.profile} profile"
     frames = progress.track(flight, len(flight), description)
     with open_view(matcher, live_view) as view:

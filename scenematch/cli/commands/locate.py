@@ -40,6 +40,7 @@ def locate(
         pitch_deg: Degrees, nose up.
     """
     from engine.values import Fix
+    from scenematch.files.track import looks_text
     from scenematch.runs.single_image import locate_image
 
     given = options.read_settings(settings)
@@ -55,7 +56,7 @@ def locate(
         progress=console.PROGRESS,
     )
     facts = _fix_facts(result) if isinstance(result, Fix) else _no_fix_facts(result)
-    facts |= {"looks": "; ".join(map(str, result.looks)), "latency_ms": result.timings.total_ms}
+    facts |= {"looks": looks_text(result), "latency_ms": result.timings.total_ms}
     console.facts(facts, title=str(image))
     found, place = isinstance(result, Fix), console.quoted(site.map)
     console.next_step(f"track --map {place} --frames FRAMES --out out" if found else f"map info {place}")
