@@ -4,36 +4,46 @@ Another season, year or sun changes grey levels and swaps the brighter side of a
 direction of edges. The surface is the mean over grey levels and both orientation channels
 (:func:`engine.kernels.scores.orientation`). With a surface model the frame is drawn over the ground's relief, and
 not on a plane, which takes longer; and of it the part that would lie on the map at an assumed place, which may be
-another part than that matched before. Null-hypothesis templates, the frame's own upside down and mirrored, measure
-in the same window what chance reaches.
+another part than that matched before.
+
+Above its own level, where it costs least, the frame is matched in blocks, in their places and as parts that may
+lie a little off them (Fischler and Elschlager 1973, https://doi.org/10.1109/T-C.1973.223602): roofs and hills that
+no surface model shows, and wrong angles, move each block by its own amount. Null-hypothesis templates, the frame's
+own upside down and mirrored, measure in the same window what chance reaches.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import itertools
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.peaks import find_peak
 from engine.kernels.scores import enhance, orientation
 from engine.kernels.sums import counts, share_on_map
-from engine.matching.candidates import PeakCandidate
+from engine.matching.candidates import PeakCandidate, nats
 from engine.matching.correlation import COARSER, MIN_SIDE_PX, MIN_VALID_SHARE, Aligned, Correlator
 from engine.matching.peak_evidence import candidate_of
 from engine.ncc_fft import ncc
-from engine.runtime.device import on_host, to_device
-from engine.values import Window
+from engine.runtime.device import Device, on_host, to_device
+from engine.values import Peak, Window
 from engine.window import level_crop
 
 FloatImage = NDArray[np.float32]
+
+_LEVEL = "structure on a level"  # a step
+_BLOCKS = 3  # along each side of the frame
+_GIVE = 1 / 16  # of a block's side, by which it may lie off its place
 
 
 def match_structure(correlator: Correlator, found: PeakCandidate, around: Correlator) -> PeakCandidate | None:
     """The candidate of the highest peak by grey levels and structure, on the first level where it suffices.
 
-    A map is often blurrier than its pixels: what a coarser level leaves out, it does not show. If none suffices,
-    it is that of the own level, where a rival that looks the same scores the same, whatever the pixels' phase.
+    The coarsest comes first: it costs least, and a map is often blurrier than its pixels. If none suffices, it is
+    that of the own level, where a rival that looks the same scores the same, whatever the pixels' phase.
 
     Args:
         correlator: of the frame.
@@ -43,93 +53,173 @@ def match_structure(correlator: Correlator, found: PeakCandidate, around: Correl
     Returns:
         PeakCandidate | None: None if the template is nowhere on the map.
     """
-    risk, own = correlator.query.risk, _on_level(correlator, found, around, 0)
-    if own is not None and own.suffices(risk):
-        return own
-    alike = 1.0 if own is None else own.evidence.alike
-    for coarser in COARSER[1:]:
-        seen = _on_level(correlator, found, around, coarser)
-        weighed = None if seen is None else seen.weighed(replace(seen.evidence, least_alike=alike))
-        if weighed is not None and weighed.suffices(risk):
-            return weighed
-    return own
+    scheduler, last = correlator.query.scheduler, None
+    for coarser in reversed(COARSER):
+        aligned = _aligned(correlator, found, last, coarser)
+        window = None if aligned is None else around.window(aligned)
+        if aligned is None or window is None:
+            continue
+        work_px = aligned.work_px(window)
+        if last is not None and not scheduler.can_afford({_LEVEL: work_px}):
+            scheduler.note_refusal(_LEVEL)
+            break
+        with scheduler.costed(_LEVEL, work_px), scheduler.stage("structure"):
+            last = _Look(correlator, found, aligned, window, coarser).candidate() or last
+        if last is not None and last.suffices(correlator.query.risk):
+            break
+    return last
 
 
-def _on_level(
-    correlator: Correlator, found: PeakCandidate, around: Correlator, coarser: int
-) -> PeakCandidate | None:
-    """The candidate out of every place of its window, so many levels above that of the candidate by grey levels.
-
-    Its rival is the better of the best elsewhere and of what chance reaches.
-    """
-    aligned = _coarser(correlator, found, coarser)
-    window = None if aligned is None else around.window(aligned)
-    if aligned is None or window is None:
-        return None
-    scored = _scores(correlator, aligned, window, _templates(correlator, aligned))
-    if scored is None:
-        return None
-    scores, crop = scored
-    chance = scores[1:][scores[1:] > -1.0]
-    if not chance.size:
-        return None
-    peak = find_peak(scores[0], exclusion_px=correlator.exclusion_px(aligned.level))
-    rival = max(peak.second_score, float(chance.max()))
-    if found.by_search and found.peak.score > 0.0:  # only the search knows the rest of the map
-        rival = max(rival, found.peak.second_score / found.peak.score * peak.score)
-    own = candidate_of(
-        correlator,
-        aligned,
-        replace(peak, x=peak.x + crop.x0, y=peak.y + crop.y0, second_score=rival),
-        window,
-        is_fitted=found.is_fitted,
-        tried=found.evidence.tried * (coarser + 1.0),  # levels as well
-        sigma=max(float(chance.std(dtype=np.float64)), 1e-3),
-    )
-    evidence, fix = replace(own.evidence, is_tested=True), replace(own.fix, window=found.fix.window)
-    return replace(own, by_structure=True, evidence=evidence, fix=fix)
-
-
-def _coarser(correlator: Correlator, found: PeakCandidate, coarser: int) -> Aligned | None:
+def _aligned(
+    correlator: Correlator, found: PeakCandidate, last: PeakCandidate | None, coarser: int
+) -> Aligned | None:
     """The candidate's hypothesis over the relief, so many levels above its own; None if it shows too little.
 
-    Its own level takes the relief at the prior's place, coarser ones that at the peak's: each may be off.
+    The relief is that at the place by a coarser level, else at the prior's.
     """
     own, site = found.aligned, correlator.query.site
-    if coarser == 0 and (own.is_over_relief or not site.has_surface):
+    if coarser == 0 and not site.has_surface:
         return own
     level = own.level + coarser
     if coarser and (level >= site.levels or min(own.template.shape) >> coarser < MIN_SIDE_PX):
         return None
-    place = correlator.nadir_px(found.peak, own) if coarser or correlator.query.prior is None else None
+    known = last or (found if correlator.query.prior is None else None)
+    place = None if known is None else correlator.nadir_px(known.peak, known.aligned)
     rows, columns = (n >> coarser for n in own.template.shape)
     aligned = correlator.align(own.pose, level, place, (rows, columns) if site.has_surface else None)
     return aligned if isinstance(aligned, Aligned) else None
 
 
-def _templates(correlator: Correlator, aligned: Aligned) -> FloatImage:
-    """Channels (3, T, h, w) of the frame and of the null-hypothesis templates."""
-    patches = [aligned.patch.gray, *correlator.nowhere(aligned)]
-    return np.stack([_channels(patch, None) for patch in patches], axis=1)
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """A look at every place of a window on one level.
+
+    Attributes:
+        correlator: of the frame.
+        found: the candidate by grey levels.
+        aligned: its hypothesis on the level.
+        window: of full-resolution pixels.
+        coarser: how many levels that is above the candidate's own.
+    """
+
+    correlator: Correlator
+    found: PeakCandidate
+    aligned: Aligned
+    window: Window
+    coarser: int
+
+    def candidate(self) -> PeakCandidate | None:
+        """The candidate out of every place; None if the frame fits none.
+
+        The null hypotheses, twice as dear as the frame itself, are matched if its own surface promises a fix.
+        """
+        correlator, aligned = self.correlator, self.aligned
+        site, (height, width) = correlator.query.site, aligned.template.shape
+        crop = level_crop(site, self.window, aligned.level)
+        if crop.width_px < width + 2 or crop.height_px < height + 2:
+            return None
+        gray, mask = site.gray(crop, aligned.level), site.valid(crop, aligned.level)
+        valid = None if mask.all() else mask
+        is_on_map = None if valid is None else share_on_map(counts(valid), height, width) >= MIN_VALID_SHARE
+        if is_on_map is not None and not is_on_map.any():
+            return None
+        search = _channels(gray, valid)
+
+        def surfaces(*patches: NDArray[np.uint8]) -> FloatImage:
+            templates = np.stack([_channels(patch, None) for patch in patches], axis=1)
+            both = by_blocks(search, templates, correlator.query.device, self._blocks)
+            if is_on_map is not None:
+                # Nodata is 0 in all channels, near their mean, and hardly lowers places mostly on the map.
+                both[..., ~is_on_map] = np.nan
+            return both
+
+        own = surfaces(aligned.patch.gray)[:, 0]
+        seen = self._best(crop, own, None)
+        if not seen.promises(correlator.query.risk):
+            return seen
+        return self._best(crop, own, surfaces(*correlator.nowhere(aligned)))
+
+    @property
+    def _blocks(self) -> int:
+        """Along each side of the frame."""
+        return _BLOCKS if self.coarser else 1
+
+    def _best(self, crop: Window, own: FloatImage, null: FloatImage | None) -> PeakCandidate:
+        """The better candidate of blocks in their places and of blocks that give way.
+
+        Args:
+            crop: of the level, in which the surfaces begin.
+            own: (K, H', W') surfaces of the frame.
+            null: (K, T, H', W') of what shows chance; None takes the frame's own, but for its highest.
+        """
+        rigid = own[0]
+        kinds = zip(own, [None] * len(own) if null is None else null, strict=True)
+        return max((self._of(crop, *each, rigid) for each in kinds), key=nats)
+
+    def _of(self, crop: Window, own: FloatImage, null: FloatImage | None, rigid: FloatImage) -> PeakCandidate:
+        """The candidate of a surface (H', W') by what others (T, H', W') reach; one is that of rigid blocks."""
+        correlator, found, aligned = self.correlator, self.found, self.aligned
+        own, *others = (each - np.nanmean(each) for each in (own, *([] if null is None else null)))
+        peak = find_peak(np.nan_to_num(own, nan=-1.0), exclusion_px=correlator.exclusion_px(aligned.level))
+        # Streets run in few directions: elsewhere the frame itself may reach more than when it is mirrored.
+        chance = [np.minimum(own, peak.second_score), *others]
+        # Where blocks give way the surface is flat: the place is that of the summit nearby where they do not.
+        reach = slack_px(aligned.template.shape, self._blocks) + 2  # a summit needs two neighbours
+        x, y = max(round(peak.x) - reach, 0), max(round(peak.y) - reach, 0)
+        near = np.nan_to_num(rigid[y : y + 2 * reach + 1, x : x + 2 * reach + 1], nan=-1.0)
+        summit = find_peak(near, exclusion_px=0.0)
+        rival = max(float(np.nanmax(each)) for each in chance)
+        if found.by_search and found.peak.score > 0.0:  # only the search knows the rest of the map
+            rival = max(rival, found.peak.second_score / found.peak.score * peak.score)
+        place = crop.x0 + x + summit.x, crop.y0 + y + summit.y
+        seen = candidate_of(
+            correlator,
+            aligned,
+            Peak(*place, peak.score, rival, summit.curvature),
+            self.window,
+            is_fitted=found.is_fitted,
+            tried=found.evidence.tried * (2.0 * self.coarser + 1.0),  # with the surfaces of other levels
+            sigma=max(1e-3, *(float(np.nanstd(each, dtype=np.float64)) for each in chance)),
+        )
+        evidence = replace(seen.evidence, is_tested=null is not None)
+        return replace(seen, by_structure=True, evidence=evidence, fix=replace(seen.fix, window=found.fix.window))
 
 
-def _scores(
-    correlator: Correlator, aligned: Aligned, window: Window, templates: FloatImage
-) -> tuple[FloatImage, Window] | None:
-    """Scores (T, H', W') of templates by all channels, and where they begin; None if these do not fit."""
-    query = correlator.query
-    crop = level_crop(query.site, window, aligned.level)
-    height, width = aligned.template.shape
-    if crop.width_px < width + 2 or crop.height_px < height + 2:
-        return None
-    gray, mask = query.site.gray(crop, aligned.level), query.site.valid(crop, aligned.level)
-    valid = None if mask.all() else mask
-    search = _channels(gray, valid)
-    scores = on_host(ncc(to_device(search, query.device), to_device(templates, query.device)).mean(0))
-    if valid is not None:
-        # Nodata is 0 in all channels, near their mean, and so hardly lowers places that are mostly on the map.
-        scores[:, share_on_map(counts(valid), height, width) < MIN_VALID_SHARE] = -1.0
-    return scores, crop
+def by_blocks(search: FloatImage, templates: FloatImage, device: Device, blocks: int) -> FloatImage:
+    """Mean scores of all channels and blocks.
+
+    Args:
+        search: (C, H, W) channels of the map.
+        templates: (C, T, h, w) likewise.
+        device: where they are correlated.
+        blocks: along each side.
+
+    Returns:
+        (K, T, H-h+1, W-w+1) of blocks in their places and, if they are several, of each at its best within its
+        slack.
+    """
+    (_, height, width), (rows, columns) = search.shape, templates.shape[2:]
+    places = height - rows + 1, width - columns + 1
+    block = rows // blocks, columns // blocks
+    slack = slack_px((rows, columns), blocks)
+    box = np.ones((2 * slack + 1, 2 * slack + 1), np.uint8)
+    both = np.zeros((2 if slack else 1, templates.shape[1], *places), np.float32)
+    for y, x in itertools.product(range(0, blocks * block[0], block[0]), range(0, blocks * block[1], block[1])):
+        top, left = max(y - slack, 0), max(x - slack, 0)
+        bottom, right = y + block[0] + places[0] - 1 + slack, x + block[1] + places[1] - 1 + slack
+        part, own = search[:, top:bottom, left:right], templates[..., y : y + block[0], x : x + block[1]]
+        found = on_host(ncc(to_device(part, device), to_device(np.ascontiguousarray(own), device)).mean(0))
+        there = np.s_[y - top : y - top + places[0], x - left : x - left + places[1]]
+        for t, scores in enumerate(found):
+            both[0, t] += scores[there]
+            both[-1, t] += cv2.dilate(scores, box)[there] if slack else 0.0
+    both /= blocks**2
+    return both
+
+
+def slack_px(shape: tuple[int, ...], blocks: int) -> int:
+    """How far so many blocks along each side of a patch of this shape may lie off their places."""
+    return max(1, round(_GIVE * min(shape) / blocks)) if blocks > 1 else 0
 
 
 def _channels(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None) -> FloatImage:

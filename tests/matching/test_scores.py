@@ -1,5 +1,6 @@
 """Enhanced grey levels and structure: each is what its line says, respects nodata, finds its place."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -8,6 +9,8 @@ import pytest
 
 from engine import Frame, OptionError
 from engine.kernels.scores import enhance, orientation
+from engine.matching.structure import by_blocks, slack_px
+from engine.runtime.device import CPU
 from tests.support.fixes import px_off
 
 NADIR = np.array([310.0, 305.0])
@@ -124,6 +127,22 @@ def test_a_frame_of_which_half_the_tones_are_turned_round_is_found_by_structure(
     result = matchers["ncc"].locate(Frame(image, 0, 150.0, 0.0, 0.0, 0.0), ground.prior(NADIR))
     assert px_off(result, NADIR) < 2.0
     assert "structure" in result.timings.stages_ms
+
+
+def test_a_block_may_lie_off_its_place_and_the_frame_scores_as_if_it_did_not():
+    rng, rows, columns = np.random.default_rng(5), 96, 144
+    search = rng.normal(size=(3, rows + 40, columns + 50)).astype(np.float32)
+    slack, (y, x), block = slack_px((rows, columns), 3), (17, 23), (rows // 3, columns // 3)
+    template = np.empty((3, 1, rows, columns), np.float32)
+    for top, left in itertools.product(range(0, rows, block[0]), range(0, columns, block[1])):
+        down, right = rng.integers(-slack, slack + 1, 2)
+        place = np.s_[:, y + top + down :, x + left + right :]
+        template[:, 0, top : top + block[0], left : left + block[1]] = search[place][:, : block[0], : block[1]]
+    rigid, giving = by_blocks(search, template, CPU, 3)[:, 0]
+    assert giving[y, x] == pytest.approx(1.0, abs=1e-5)
+    assert giving[y, x] == giving.max()
+    assert rigid[y, x] < 0.9
+    assert (giving >= rigid - 1e-6).all()
 
 
 @pytest.mark.parametrize("turn_deg", [-4.0, 4.5])
