@@ -127,8 +127,8 @@ class Refinement:
             return replace(found, fix=replace(reaching(found.fix, best.fix), stage="unconfirmed"))
         if best is not None:
             return best
-        if has_tilt and not is_oblique(query, query.telemetry.known_attitude):
-            # Of few right places, but of many that a camera far off the vertical sees.
+        if has_tilt and query.site.has_surface and not is_oblique(query, query.telemetry.known_attitude):
+            # Of few right places, but of many over relief that no model shows, or seen from far off the vertical.
             found = found.weighed(replace(found.evidence, refined=-math.inf))
         if not found.promises(query.risk):
             return found
