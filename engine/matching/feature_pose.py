@@ -283,7 +283,9 @@ class FeatureMatcher:
         measured_m = query.above_ground_m(nadir, up)
         doubt_m = query.scale_doubt_m(measured_m, stats.rotation[2])
         above_m = up - float(site.surface_at(nadir))
-        stats = _with_tilt_doubt(stats, above_m, math.hypot(self._slope_rad, doubt_m / above_m))
+        attitude = Attitude(*attitude_from_rotation(stats.rotation.T @ query.camera.mount.T))
+        slope_rad = math.hypot(self._slope_rad, self._shared_rad(attitude))
+        stats = _with_tilt_doubt(stats, above_m, math.hypot(slope_rad, doubt_m / above_m))
         return query.fix(
             self.method,
             nadir,
@@ -292,10 +294,16 @@ class FeatureMatcher:
             window=window,
             east_north_m=stats.center_m[:2],
             up_m=up,
-            grid_attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ query.camera.mount.T)),
+            grid_attitude=attitude,
             turn_covariance_rad2=stats.covariance[3:, 3:],
             map_sigma_m=query.errors.map_m,
         )
+
+    def _shared_rad(self, attitude: Attitude) -> float:
+        """Standard deviation of what unknown ground's slope is of an unknown tilt: any share of it."""
+        if self.query.telemetry.has_tilt or self.query.site.has_surface or not self.options.use_attitude:
+            return 0.0
+        return math.radians(math.hypot(attitude.roll_deg, attitude.pitch_deg)) / math.sqrt(3.0)
 
     @property
     def _slope_rad(self) -> float:
