@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -25,7 +26,7 @@ from engine import Camera, Fix, Frame, MatcherOptions, Navigator, NoFix, OrthoMa
 from engine.geo import Array, enu_from_body
 from engine.values import Attitude, Truth
 from scenematch.report.metrics import errors_en_m
-from scenematch.simulator import FlightStyle, Town, build_town, plan_flight, render_frame
+from scenematch.simulator import FlightStyle, build_town, plan_flight, render_frame
 from scenematch.simulator.flight import paper_camera
 from scenematch.simulator.render import grid_from_enu
 from scenematch.simulator.town import MAP_SENSOR
@@ -35,7 +36,7 @@ FIRST_SEED = 9100
 RATE_HZ = 0.28
 CITY_SHIFT_M, CITY_TILT_DEG, CITY_HEIGHT_M = 5.0, 9.0, 120.0
 CITY_CHANGED, LEAN_DEG, LEAN_FROM_M = 0.2, 12.0, 6000.0
-HILLS_M, HILLS_HEIGHT_M, HILLS_PITCH_DEG = 60.0, 120.0, -45.0
+HILLS_M, HILLS_HEIGHT_M = 60.0, 120.0
 SEASONS = ("autumn", "winter")
 METHODS = ("ncc", "sift", "auto")
 SIZE_PX, FOV_DEG = (640, 480), 62.0
@@ -109,33 +110,25 @@ def _web_map(seed: int, rng: np.random.Generator, shift_m: Array) -> OrthoMap:
     return OrthoMap.from_arrays(np.asarray(gray, np.uint8), moved, f"EPSG:{town.crs_epsg}")
 
 
-def oblique(seed: int, frames: int | None) -> Scene:
-    """A 45 degree camera over hills of 60 m in autumn or winter, on the map of summer with its surface."""
+def oblique(seed: int, frames: int | None, off_deg: float = 45.0, side_px: int = 1000) -> Scene:
+    """A camera off the vertical over hills of 60 m in autumn or winter, on the map of summer with its surface."""
     season = SEASONS[seed % len(SEASONS)]
-    hilly = {"width_px": 1000, "height_px": 1100, "relief_m": HILLS_M, "river": True}
+    hilly = {"width_px": side_px, "height_px": side_px + 100, "relief_m": HILLS_M, "river": True}
     town = build_town(seed, **hilly, condition=season, rebuild=rebuilt(seed, 0.05))
-    camera = replace(_photographing(), mount=paper_camera(HILLS_PITCH_DEG).mount)
-    plan = plan_flight(
-        seed,
-        frames=frames,
-        rate_hz=RATE_HZ,
-        town=town,
-        camera=camera,
-        style=FlightStyle(height_agl_m=_above(town)),
-    )
-    return Scene("oblique", town.site(), camera, list(plan.iter_frames()), plan.truth_rows(), np.zeros(2))
-
-
-def _above(town: Town) -> float:
-    """Height at which a flight that begins anywhere clears every roof."""
-    return float(town.world.height_m.max()) + 0.5 * HILLS_HEIGHT_M
+    camera = replace(_photographing(), mount=paper_camera(off_deg - 90.0).mount)
+    height_m = float(town.world.height_m.max()) + 0.5 * HILLS_HEIGHT_M  # clears every roof
+    style = FlightStyle(height_agl_m=height_m)
+    plan = plan_flight(seed, frames=frames, rate_hz=RATE_HZ, town=town, camera=camera, style=style)
+    name = f"oblique-{off_deg:.0f}"
+    return Scene(name, town.site(), camera, list(plan.iter_frames()), plan.truth_rows(), np.zeros(2))
 
 
 def _photographing() -> Camera:
     return Camera.from_fov(*SIZE_PX, FOV_DEG)
 
 
-SCENES: dict[str, Callable[[int, int | None], Scene]] = {"snow": snow, "city": city, "oblique": oblique}
+SCENES: dict[str, Callable[[int, int | None], Scene]] = {"snow": snow, "city": city, "oblique-45": oblique}
+SCENES["oblique-60"] = partial(oblique, off_deg=60.0, side_px=1600)
 
 
 # ------------------------------------------------------------------------------------------- matching
