@@ -177,9 +177,7 @@ class Ncc(Method):
     def around(self, query: Query, found: PeakCandidate) -> Correlator:
         """Of the frame where structure is matched: about its prior; after a search, about the place."""
         if found.by_search:
-            known_m = math.inf if query.prior is None else query.prior.sigma_m
-            sigma_m = min(_SURROUNDINGS_SIGMA_M, known_m)
-            place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=sigma_m)
+            place = Prior(east_m=found.fix.east_m, north_m=found.fix.north_m, sigma_m=_SURROUNDINGS_SIGMA_M)
             query = replace(query, prior=place)
         return self._correlator(query)
 
