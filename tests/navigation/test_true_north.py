@@ -65,7 +65,7 @@ def test_a_frame_with_its_true_heading_lies_on_the_map(make, polar, frame, metho
 @pytest.mark.parametrize("known", [True, False], ids=["prior", "whole map"])
 def test_a_heading_that_was_searched_for_is_the_true_one(make, polar, frame, known):
     """Without a prior the search begins with north as in the map's middle."""
-    turned = replace(frame, heading_deg=frame.heading_deg + 11.0, heading_sigma_deg=4.0)
+    turned = replace(frame, heading_deg=frame.heading_deg + 20.0, heading_sigma_deg=8.0)
     fix = make("ncc").locate(turned, polar.prior(NADIR) if known else None)
     assert isinstance(fix, Fix)
     assert heading_off(fix, frame.heading_deg) < 0.2
