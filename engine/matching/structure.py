@@ -59,11 +59,11 @@ def match_structure(correlator: Correlator, found: PeakCandidate, around: Correl
         window = None if aligned is None else around.window(aligned)
         if aligned is None or window is None:
             continue
-        work_px = aligned.work_px(window)
-        if last is not None and not scheduler.can_afford({_LEVEL: work_px}):
-            scheduler.note_refusal(_LEVEL)
+        step, work_px = (_LEVEL, coarser), aligned.work_px(window)
+        if last is not None and not scheduler.can_afford({step: work_px}):
+            scheduler.note_refusal(step)
             break
-        with scheduler.costed(_LEVEL, work_px), scheduler.stage("structure"):
+        with scheduler.costed(step, work_px), scheduler.stage("structure"):
             last = _Look(correlator, found, aligned, window, coarser).candidate() or last
         if last is not None and last.suffices(correlator.query.risk):
             break
