@@ -284,8 +284,7 @@ class FeatureMatcher:
         doubt_m = query.scale_doubt_m(measured_m, stats.rotation[2])
         above_m = up - float(site.surface_at(nadir))
         attitude = Attitude(*attitude_from_rotation(stats.rotation.T @ query.camera.mount.T))
-        slope_rad = math.hypot(self._slope_rad, self._shared_rad(attitude))
-        stats = _with_tilt_doubt(stats, above_m, math.hypot(slope_rad, doubt_m / above_m))
+        stats = _with_tilt_doubt(stats, above_m, math.hypot(self._slope_rad(attitude), doubt_m / above_m))
         return query.fix(
             self.method,
             nadir,
@@ -299,19 +298,19 @@ class FeatureMatcher:
             map_sigma_m=query.errors.map_m,
         )
 
-    def _shared_rad(self, attitude: Attitude) -> float:
-        """Standard deviation of what unknown ground's slope is of an unknown tilt: any share of it."""
-        if self.query.telemetry.has_tilt or self.query.site.has_surface or not self.options.use_attitude:
-            return 0.0
-        return math.radians(math.hypot(attitude.roll_deg, attitude.pitch_deg)) / math.sqrt(3.0)
+    def _slope_rad(self, attitude: Attitude) -> float:
+        """Standard deviation of the ground's slope that a pose of this attitude does not hold yet.
 
-    @property
-    def _slope_rad(self) -> float:
-        """Standard deviation of the ground's slope that the pose does not hold yet."""
+        Of a tilt that nothing states, any share may be the slope of unknown ground.
+        """
+        errors, options, has_tilt = self.query.errors, self.options, self.query.telemetry.has_tilt
         if self._divides_tilt:
             return 0.0
-        errors, has_surface = self.query.errors, self.query.site.has_surface
-        return math.radians(errors.surface_slope_deg if has_surface else errors.unknown_slope_deg)
+        if self.query.site.has_surface:
+            return math.radians(errors.surface_slope_deg)
+        is_shared = options.use_attitude and not has_tilt
+        tilt_deg = math.hypot(attitude.roll_deg, attitude.pitch_deg) if is_shared else 0.0
+        return math.radians(math.hypot(errors.unknown_slope_deg, tilt_deg / math.sqrt(3.0)))
 
     @property
     def _divides_tilt(self) -> bool:

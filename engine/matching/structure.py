@@ -212,7 +212,8 @@ def by_blocks(search: FloatImage, templates: FloatImage, device: Device, blocks:
         there = np.s_[y - top : y - top + places[0], x - left : x - left + places[1]]
         for t, scores in enumerate(found):
             both[0, t] += scores[there]
-            both[-1, t] += cv2.dilate(scores, box)[there] if slack else 0.0
+            if slack:
+                both[1, t] += cv2.dilate(scores, box)[there]
     both /= blocks**2
     return both
 
