@@ -45,12 +45,9 @@ from typing import Any
 
 from bench.accuracy.truth import pooled
 from bench.pages.text import percent, table_of
+from scenematch.runs.inputs import FOLDER_LAYOUT
 
 RUNS, FLIGHTS, UNFINISHED = "runs", "flights", "unfinished"
-_LAYOUT = {
-    "map": "map.tif", "surface": "dsm.tif", "camera": "camera.yaml", "frames": "frames",
-    "telemetry": "telemetry.csv", "truth": "truth.csv",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ def jobs_of(plan: Mapping[str, Any], out: Path) -> tuple[list[Job], list[Job]]:
     runs = []
     for name, given in flights.items():
         group, folder = given.pop("group", name), given.pop("folder", None)
-        files = {} if folder is None else {key: f"{folder}/{file}" for key, file in _LAYOUT.items()}
+        files = {} if folder is None else {key: f"{folder}/{file}" for key, file in FOLDER_LAYOUT.items()}
         for run, how in plan["runs"].items():
             arguments = options({**files, **given, **how})
             runs.append(Job(f"{name}/{run}", group, out / RUNS / name / run, ("track", *arguments)))

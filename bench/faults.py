@@ -25,7 +25,7 @@ from bench.pages.text import fill, shown, table
 from engine import Fix, Navigator, Prior, SceneMatcher
 from engine.geo import Array
 from engine.navigation.telemetry_errors import Calibration
-from scenematch.check import diagnose
+from scenematch.check import Finding, diagnose
 from scenematch.files.truth import interpolate_truth
 
 FALSE_M, FALSE_SIGMAS = 5.0, 3.0
@@ -120,13 +120,15 @@ def cell(inputs: FlightInputs, fault: Fault, flight: str, method: str) -> Cell:
     return Cell(flight, fault.name, method, *counts, flown.rms_m, flown.nees, largest_m)
 
 
+def findings(inputs: FlightInputs, true: FlightInputs) -> list[Finding]:
+    """What ``check`` finds in inputs that may have a fault, from the start of the true ones."""
+    start = start_of(true, stamps_of(true)[0])
+    return diagnose(inputs.frames, inputs.frames.__getitem__, inputs.site(), inputs.camera, start=start).findings
+
+
 def diagnosed(inputs: FlightInputs, fault: Fault) -> tuple[str, str]:
     """Whether a diagnosis names it, and what it says."""
-    spoiled = fault.spoil(inputs)
-    start = start_of(inputs, inputs.frames[0].timestamp_ns or 0)
-    found = diagnose(
-        spoiled.frames, spoiled.frames.__getitem__, spoiled.site(), spoiled.camera, start=start
-    ).findings
+    found = findings(fault.spoil(inputs), inputs)
     if not found:
         verdict = "silent"
     elif found[0].cause in fault.causes:

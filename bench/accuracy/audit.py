@@ -211,14 +211,13 @@ def auc_of(found: list[Trial]) -> float:
     return auc(np.array([t.predicted for t in found]), np.array([t.right for t in found], bool))
 
 
-def fitted(x: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[float, ...]:
-    """Weights by maximum likelihood, by Newton's method with a whisper of ridge that keeps it finite.
+def fit(found: list[Trial]) -> tuple[float, ...]:
+    """Weights of the logistic rule by maximum likelihood, by Newton's method.
 
-    Args:
-        x: (N, K) terms.
-        right: (N,) whether each place was right.
+    A whisper of ridge keeps them finite.
     """
-    weights, y = np.zeros(x.shape[1]), right.astype(np.float64)
+    x = np.column_stack([np.ones(len(found)), np.array([t.features for t in found])])
+    weights, y = np.zeros(x.shape[1]), np.array([t.right for t in found], np.float64)
     for _ in range(50):
         p = 1.0 / (1.0 + np.exp(-np.clip(x @ weights, -30, 30)))
         hessian = (x * (p * (1.0 - p))[:, None]).T @ x + 0.1 * np.eye(x.shape[1])
@@ -227,12 +226,6 @@ def fitted(x: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[float, ...
         if np.abs(step).max() < 1e-8:
             break
     return tuple(float(round(w, 3)) for w in weights)
-
-
-def fit(found: list[Trial]) -> tuple[float, ...]:
-    """Weights of the logistic rule."""
-    x = np.column_stack([np.ones(len(found)), np.array([t.features for t in found])])
-    return fitted(x, np.array([t.right for t in found], bool))
 
 
 def places_rows(count: int) -> list[list[str]]:

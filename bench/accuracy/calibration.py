@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from bench.command import parser_on_one_thread
-from bench.faults import Flown, fly, stamps_of, start_of
-from bench.inputs.faults import FlightInputs, late, lens, load, mounted, raised, turned
+from bench.faults import Flown, findings, fly, stamps_of
+from bench.inputs.faults import FlightInputs, Spoil, late, lens, load, mounted, raised, turned
 from bench.pages.text import shown
 from engine.navigation.telemetry_errors import Calibration
-from scenematch.check import Finding, diagnose
+from scenematch.check import Finding
 from scenematch.files.truth import interpolate_truth
 
 Measured = tuple[float, float]  # a value and its standard deviation
@@ -43,11 +43,11 @@ class Error:
     """
 
     name: str
-    spoil: Callable[[FlightInputs], FlightInputs]
+    spoil: Spoil
     size: float
     measured: Callable[[Calibration], Measured | None]
     own: Callable[[FlightInputs], float]
-    cure: Callable[[float], Callable[[FlightInputs], FlightInputs]]
+    cure: Callable[[float], Spoil]
     causes: tuple[str, ...]
 
 
@@ -117,12 +117,6 @@ def converged_s(flown: Flown, true: FlightInputs, error: Error, truth: float) ->
     return since
 
 
-def named(inputs: FlightInputs, true: FlightInputs) -> list[Finding]:
-    """What ``check`` finds."""
-    start = start_of(true, true.frames[0].timestamp_ns or 0)
-    return diagnose(inputs.frames, inputs.frames.__getitem__, inputs.site(), inputs.camera, start=start).findings
-
-
 def cured(inputs: FlightInputs, error: Error, found: Finding) -> FlightInputs:
     """The inputs without what was found."""
     value = found.value or 0.0
@@ -174,7 +168,7 @@ def main() -> None:
         right = {method: fly(true, stamps_of(true), method) for method in wanted.methods}
         print(f"{folder.name}, {len(true.frames)} frames", flush=True)
         for error in ERRORS:
-            found = named(error.spoil(true), true)
+            found = findings(error.spoil(true), true)
             for method in wanted.methods:
                 print(row(error, true, method, right[method], found), flush=True)
 

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from bench.command import parser_on_one_thread
+from bench.pages.text import table_of
 from scenematch import ClosedLoopSettings, WorldSettings, fly_closed_loop
 
 FLIGHTS = (
@@ -21,9 +23,12 @@ FLIGHTS = (
     ("noon", "ncc", "shifted"),
 )
 """Condition of the frames over a map of noon, method, and fault."""
-HEAD = (
-    "seed", "frames of", "method", "fault", "flown s", "true track RMS m", "largest m", "estimate RMS m",
-    "fixes", "used", "false", "unhealthy s", "held s", "handed over",
+COLUMNS = (
+    ("seed", "seed", "d"), ("frames of", "condition", "s"), ("method", "method", "s"), ("fault", "fault", "s"),
+    ("flown s", "seconds", ".0f"), ("true track RMS m", "plan_rms_m", ".2f"), ("largest m", "plan_max_m", ".2f"),
+    ("estimate RMS m", "estimate_rms_m", ".2f"), ("fixes", "found", "s"), ("used", "used", "d"),
+    ("false", "false_fixes", "d"), ("unhealthy s", "unhealthy_s", ".1f"), ("held s", "hold_s", ".1f"),
+    ("handed over", "handed_over", lambda is_done: "yes" if is_done else "no"),
 )  # fmt: skip
 
 
@@ -34,35 +39,22 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="keeps every flight's folder here")
     parser.add_argument("--flights", type=int, nargs="+", default=list(range(len(FLIGHTS))), help="which of them")
     arguments = parser.parse_args()
-    print("|", " | ".join(HEAD), "|")
-    print("|---" * len(HEAD) + "|")
+    print("\n".join(table_of([], *COLUMNS)[:2]))
     for seed in arguments.seeds:
         for number in arguments.flights:
             with tempfile.TemporaryDirectory() as scratch:
                 folder = (arguments.out or Path(scratch)) / f"{seed}-{'-'.join(FLIGHTS[number])}"
-                print("|", " | ".join(row(folder, seed, arguments.minutes, *FLIGHTS[number])), "|", flush=True)
+                flown = row(folder, seed, arguments.minutes, *FLIGHTS[number])
+                print(table_of([flown], *COLUMNS)[2], flush=True)
 
 
-def row(folder: Path, seed: int, minutes: float, condition: str, method: str, fault: str) -> list[str]:
+def row(folder: Path, seed: int, minutes: float, condition: str, method: str, fault: str) -> dict[str, Any]:
+    """The figures of one flight."""
     world = WorldSettings(seed=seed, condition=condition)
     loop = ClosedLoopSettings(minutes=minutes, method=method, fault=fault)
     figures = fly_closed_loop(folder, world, loop, force=True)
-    return [
-        str(seed),
-        condition,
-        method,
-        fault,
-        f"{figures['seconds']:.0f}",
-        f"{figures['plan_rms_m']:.2f}",
-        f"{figures['plan_max_m']:.2f}",
-        f"{figures['estimate_rms_m']:.2f}",
-        f"{figures['fixes']} of {figures['frames']}",
-        str(figures["used"]),
-        str(figures["false_fixes"]),
-        f"{figures['unhealthy_s']:.1f}",
-        f"{figures['hold_s']:.1f}",
-        "yes" if figures["handed_over"] else "no",
-    ]
+    asked = {"seed": seed, "condition": condition, "method": method, "fault": fault}
+    return {**figures, **asked, "found": f"{figures['fixes']} of {figures['frames']}"}
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ wrong places, beside how often it may be.
 
 from __future__ import annotations
 
-import argparse
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from bench.accuracy.judged import GREY, STRUCTURE, Bench, Row
 from bench.accuracy.trials import Trial, ground
 from bench.accuracy.year_pairs import matched as year_matched
+from bench.command import parser_on_one_thread
 from engine.options import SiftOptions
 from engine.runtime.threads import set_threads
 
@@ -76,7 +76,7 @@ def _by_sift(bench: Bench, made: Trial, rng: np.random.Generator) -> Row:
 
 def main() -> None:
     """Match, count and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__)
     parser.add_argument("--matches", type=int, default=12_000, help="by each method")
     parser.add_argument("--method", choices=METHODS)
     options = parser.parse_args()

@@ -10,11 +10,10 @@ docs/results/field.md.
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from bench.accuracy.flights import MIDDLE, where_truth_is
 from bench.accuracy.truth import START_SIGMA_M, answered, rows_of
 from bench.command import parser_on_one_thread
 from bench.pages import field
+from bench.pages.text import printed
 from engine import Frame, Navigator, OrthoMap, Prior
 from engine.geo import Array
 from engine.options import LearnedOptions
@@ -76,17 +76,14 @@ class Figures:
 def inputs_of(name: str, step: int) -> tuple[FlightFiles, FlightInputs]:
     """A shared flight, every ``step``-th frame of it."""
     folder = SHARED / name.removesuffix(BLIND)
-    files = _with_video(folder) if (folder / VIDEO).is_file() else FlightFiles.in_folder(folder)
+    files = FlightFiles.in_folder(folder)
+    if (folder / VIDEO).is_file():
+        files = replace(files, frames=folder / VIDEO)
     inputs = open_inputs(files, [])
     flight = inputs.flight.every(step)
     if name.endswith(BLIND):
         flight.rows[:] = [replace(row, lat_deg=None, lon_deg=None) for row in flight.rows]
     return files, replace(inputs, flight=flight)
-
-
-def _with_video(folder: Path) -> FlightFiles:
-    names = {"map": "map.tif", "camera": "camera.yaml", "frames": VIDEO, "telemetry": "telemetry.csv"}
-    return FlightFiles.from_flat(**{what: folder / name for what, name in names.items()})
 
 
 def fly(name: str, method: str, step: int, weights: Sequence[Path]) -> Figures:
@@ -215,11 +212,7 @@ def main() -> None:
     parser.add_argument("--step", type=int, help="every how many frames one is taken, of every set")
     parser.add_argument("--weights", type=Path, nargs="+", default=(), help="of the learned method, else left out")
     options = parser.parse_args()
-    rows = []
-    for row in measure(options):
-        rows.append(row)
-        print(json.dumps(asdict(row)), flush=True)
-    field.write(options.docs, rows)
+    field.write(options.docs, printed(measure(options)))
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def moved_to_middle(fix: Fix, site: OrthoMap, camera: Camera) -> Fix:
     """The fix at the ground that the middle of its frame shows, where it has a pose."""
     if fix.attitude is None or fix.up_m is None:
         return fix
-    ray = _turn(fix.attitude) @ camera.mount @ camera.frame_rays[4]
+    ray = camera.enu_from_camera(fix.attitude) @ camera.frame_rays[4]
     east, north = np.array([fix.east_m, fix.north_m]) + ray[:2] * (fix.up_m - site.ground_m) / -ray[2]
     lat, lon = site.frame.geodetic_from_enu(east, north)
     return replace(fix, east_m=float(east), north_m=float(north), lat_deg=float(lat), lon_deg=float(lon))

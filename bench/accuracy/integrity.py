@@ -8,7 +8,6 @@ Each match is of one frame, with a prior that is as far off as it says. What was
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import zlib
@@ -17,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bench import RESULTS, ROOT, SHARED
+from bench import ROOT, SHARED
 from bench.accuracy.judged import METHODS, Bench, Row
 from bench.accuracy.trials import ground
+from bench.command import parser_on_one_thread
 from bench.pages import integrity
 from engine.runtime.threads import set_threads
 
@@ -89,10 +89,9 @@ def gathered() -> list[Row]:
 
 def main() -> None:
     """Match, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("--matches", type=int, default=100_000)
     parser.add_argument("--resume", action="store_true", help="keep what an earlier run matched")
-    parser.add_argument("--docs", type=Path, default=RESULTS)
     options = parser.parse_args()
     if not options.resume:
         shutil.rmtree(PARTS, ignore_errors=True)

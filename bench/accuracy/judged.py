@@ -101,7 +101,7 @@ class Bench:
             return self.posed(made, made.frame, made.prior, matcher.options.sift)
         fix = matcher.locate(made.frame, made.prior)
         if isinstance(fix, NoFix):
-            return self.row(made, method, None, False, [], [])
+            return self.no_match(made, method)
         return self.row(made, method, fix, True, [fix.confidence or 0.0], [])
 
     def peak(self, made: Trial) -> tuple[Query, Ncc, PeakCandidate | NoFix]:
@@ -117,7 +117,7 @@ class Bench:
         """The match by NCC alone: by structure where the peak by grey levels is refused."""
         query, ncc, found = self.peak(made)
         if isinstance(found, NoFix):
-            return self.row(made, "NCC", None, False, [], [])
+            return self.no_match(made, "NCC")
         if not found.suffices(query.risk):
             found = ncc.match_structure(query, found) or found
         ratio = math.sqrt(found.evidence.rival / max(found.evidence.surprise, 1e-6))
@@ -131,7 +131,7 @@ class Bench:
         if found is not None and method == STRUCTURE:
             found = ncc.match_structure(query, found)
         if found is None:
-            return self.row(made, method, None, False, [], [])
+            return self.no_match(made, method)
         scores = [found.fix.confidence or 0.0, found.peak.score]
         return self.row(made, method, found.fix, found.suffices(query.risk), scores, [found.evidence.nats])
 
@@ -141,29 +141,25 @@ class Bench:
         query = _query(matcher, frame, prior)
         sift = _part(matcher, "sift", Sift)
         found = sift.find(query, options)
-        fixed = not isinstance(found, NoFix) and found.suffices(query.risk)
         if isinstance(found, NoFix):
-            return self.row(made, "SIFT", None, False, [], [])
-        scores = [
-            found.fix.confidence or 0.0,
-            found.evidence.surprise - math.log(found.evidence.tried),
-            found.fix.score,
-        ]
-        return self.row(made, "SIFT", found.fix, fixed, scores, [found.evidence.nats])
+            return self.no_match(made, "SIFT")
+        false_alarms = found.evidence.surprise - math.log(found.evidence.tried)
+        scores = [found.fix.confidence or 0.0, false_alarms, found.fix.score]
+        return self.row(made, "SIFT", found.fix, found.suffices(query.risk), scores, [found.evidence.nats])
 
-    def row(
-        self, made: Trial, method: str, fix: Fix | None, fixed: bool, scores: list[float], values: list[float]
-    ) -> Row:
-        """A match held against its truth."""
+    def no_match(self, made: Trial, method: str) -> Row:
+        """A match that found nothing."""
+        return Row(self.here.name, made.kind, method, False, False, [], [], np.inf, np.nan, np.nan)
+
+    def row(self, made: Trial, method: str, fix: Fix, fixed: bool, scores: list[float], nats: list[float]) -> Row:
+        """What was found, held against its truth."""
         name, kind = self.here.name, made.kind
-        if fix is None:
-            return Row(name, kind, method, False, False, [], [], np.inf, np.nan, np.nan)
         levels_m = [fix.protection_level_m(risk) for risk in RISKS]
         if made.truth_m is None:
-            return Row(name, kind, method, fixed, False, scores, values, np.inf, fix.sigma_m, np.nan, levels_m)
+            return Row(name, kind, method, fixed, False, scores, nats, np.inf, fix.sigma_m, np.nan, levels_m)
         error_m, sigmas = off(self.here.seen(fix), made.truth_m)
         right = error_m <= WRONG_M or error_m <= FALSE_SIGMAS * fix.sigma_m
-        return Row(name, kind, method, fixed, right, scores, values, error_m, fix.sigma_m, sigmas**2, levels_m)
+        return Row(name, kind, method, fixed, right, scores, nats, error_m, fix.sigma_m, sigmas**2, levels_m)
 
 
 def _query(matcher: SceneMatcher, frame: Frame, prior: Prior | None) -> Query:

@@ -54,21 +54,15 @@ def town_site(seed: int) -> OrthoMap:
 
 def simulated(seed: int, starts: int, condition: str = "noon") -> Flight:
     """Runs over a town: any place, heading and height from which the map holds most of the frame."""
-    plan, site, rng = (
-        plan_flight(seed, frames=1, condition=condition),
-        town_site(seed),
-        np.random.default_rng(seed),
-    )
+    plan = plan_flight(seed, frames=1, condition=condition)
+    site, rng = town_site(seed), np.random.default_rng(seed)
     motion = wander(site, starts, rng)
     stamps = tuple((START_NS + np.rint(motion.time_s * 1e9).astype(np.int64)).tolist())
     telemetry = simulate_telemetry(motion, SensorNoise(), rng)
-    frames = [
-        blind(f) for f in replace(plan, truth=motion, telemetry=telemetry, timestamps_ns=stamps).iter_frames()
-    ]
-    seen = list(zip(frames, motion.position_m[:, :2], strict=True))
-    return Flight(
-        f"town {seed}, {condition}", site, plan.camera, [seen[k : k + FRAMES] for k in range(0, len(seen), FRAMES)]
-    )
+    plan = replace(plan, truth=motion, telemetry=telemetry, timestamps_ns=stamps)
+    seen = list(zip(map(blind, plan.iter_frames()), motion.position_m[:, :2], strict=True))
+    runs = [seen[k : k + FRAMES] for k in range(0, len(seen), FRAMES)]
+    return Flight(f"town {seed}, {condition}", site, plan.camera, runs)
 
 
 def wander(site: OrthoMap, starts: int, rng: np.random.Generator) -> Motion:
@@ -114,9 +108,8 @@ def fly(flight: Flight, matcher: SceneMatcher) -> dict[str, Any]:
     A fix is wrong that is off by more than 10 m and three of its own sigmas.
     """
     within, fixes, wrong, alone, alone_wrong, refused, times = 0, 0, 0, 0, 0, 0, []
-    any_heading = (
-        {"heading_deg": 0.0, "heading_sigma_deg": 180.0} if matcher.method == "ncc" else {}
-    )  # it needs one
+    # NCC needs a heading.
+    any_heading = {"heading_deg": 0.0, "heading_sigma_deg": 180.0} if matcher.method == "ncc" else {}
     for run in flight.runs:
         frames = [(replace(frame, **any_heading),) for frame, _ in run]
         results, spent_ms = answered(Navigator(matcher).update, frames)

@@ -20,18 +20,7 @@ from bench import SHARED
 from bench.accuracy.flights import Recorded, recorded, simulated, where_truth_is
 from bench.accuracy.truth import true_start
 from bench.command import parser_on_one_thread
-from engine import (
-    Budget,
-    Camera,
-    Fix,
-    Frame,
-    Navigator,
-    NavigatorOptions,
-    NoFix,
-    Prior,
-    Reason,
-    SceneMatcher,
-)
+from engine import Budget, Camera, Fix, Frame, Navigator, NavigatorOptions, NoFix, Prior, Reason, SceneMatcher
 from engine.assumed_errors import AssumedErrors
 from engine.geo import Array
 from engine.matching.align import to_gray

@@ -71,7 +71,7 @@ def row_rays(
     A ray d of a camera displaced by s meets the ground where d - s d_z / h of the undisplaced one does.
     """
     start = np.array([attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg])
-    cam_from_enu = (enu_from_body(*start) @ camera.mount).T
+    cam_from_enu = camera.enu_from_camera(attitude).T
 
     def seen_after(time_s: float) -> Array:
         shear = np.eye(3)

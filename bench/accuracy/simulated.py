@@ -8,16 +8,15 @@ ones.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bench.accuracy.rebuilt import rebuilt
 from bench.accuracy.shutter import Shutter, ShutterFlight
 from bench.accuracy.truth import answered, pooled, rows_of, true_start
 from bench.command import parser_on_one_thread
-from bench.pages.text import fill, machine, paragraph, percent, table_of
+from bench.pages.text import fill, machine, paragraph, percent, printed, table_of
 from engine import Navigator, SceneMatcher
 from scenematch.report.metrics import Ground, summarise
 from scenematch.runs.settings import TrackSettings
@@ -146,15 +145,6 @@ def hilly_lines(runs: list[Run]) -> list[str]:
     return table_of(rows, ("hills", "hills", "s"), DAY, WHO, RMS, worst, FIXED, FALSE, nees)
 
 
-def flown(runs: Iterator[Run]) -> list[Run]:
-    """All of them, each printed when it is there."""
-    out = []
-    for run in runs:
-        out.append(run)
-        print(json.dumps(asdict(run)), flush=True)
-    return out
-
-
 def main() -> None:
     """Fly, and write the tables."""
     parser = parser_on_one_thread(__doc__, docs=True)
@@ -165,11 +155,11 @@ def main() -> None:
     frames = 5 if options.quick else None
     if options.hills:
         seeds, hills_m = (HILLY_SEEDS[:1], HILLS_M[-1:]) if options.quick else (HILLY_SEEDS, HILLS_M)
-        fill(page, {"hills": [*hilly_lines(flown(hills(seeds, hills_m, frames))), *measured]})
+        fill(page, {"hills": [*hilly_lines(printed(hills(seeds, hills_m, frames))), *measured]})
         return
     seeds = SEEDS[:1] if options.quick else SEEDS
-    body = lines(flown(flights(seeds, frames)), WAYS)
-    more = lines(flown(harder(seeds[:2], frames)), WAYS[:2])
+    body = lines(printed(flights(seeds, frames)), WAYS)
+    more = lines(printed(harder(seeds[:2], frames)), WAYS[:2])
     fill(page, {"conditions": [*body, "The engine on what is harder, two towns each:", "", *more, *measured]})
 
 

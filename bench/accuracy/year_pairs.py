@@ -70,7 +70,7 @@ def _plain(bench: Bench, made: Trial) -> Row:
     """The highest peak of OpenCV's plain zero-mean NCC of the rectified frame in the whole window."""
     query, _, found = bench.peak(made)
     if isinstance(found, NoFix):
-        return bench.row(made, PLAIN, None, False, [], [])
+        return bench.no_match(made, PLAIN)
     aligned, site = found.aligned, query.site
     crop = level_crop(site, found.fix.window, aligned.level)
     scores = cv2.matchTemplate(site.gray(crop, aligned.level), aligned.patch.gray, cv2.TM_CCOEFF_NORMED)

@@ -13,18 +13,14 @@ from functools import cache
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench import SHARED
-from bench.accuracy.trials import Ground, Trial, ground_quad_px, mirrored, picture, turned_round
+from bench.accuracy.trials import Ground, Rng, Trial, ground_quad_px, mirrored, picture, turned_round
 from bench.accuracy.truth import prior_about
 from bench.inputs.farmland import farmland, half_of, laid_out, vintages
 from engine import Camera, Frame, OrthoMap, Prior
 from engine.geo import Array
 from engine.values import Attitude, Window
-
-Image = NDArray[np.uint8]
-Rng = np.random.Generator
 
 CITIES = SHARED / "naip-cities"
 YEARS = ("2016", "2018", "2020")

@@ -82,10 +82,13 @@ def load(folder: Path, map_name: str = "map.tif", step: int = 1, count: int | No
     )
 
 
+Spoil = Callable[[FlightInputs], FlightInputs]
+"""Puts a fault into the inputs of a flight."""
+
 # ---------------------------------------------------------------------------------------------- telemetry
 
 
-def _angles(change: Angles) -> Callable[[FlightInputs], FlightInputs]:
+def _angles(change: Angles) -> Spoil:
     """All roll, pitch and heading (N, 3) by another rule."""
 
     def spoil(inputs: FlightInputs) -> FlightInputs:
@@ -100,12 +103,13 @@ def _angles(change: Angles) -> Callable[[FlightInputs], FlightInputs]:
     return spoil
 
 
-def _each(change: Callable[[Frame], Frame]) -> Callable[[FlightInputs], FlightInputs]:
-    return lambda inputs: replace(inputs, frames=[change(frame) for frame in inputs.frames])
+def _each(change: Callable[[Frame, FlightInputs], Frame]) -> Spoil:
+    """Every frame of a flight changed."""
+    return lambda inputs: replace(inputs, frames=[change(frame, inputs) for frame in inputs.frames])
 
 
-def raised(change: Callable[[float], float]) -> Callable[[FlightInputs], FlightInputs]:
-    def one(frame: Frame) -> Frame:
+def raised(change: Callable[[float], float]) -> Spoil:
+    def one(frame: Frame, _: FlightInputs) -> Frame:
         if frame.height_agl_m is None:
             return frame
         return replace(frame, height_agl_m=max(change(frame.height_agl_m), 1.0))
@@ -113,7 +117,7 @@ def raised(change: Callable[[float], float]) -> Callable[[FlightInputs], FlightI
     return _each(one)
 
 
-def late(seconds: float, *, attitude: bool = True, rest: bool = True) -> Callable[[FlightInputs], FlightInputs]:
+def late(seconds: float, *, attitude: bool = True, rest: bool = True) -> Spoil:
     """Telemetry of some time ago; of its parts, the attitude or the rest."""
 
     def spoil(inputs: FlightInputs) -> FlightInputs:
@@ -139,8 +143,8 @@ def late(seconds: float, *, attitude: bool = True, rest: bool = True) -> Callabl
     return spoil
 
 
-def _velocity(change: Callable[[float, float], tuple[float, float]]) -> Callable[[FlightInputs], FlightInputs]:
-    def one(frame: Frame) -> Frame:
+def _velocity(change: Callable[[float, float], tuple[float, float]]) -> Spoil:
+    def one(frame: Frame, _: FlightInputs) -> Frame:
         if frame.east_velocity_mps is None or frame.north_velocity_mps is None:
             return frame
         east, north = change(frame.east_velocity_mps, frame.north_velocity_mps)
@@ -149,24 +153,21 @@ def _velocity(change: Callable[[float, float], tuple[float, float]]) -> Callable
     return _each(one)
 
 
-def _stamps(factor: float) -> Callable[[FlightInputs], FlightInputs]:
+def _stamps(factor: float) -> Spoil:
     """Stamps in another unit, or of another frame rate; the truth keeps its own, by position in the list."""
 
-    def spoil(inputs: FlightInputs) -> FlightInputs:
-        first = inputs.frames[0].timestamp_ns or 0
-        frames = [
-            replace(f, timestamp_ns=round(first * min(factor, 1.0) + ((f.timestamp_ns or 0) - first) * factor))
-            for f in inputs.frames
-        ]
-        return replace(inputs, frames=frames)
+    def one(frame: Frame, inputs: FlightInputs) -> Frame:
+        first_ns = inputs.frames[0].timestamp_ns or 0
+        since_ns = (frame.timestamp_ns or 0) - first_ns
+        return replace(frame, timestamp_ns=round(first_ns * min(factor, 1.0) + since_ns * factor))
 
-    return spoil
+    return _each(one)
 
 
 # ------------------------------------------------------------------------------------------------- camera
 
 
-def lens(focal: float = 1.0, principal_px: float = 0.0) -> Callable[[FlightInputs], FlightInputs]:
+def lens(focal: float = 1.0, principal_px: float = 0.0) -> Spoil:
     def spoil(inputs: FlightInputs) -> FlightInputs:
         matrix = inputs.camera.matrix.copy()
         matrix[[0, 1], [0, 1]] *= focal
@@ -176,7 +177,7 @@ def lens(focal: float = 1.0, principal_px: float = 0.0) -> Callable[[FlightInput
     return spoil
 
 
-def mounted(turn_deg: float = 0.0, tilt_deg: float = 0.0) -> Callable[[FlightInputs], FlightInputs]:
+def mounted(turn_deg: float = 0.0, tilt_deg: float = 0.0) -> Spoil:
     """The calibration's mount turned about the optical axis, and tilted about the body's right axis."""
 
     def spoil(inputs: FlightInputs) -> FlightInputs:
@@ -187,11 +188,11 @@ def mounted(turn_deg: float = 0.0, tilt_deg: float = 0.0) -> Callable[[FlightInp
     return spoil
 
 
-def _pictures(change: Callable[[Array], Array]) -> Callable[[FlightInputs], FlightInputs]:
-    return _each(lambda f: replace(f, image=np.ascontiguousarray(change(np.asarray(f.image)))))
+def _pictures(change: Callable[[Array], Array]) -> Spoil:
+    return _each(lambda f, _: replace(f, image=np.ascontiguousarray(change(np.asarray(f.image)))))
 
 
-def _distorted(k1: float) -> Callable[[FlightInputs], FlightInputs]:
+def _distorted(k1: float) -> Spoil:
     """Pictures of a lens with distortion, whose calibration says that it has none."""
 
     def spoil(inputs: FlightInputs) -> FlightInputs:
@@ -207,29 +208,24 @@ def _distorted(k1: float) -> Callable[[FlightInputs], FlightInputs]:
     return spoil
 
 
-def _rolling(readout_ms: float) -> Callable[[FlightInputs], FlightInputs]:
+def _rolling(readout_ms: float) -> Spoil:
     """Rows read one after the other: the picture shears by the vehicle's own motion."""
 
-    def spoil(inputs: FlightInputs) -> FlightInputs:
-        frames = []
-        for f in inputs.frames:
-            speed = np.array([f.east_velocity_mps or 0.0, f.north_velocity_mps or 0.0])
-            heading = np.radians(f.heading_deg or 0.0)
-            along = speed @ [np.sin(heading), np.cos(heading)], speed @ [np.cos(heading), -np.sin(heading)]
-            px_per_s = inputs.camera.focal_px / (f.height_agl_m or 100.0)
-            dy, dx = along[0] * px_per_s * readout_ms * 1e-3, -along[1] * px_per_s * readout_ms * 1e-3
-            height = inputs.camera.height_px
-            shear = np.array([[1.0, dx / height, -dx / 2], [0.0, 1.0 + dy / height, -dy / 2]])
-            image = cv2.warpAffine(
-                np.asarray(f.image), shear, (inputs.camera.width_px, height), borderMode=cv2.BORDER_REFLECT
-            )
-            frames.append(replace(f, image=np.ascontiguousarray(image)))
-        return replace(inputs, frames=frames)
+    def one(f: Frame, inputs: FlightInputs) -> Frame:
+        width, height = inputs.camera.width_px, inputs.camera.height_px
+        speed = np.array([f.east_velocity_mps or 0.0, f.north_velocity_mps or 0.0])
+        heading = np.radians(f.heading_deg or 0.0)
+        along = speed @ [np.sin(heading), np.cos(heading)], speed @ [np.cos(heading), -np.sin(heading)]
+        px_per_s = inputs.camera.focal_px / (f.height_agl_m or 100.0)
+        dy, dx = along[0] * px_per_s * readout_ms * 1e-3, -along[1] * px_per_s * readout_ms * 1e-3
+        shear = np.array([[1.0, dx / height, -dx / 2], [0.0, 1.0 + dy / height, -dy / 2]])
+        image = cv2.warpAffine(np.asarray(f.image), shear, (width, height), borderMode=cv2.BORDER_REFLECT)
+        return replace(f, image=np.ascontiguousarray(image))
 
-    return spoil
+    return _each(one)
 
 
-def _frozen(every_s: float, for_s: float) -> Callable[[FlightInputs], FlightInputs]:
+def _frozen(every_s: float, for_s: float) -> Spoil:
     def spoil(inputs: FlightInputs) -> FlightInputs:
         frames, held, first = [], None, inputs.frames[0].timestamp_ns or 0
         for f in inputs.frames:
@@ -241,7 +237,7 @@ def _frozen(every_s: float, for_s: float) -> Callable[[FlightInputs], FlightInpu
     return spoil
 
 
-def _kept(every: int) -> Callable[[FlightInputs], FlightInputs]:
+def _kept(every: int) -> Spoil:
     return lambda inputs: replace(inputs, frames=inputs.frames[::every])
 
 
@@ -250,7 +246,7 @@ def _kept(every: int) -> Callable[[FlightInputs], FlightInputs]:
 
 def _ground(
     shift_m: tuple[float, float] = (0.0, 0.0), scale: float = 1.0, turn_deg: float = 0.0, *, surface: str = "both"
-) -> Callable[[FlightInputs], FlightInputs]:
+) -> Spoil:
     """What the map shows, moved on its own grid; with its surface model, without it, or that alone."""
 
     def spoil(inputs: FlightInputs) -> FlightInputs:
@@ -268,7 +264,7 @@ def _ground(
     return spoil
 
 
-def _heights(change: Callable[[Array], Array]) -> Callable[[FlightInputs], FlightInputs]:
+def _heights(change: Callable[[Array], Array]) -> Spoil:
     return lambda inputs: (
         inputs if inputs.surface_m is None else replace(inputs, surface_m=change(inputs.surface_m))
     )
@@ -286,14 +282,14 @@ class Fault:
 
     name: str
     causes: tuple[str, ...]
-    spoil: Callable[[FlightInputs], FlightInputs]
+    spoil: Spoil
 
 
-def turned(*offsets_deg: float) -> Callable[[FlightInputs], FlightInputs]:
+def turned(*offsets_deg: float) -> Spoil:
     return _angles(lambda angles: angles + np.array(offsets_deg))
 
 
-def _times(*factors: float) -> Callable[[FlightInputs], FlightInputs]:
+def _times(*factors: float) -> Spoil:
     return _angles(lambda angles: angles * np.array(factors))
 
 
@@ -303,7 +299,7 @@ def _quarter_turned(image: Array) -> Array:
 
 
 _RADIANS = float(np.pi / 180.0)
-_TELEMETRY: dict[str, tuple[str, dict[str, Callable[[FlightInputs], FlightInputs]]]] = {
+_TELEMETRY: dict[str, tuple[str, dict[str, Spoil]]] = {
     "angles in radians:": ("radians", {
         "all": _angles(np.radians), "heading": _times(1, 1, _RADIANS), "tilt": _times(_RADIANS, _RADIANS, 1)}),
     "angles converted twice": ("degrees", {"": _angles(np.degrees)}),
@@ -326,7 +322,7 @@ _TELEMETRY: dict[str, tuple[str, dict[str, Callable[[FlightInputs], FlightInputs
     "stamps in": ("velocity", {"milliseconds": _stamps(1e-6), "microseconds": _stamps(1e-3)}),
     "frame rate times": ("velocity", {"1.5": _stamps(1 / 1.5), "0.5": _stamps(2.0)}),
 }  # fmt: skip
-_CAMERA: dict[str, tuple[str, dict[str, Callable[[FlightInputs], FlightInputs]]]] = {
+_CAMERA: dict[str, tuple[str, dict[str, Spoil]]] = {
     "focal length off by": ("focal height", {
         "-20 %": lens(0.8), "-5 %": lens(0.95), "5 %": lens(1.05), "20 %": lens(1.2)}),
     "principal point off by": ("mount", {"10 px": lens(principal_px=10), "30 px": lens(principal_px=30)}),
@@ -341,7 +337,7 @@ _CAMERA: dict[str, tuple[str, dict[str, Callable[[FlightInputs], FlightInputs]]]
     "pictures frozen": ("frozen", {"5 of 15 s": _frozen(15, 5), "2 of 6 s": _frozen(6, 2)}),
     "one picture of": ("", {"3": _kept(3), "10": _kept(10)}),
 }  # fmt: skip
-_MAP: dict[str, tuple[str, dict[str, Callable[[FlightInputs], FlightInputs]]]] = {
+_MAP: dict[str, tuple[str, dict[str, Spoil]]] = {
     "map shifted by": ("map", {"5 m": _ground((3, 4)), "8 m": _ground((8, 0)), "40 m": _ground((-32, 24))}),
     "map scaled by": ("height focal", {"2 %": _ground(scale=1.02), "10 %": _ground(scale=1.1)}),
     "map turned by": ("heading", {"2": _ground(turn_deg=2), "5": _ground(turn_deg=5)}),
@@ -359,13 +355,10 @@ def faults() -> list[Fault]:
     for table, stated in ((_TELEMETRY, True), (_CAMERA, True), (_MAP, False)):
         for name, (causes, sizes) in table.items():
             for size, spoil in sizes.items():
-                rows.append(Fault(f"{name} {size}".strip(), tuple(causes.split()), _with_accuracy(spoil, stated)))
+                told = spoil if stated else _without_accuracy(spoil)
+                rows.append(Fault(f"{name} {size}".strip(), tuple(causes.split()), told))
     return rows
 
 
-def _with_accuracy(
-    spoil: Callable[[FlightInputs], FlightInputs], stated: bool
-) -> Callable[[FlightInputs], FlightInputs]:
-    if stated:
-        return spoil
+def _without_accuracy(spoil: Spoil) -> Spoil:
     return lambda inputs: replace(spoil(inputs), georeference_sigma_m=None)

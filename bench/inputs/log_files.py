@@ -1,7 +1,8 @@
 """Flight logs written byte by byte with known values: what the tests read back and the fuzz damages."""
 
-import math
 import struct
+
+from scipy.spatial.transform import Rotation
 
 S = 1_000_000_000
 GPS_WEEK, GPS_MS = 2288, 166_418_000  # 2023-11-13 22:13:20 UTC, 18 leap seconds later by GPS
@@ -109,15 +110,9 @@ def dataflash_flight(path, *, more=(), rangefinder=True):
 
 
 def quaternion(roll_deg, pitch_deg, heading_deg):
-    r, p, y = (math.radians(angle) / 2 for angle in (roll_deg, pitch_deg, heading_deg))
-    about = {"x": (math.cos(r), math.sin(r)), "y": (math.cos(p), math.sin(p)), "z": (math.cos(y), math.sin(y))}
-    (cr, sr), (cp, sp), (cy, sy) = about["x"], about["y"], about["z"]
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
+    """Of the body in north-east-down, w first."""
+    turn = Rotation.from_euler("ZYX", (heading_deg, pitch_deg, roll_deg), degrees=True)
+    return turn.as_quat(scalar_first=True)
 
 
 def ulog_flight(path, *, more=(), without=(), names=None):

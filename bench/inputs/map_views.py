@@ -17,7 +17,6 @@ from bench.accuracy.quality import Array, Gray, ViewPair
 from bench.inputs.scenes import flight
 from bench.inputs.views import Size, by_homography, open_shared
 from engine import Camera, Frame, OrthoMap
-from engine.geo import enu_from_body
 from engine.matching.align import to_gray, view_of
 from engine.values import Attitude, Truth, Window
 from engine.window import level_for
@@ -111,7 +110,7 @@ def _pair(name: str, site: OrthoMap, camera: Camera, photo: Photo, size: Size) -
     window = Window(int(corner[0]), int(corner[1]), width, height)
     if not site.valid(window, level).all():
         return None
-    turn = (enu_from_body(*_angles(photo.attitude)) @ camera.mount).T
+    turn = camera.enu_from_camera(photo.attitude).T
     picture = cv2.resize(photo.gray, None, fx=reduced, fy=reduced, interpolation=cv2.INTER_AREA)
     cut = (np.array(picture.shape[::-1]) - size) // 2
 
@@ -123,10 +122,6 @@ def _pair(name: str, site: OrthoMap, camera: Camera, photo: Photo, size: Size) -
 
     first = np.ascontiguousarray(picture[cut[1] : cut[1] + height, cut[0] : cut[0] + width])
     return ViewPair(f"{name} on map", first, site.gray(window, level), first_from_second)
-
-
-def _angles(attitude: Attitude) -> tuple[float, float, float]:
-    return attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg
 
 
 def _aligned(pair: ViewPair) -> ViewPair | None:

@@ -272,7 +272,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    import torch
-
-    torch.set_num_threads(1)
     main()

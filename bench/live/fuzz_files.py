@@ -86,6 +86,10 @@ def use_rows(rows: list[TelemetryRow]) -> None:
     ground_amsl_m(rows)
 
 
+def use_telemetry(path: Path) -> None:
+    use_rows(read_telemetry(path))
+
+
 def use_truth(path: Path) -> None:
     rows = read_truth(path)
     interpolate_truth(rows, (rows[0].timestamp_ns + rows[-1].timestamp_ns) // 2)
@@ -122,17 +126,14 @@ covariance_en_m2,score,method,window_width_px,window_height_px,latency_ms,deadli
 1700000000000000000,a.png,fix,,32.5,35.25,1.0,2.0,3.0,0.5,0.5,0.01,0.9,ncc,200,200,20.1,true
 1700000000200000000,b.png,no_fix,no_texture,,,,,,,,,0.1,ncc,200,200,20.1,true
 """
+TRANSECT = {"Items": [{"command": 16, "params": [0, 0, 0, None, 33.65, 72.98, 50]}]}
 PLAN = {
     "fileType": "Plan",
     "mission": {
         "plannedHomePosition": [33.64, 72.99, 500],
         "items": [
             {"command": 22, "type": "SimpleItem", "params": [15, 0, 0, None, 33.64, 72.99, 50]},
-            {
-                "TransectStyleComplexItem": {
-                    "Items": [{"command": 16, "params": [0, 0, 0, None, 33.65, 72.98, 50]}]
-                }
-            },
+            {"TransectStyleComplexItem": TRANSECT},
             {"command": 20, "type": "SimpleItem", "params": [0, 0, 0, 0, 0, 0, 0]},
         ],
     },
@@ -152,11 +153,7 @@ def seeds(folder: Path) -> dict[str, tuple[str, bytes, Callable[[Path], object]]
         "DataFlash": ("a.BIN", dataflash_flight(folder / "seed.BIN").read_bytes(), use_log),
         "ULog": ("a.ulg", ulog_flight(folder / "seed.ulg").read_bytes(), use_log),
         "SRT": ("a.srt", SRT.encode(), use_log),
-        "telemetry.csv": (
-            "telemetry.csv",
-            (folder / "seed.csv").read_bytes(),
-            lambda path: use_rows(read_telemetry(path)),
-        ),
+        "telemetry.csv": ("telemetry.csv", (folder / "seed.csv").read_bytes(), use_telemetry),
         "truth.csv": ("truth.csv", TRUTH.encode(), use_truth),
         "track.csv": ("track.csv", TRACK.encode(), use_track),
         "plan": ("a.plan", json.dumps(PLAN, indent=1).encode(), read_route),

@@ -106,7 +106,7 @@ def growth_bytes(hours: float) -> int:
 
 
 if __name__ == "__main__":
-    begin = time.thread_time()
+    begin = time.perf_counter()
     done = fuzz(int(sys.argv[1]) if len(sys.argv) > 1 else 100_000, seed=1)
     print(f"{done.packets} pieces, {done.heard} messages heard, longest {done.longest_s * 1e3:.1f} ms, "
           f"{time.perf_counter() - begin:.0f} s")  # fmt: skip

@@ -37,24 +37,24 @@ def entries(rounds: int = 5) -> list[Row]:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     rows = []
     for what, arguments in ENTRIES.items():
-        starts = [_entry(arguments, environment) for _ in range(rounds + 1)][1:]
+        starts = [_started(environment, "--entry", *arguments) for _ in range(rounds + 1)][1:]
         seconds, core_s, resident_mb = (statistics.median(values) for values in zip(*starts, strict=True))
         rows.append({"what": what, "seconds": seconds, "core_s": core_s, "resident_mb": resident_mb})
     return rows
 
 
-def _entry(arguments: tuple[str, ...], environment: dict[str, str]) -> tuple[float, float, float]:
+def _started(environment: dict[str, str], *arguments: str) -> Any:
+    """What this module prints as a process with these arguments."""
+    command = [sys.executable, "-m", "bench.live.startup", *arguments]
+    ended = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
+    return json.loads(ended.stdout)
+
+
+def _measured_entry(arguments: list[str]) -> list[float]:
     """Seconds, seconds on a core and megabytes of one start of Python.
 
     A small process starts it: the peak that the system counts for a child begins with that of its parent.
     """
-    command = [sys.executable, "-m", "bench.live.startup", "--entry", *arguments]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
-    seconds, core_s, resident_mb = json.loads(done.stdout)
-    return seconds, core_s, resident_mb
-
-
-def _measured_entry(arguments: list[str]) -> list[float]:
     begin = time.perf_counter()
     process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)
@@ -87,11 +87,8 @@ def startup(methods: tuple[str, ...] = ("ncc", "sift", "auto"), rounds: int = 1)
 def _row(root: Path, method: str, kept: str, maps: Path, compiled: Path, rounds: int) -> Row:
     """Medians of some starts, in seconds."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(maps / "maps"), "NUMBA_CACHE_DIR": str(compiled / "numba")}
-    starts = []
-    for _ in range(rounds + (kept == "all kept")):
-        command = [sys.executable, "-m", "bench.live.startup", str(root / "flight"), method, repr(time.time())]
-        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
-        starts.append(json.loads(done.stdout))
+    count, flight = rounds + (kept == "all kept"), str(root / "flight")
+    starts = [_started(environment, flight, method, repr(time.time())) for _ in range(count)]
     starts = starts[-rounds:]  # the first of those with everything kept may still have had something to keep
     medians = {part: statistics.median(start[part] for start in starts) for part in PARTS}
     return {

@@ -19,10 +19,7 @@ def tradeoff(
     course: Course, frames: int = 100, table_frames: int = 1_000, paper_frames: int = 150
 ) -> dict[str, list[Row]]:
     """Both tables."""
-    return {
-        "curve": curve(course, frames),
-        "table": table_one(table_frames, paper_frames),
-    }
+    return {"curve": curve(course, frames), "table": table_one(table_frames, paper_frames)}
 
 
 def curve(course: Course, frames: int) -> list[Row]:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bench.pages.text import fill, measured, table_of
+from bench.pages.text import fill, measured, save_pictures, table_of
 
 TITLES = {
     "gazebo-a1": "town A1, drawn by Gazebo",
@@ -55,8 +55,7 @@ def write(docs: Path, runs: list[Run], variants: list[Run]) -> None:
         lines += [f"## {TITLES.get(flight, flight)} ({own[0].summary['frames']} frames, {every})", ""]
         lines += _table(own, "who")
     fill(docs / "flights.md", measured() | {"flights": lines, "telemetry": _table(variants, "telemetry")})
-    (docs / "img").mkdir(exist_ok=True)
-    _chart(runs).savefig(docs / "img" / "sift-flights.png", dpi=130, facecolor="white")
+    save_pictures(docs, {"sift-flights.png": _chart(runs)})
 
 
 def _table(runs: list[Run], first: str) -> list[str]:

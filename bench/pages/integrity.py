@@ -6,12 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from bench.accuracy.judged import METHODS, RISKS, SCORES, Row
 from bench.accuracy.trials import ANSWERABLE, SUITABLE, UNANSWERABLE, UNSUITABLE
-from bench.pages.text import fill, paragraph, percent, table
+from bench.pages.text import fill, paragraph, percent, save_pictures, table
 from engine.geo import Array
 
 Mask = NDArray[np.bool_]
@@ -26,8 +27,8 @@ def write(rows: list[Row], docs: Path) -> None:
     """Fill in the sections of the page, and draw its pictures."""
     found = sections(rows)
     fill(docs / "integrity.md", found)
-    risk_chart(rows, docs / "img" / "integrity-risk.png")
-    reliability_chart(rows, docs / "img" / "integrity-reliability.png")
+    pictures = {"integrity-risk.png": _risk_chart(rows), "integrity-reliability.png": _reliability_chart(rows)}
+    save_pictures(docs, pictures, dpi=110)
     print("\n".join(line for lines in found.values() for line in lines))
 
 
@@ -186,12 +187,11 @@ def calibration_error(stated: Array, right: Mask, bins: int = 10) -> float:
     return float(sum(abs(stated[part].mean() - right[part].mean()) * part.mean() for part in parts))
 
 
-def risk_chart(rows: list[Row], path: Path) -> None:
+def _risk_chart(rows: list[Row]) -> Figure:
     """Wrong ones among those accepted, against the share of the suitable matches that is answered rightly."""
-    import matplotlib.pyplot as plt
-
     shown = [method for method, names in SCORES.items() if len(names) > 1]
-    figure, axes = plt.subplots(1, len(shown), figsize=(10, 4), sharey=True, layout="constrained")
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    axes = figure.subplots(1, len(shown), sharey=True)
     for axis, method in zip(axes, shown, strict=True):
         judged = [row for row in _of(rows, method) if row.scores and row.kind not in UNSUITABLE]
         right = np.array([row.right for row in judged])
@@ -207,16 +207,13 @@ def risk_chart(rows: list[Row], path: Path) -> None:
         axis.grid(alpha=0.3)
         axis.legend()
     axes[0].set_ylabel("share of wrong ones among the accepted")
-    path.parent.mkdir(exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    return figure
 
 
-def reliability_chart(rows: list[Row], path: Path) -> None:
+def _reliability_chart(rows: list[Row]) -> Figure:
     """How often a place is right of which the engine says so with a probability."""
-    import matplotlib.pyplot as plt
-
-    figure, axis = plt.subplots(figsize=(5, 4.2), layout="constrained")
+    figure = Figure(figsize=(5, 4.2), layout="constrained")
+    axis = figure.subplots()
     axis.plot([0, 1], [0, 1], color="0.7", lw=0.8)
     for method in SCORES:
         judged = [row for row in _of(rows, method) if row.scores]
@@ -230,5 +227,4 @@ def reliability_chart(rows: list[Row], path: Path) -> None:
     axis.set(xlabel="probability stated", ylabel="share that is right", xlim=(0, 1.02), ylim=(0, 1.02))
     axis.grid(alpha=0.3)
     axis.legend()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    return figure

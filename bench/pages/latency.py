@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from bench.live.endless import GRACE_MS
 from bench.live.startup import PARTS
-from bench.pages.text import fill, measured, table_of
+from bench.pages.text import fill, measured, save_pictures, table_of
 
 Row = dict[str, Any]
 COLOURS = {"ncc": "#0072b2", "sift": "#d55e00", "auto": "#009e73"}
@@ -34,14 +34,12 @@ def write(docs: Path, results: dict[str, Any]) -> None:
     if results["embedded"]:  # else its flight was not there
         sections["embedded"] = _embedded_table(results["embedded"])
     fill(docs / "latency.md", measured() | sections)
-    (docs / "img").mkdir(exist_ok=True)
     pictures = {
-        "budgets": _load_chart(results),
-        "soak": _soak_chart(soaked),
-        "tradeoff": _tradeoff_chart(results["tradeoff"]["curve"]),
+        "latency-budgets.png": _load_chart(results),
+        "latency-soak.png": _soak_chart(soaked),
+        "latency-tradeoff.png": _tradeoff_chart(results["tradeoff"]["curve"]),
     }
-    for name, figure in pictures.items():
-        figure.savefig(docs / "img" / f"latency-{name}.png", dpi=130, facecolor="white")
+    save_pictures(docs, pictures)
 
 
 # ----------------------------------------------------------------------------------------------------- tables

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.pages.field import COLUMNS, outcome
+from bench.pages.field import COLUMNS, NAMES, outcome
 from bench.pages.text import fill, measured, table
 
 if TYPE_CHECKING:
     from bench.accuracy.field import Figures
-
-NAMES = {"ncc": "NCC", "sift": "SIFT", "auto": "auto"}
 
 
 @dataclass(frozen=True)

@@ -2,19 +2,36 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import subprocess
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 import torch
 
 from bench import RESULTS, ROOT
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Row = TypeVar("Row")
+
+
+def printed(rows: Iterable[Row]) -> list[Row]:
+    """All of them, dataclasses, each printed as JSON as soon as it is there."""
+    out = []
+    for row in rows:
+        out.append(row)
+        print(json.dumps(asdict(row)), flush=True)
+    return out
 
 
 def table(columns: list[str], rows: list[list[str]]) -> list[str]:
@@ -61,6 +78,13 @@ def fill(page: Path, sections: Mapping[str, list[str]]) -> None:
         text = "\n".join([before + begin, "", *lines, end + rest.split(end)[1]])
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(text, encoding="utf-8")
+
+
+def save_pictures(docs: Path, pictures: Mapping[str, Figure], dpi: int = 130) -> None:
+    """Save the pictures of a page below ``docs``, by the names of their files."""
+    (docs / "img").mkdir(parents=True, exist_ok=True)
+    for name, figure in pictures.items():
+        figure.savefig(docs / "img" / name, dpi=dpi, facecolor="white")
 
 
 def measured() -> dict[str, list[str]]:

@@ -9,7 +9,6 @@ the table of docs/results/large-maps.md. Takes some fifteen minutes; `--folder` 
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import csv
 import json
@@ -23,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from bench import RESULTS
+from bench.command import parser_on_one_thread
 from bench.inputs.scenes import mosaic
 from bench.live.growth import resident_mb
 from bench.pages.text import fill, machine, paragraph, table_of
@@ -181,7 +180,7 @@ def _rows(path: Path) -> int:
 # --------------------------------------------------------------------------------------------------- the page
 
 
-def section(runs: list[Run], side: int) -> str:
+def section(runs: list[Run], side: int) -> list[str]:
     """What stands between the markers."""
     rows = [
         {
@@ -203,10 +202,9 @@ def section(runs: list[Run], side: int) -> str:
 
 def main() -> None:
     """Build, fly, and put the table between the page's markers."""
-    parser = argparse.ArgumentParser()
+    parser = parser_on_one_thread(__doc__, docs=True)
     parser.add_argument("--side", type=int, default=100_000)
     parser.add_argument("--folder", type=Path)
-    parser.add_argument("--docs", type=Path, default=RESULTS)
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = asked.folder or Path(temporary)

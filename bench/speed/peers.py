@@ -14,7 +14,7 @@ from bench.accuracy.quality import Array, Gray, Keypoints, matches
 from engine import Budget, Camera, Fix, Frame, NoFix, OrthoMap, Prior
 from engine.assumed_errors import AssumedErrors
 from engine.budget import Deadline
-from engine.geo import attitude_from_rotation, enu_from_body
+from engine.geo import attitude_from_rotation
 from engine.matching.align import to_gray, view_of
 from engine.matching.pose import MIN_INLIERS, AttitudePrior, PoseStats, solve_pose
 from engine.matching.query import Query
@@ -87,8 +87,8 @@ class OpenCvStep:
         assert isinstance(frame.image, np.ndarray)
         assert frame.height_agl_m is not None
         gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
-        body = enu_from_body(frame.roll_deg or 0.0, frame.pitch_deg or 0.0, frame.heading_deg or 0.0)
-        turn = body @ camera.mount
+        attitude = Attitude(frame.roll_deg or 0.0, frame.pitch_deg or 0.0, frame.heading_deg or 0.0)
+        turn = camera.enu_from_camera(attitude)
         ray = turn @ np.linalg.inv(camera.matrix) @ np.array([149.5, 149.5, 1.0])
         aim = np.linalg.solve(jacobian, ray[:2] * frame.height_agl_m / -ray[2])
         scale = frame.height_agl_m / (camera.focal_px * self._site.gsd_m_per_px)
@@ -202,9 +202,8 @@ class OpenCvFeatures:
         errors, attitude = AssumedErrors(), pose.grid_attitude
         if not self._options.use_attitude or attitude is None or not pose.has_tilt:
             return None
-        turn = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
         sigma_deg = (errors.tilt_deg, errors.tilt_deg, errors.heading_deg)
-        return AttitudePrior((turn @ self._camera.mount).T, sigma_deg)
+        return AttitudePrior(self._camera.enu_from_camera(attitude).T, sigma_deg)
 
     def _fix(self, query: Query, stats: PoseStats, window: Window) -> Fix:
         errors, site = query.errors, self.site
