@@ -39,7 +39,7 @@ class RosTopics:
     imu: str = bags.IMU
     compass: str = ""
     height: str = bags.HEIGHT
-    range: str = bags.RANGE
+    range: str = ""
     velocity: str = bags.VELOCITY
     odometry: str = ""
 

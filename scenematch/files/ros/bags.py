@@ -36,7 +36,7 @@ BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """Suffixes of bag files, in lower or upper case; a folder is a bag if it contains metadata.yaml."""
 IMAGE, CAMERA_INFO = "/camera/image_raw", "/camera/camera_info"
 IMU, COMPASS = "/mavros/imu/data", "/mavros/global_position/compass_hdg"
-HEIGHT, RANGE = "/mavros/global_position/rel_alt", "/mavros/rangefinder/rangefinder"
+HEIGHT = "/mavros/global_position/rel_alt"
 VELOCITY, POSITION = "/mavros/local_position/velocity_local", "/mavros/global_position/global"
 TRUTH, TRUTH_ATTITUDE = "/truth/fix", "/truth/imu"
 TRUTH_HEIGHT, TRUTH_ALTITUDE = "/truth/height_agl", "/truth/alt_amsl"
@@ -79,9 +79,7 @@ def _data(message: Any) -> tuple[float]:
 QUANTITIES = {
     "imu": Quantity("sensor_msgs/msg/Imu", messages.attitude_from_message, ("/imu/data", ""), (TRUTH_ATTITUDE,)),
     "compass": Quantity(_FLOAT, _data, ("/compass_hdg",)),
-    "range": Quantity(
-        "sensor_msgs/msg/Range", lambda message: (messages.range_from_message(message),), (RANGE, "")
-    ),
+    "range": Quantity("sensor_msgs/msg/Range", lambda message: (messages.range_from_message(message),), ("",)),
     "height": Quantity(_FLOAT, _data, ("/rel_alt",), (TRUTH_HEIGHT,)),
     "altitude": Quantity(_FLOAT, _data, (), (TRUTH_ALTITUDE,)),
     "velocity": Quantity(
