@@ -43,7 +43,7 @@ FIGURES = {  # page: claim: results page, heading and words of each row that sta
     },
     "docs/how-ncc-works.md": {"from 1.4 to 0.15 m": [("ncc.md", "Dense refinement", "| `gazebo-a1` |")]},
     "docs/mavlink.md": {
-        "0.24 m RMS off in simulation": [("mavlink.md", "PX4 SITL", "| `odometry`, 5 min |")],
+        "PX4's position was 0.24 m RMS off": [("mavlink.md", "PX4 SITL", "| `odometry`, 5 min |")],
         "by `global_position_sensor` 1.4 m": [("mavlink.md", "PX4 SITL", "| `global_position_sensor`, 1")],
         "some 0.1 s": [("vehicle.md", "The unit of systemd", "| worker killed |")],
         "takes 2 to 3 s to its first fix":
@@ -63,7 +63,7 @@ FIGURES = {  # page: claim: results page, heading and words of each row that sta
     },
     "docs/vehicle.md": {
         "some 0.1 s": [("vehicle.md", "The unit of systemd", "| worker killed |")],
-        "the fixes of x86-64 to 0.15 mm": [("vehicle.md", "arm64", "| 11 frames")],
+        "those of x86-64 to 0.15 mm": [("vehicle.md", "arm64", "| 11 frames")],
         "1.5 GB on disk": [("vehicle.md", "On disk", "| plain |")],
         "0.3 GB of memory for NCC": [("vehicle.md", "To the first fix", "| ncc | all kept |")],
         "0.6 GB for `auto`": [("vehicle.md", "To the first fix", "| auto | all kept |")],
@@ -89,7 +89,7 @@ FIGURE = re.compile(
     r"(?<![\w.])(\d+(?:\.\d+)?)(?= (?:m|mm|ms|s|GB|MB|degrees|%|of \d+|RMS)(?!\w)| to [\d.]+ (?:m|ms|s|%))"
 )
 UNMEASURED = {  # what the front pages state as assumed
-    "README.md": ["good to 1 m", "adds 3 m unless", "over 10 m off"],
+    "README.md": ["only good to 1 m", "adds 3 m for that", "over 10 m off"],
     "docs/index.md": [],
 }
 

@@ -209,6 +209,7 @@ class MavlinkBridge:
             self._counters.withheld[cause] += 1
             return cause
         self._guard.has_fix = True
+        self.telemetry.add_sent(captured_ns)
         self._counters.add_sent(report.age_ms)
         return None
 

@@ -21,7 +21,15 @@ from engine.geo import wrap_heading_deg
 from engine.values import Attitude
 from scenematch.bridges.gimbal import body_behind, from_device, from_mount
 from scenematch.bridges.packets import BRIDGE_COMPONENT
-from scenematch.bridges.vehicle import ANGLES, NedOrigin, RecentValues, VehicleState, height_above_ground_m, scalar
+from scenematch.bridges.vehicle import (
+    ANGLES,
+    STALE_NS,
+    NedOrigin,
+    RecentValues,
+    VehicleState,
+    height_above_ground_m,
+    scalar,
+)
 from scenematch.bridges.vision_in import has_failed, is_by_camera, vision_velocity
 
 MAV_AUTOPILOTS = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
@@ -69,6 +77,9 @@ _UNIX_RANGE_US = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100:
 _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
 # ESTIMATOR_STATUS of PX4 has the same bits as EKF_STATUS_REPORT of ArduPilot.
 _VELOCITY_KNOWN, _CONSTANT_POSITION = mavlink.EKF_VELOCITY_HORIZ, mavlink.EKF_CONST_POS_MODE
+_SUPPORT_NS = (
+    2_000_000_000  # of fixes: before, an estimator that aligned in the air states its velocity some m/s off
+)
 _MIN_GNSS_SIGMA_M, _DEFAULT_GNSS_SIGMA_M = 0.5, 5.0  # the latter if the receiver states no accuracy
 
 
@@ -177,7 +188,7 @@ class MavlinkTelemetry:
             self._range, self._clearance, self._relative = RecentValues(), RecentValues(), RecentValues()
             self._alt_amsl = RecentValues()
             self._unix_offset_ns: int | None = None
-            self._has_velocity = True
+            self._has_velocity, self._owed_ns, self._sent_ns = True, 0, 0
             self._home_down_m = 0.0  # how far its home is below its origin
             self.origin: NedOrigin | None = None
             self.has_receiver: bool | None = None
@@ -194,6 +205,12 @@ class MavlinkTelemetry:
         with self._lock:
             self._clock.add_request(now_ns)
 
+    def add_sent(self, captured_ns: int) -> None:
+        """Count a fix that was sent towards those that an estimator needs to know its velocity."""
+        with self._lock:
+            self._owed_ns = max(self._owed_ns - max(min(captured_ns - self._sent_ns, STALE_NS), 0), 0)
+            self._sent_ns = captured_ns
+
     def unix_ns(self, time_ns: int) -> int:
         """Nanoseconds since 1970 of a local time, by the autopilot's UTC or, if it has none, this machine's."""
         offset_ns = self._unix_offset_ns
@@ -209,7 +226,8 @@ class MavlinkTelemetry:
         with self._lock:
             held = self._holder.at(time_ns)
             roll, pitch, heading = self._attitude.at(time_ns) or (None, None, None)
-            own = self._velocity.at(time_ns) if self._has_velocity and own_velocity else None
+            is_known = self._has_velocity and self._owed_ns == 0
+            own = self._velocity.at(time_ns) if is_known and own_velocity else None
             # From another camera's odometry, if there is one: it does not depend on the fixes.
             east, north, up, *_ = self._vision.at(time_ns) or own or (None, None, None)
             *_, sigma = self._vision.nearest(time_ns) or (0.0,)  # 0 means not stated: nothing to interpolate
@@ -256,7 +274,10 @@ class MavlinkTelemetry:
                 self._add_vision(message, arrival_ns)
         elif kind in ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"):
             # If it knows no velocity, it still reports one, of zero.
-            self._has_velocity = bool(message.flags & _VELOCITY_KNOWN) and not message.flags & _CONSTANT_POSITION
+            has_velocity = bool(message.flags & _VELOCITY_KNOWN) and not message.flags & _CONSTANT_POSITION
+            if self.armed and has_velocity and not self._has_velocity:
+                self._owed_ns, self._sent_ns = _SUPPORT_NS, arrival_ns
+            self._has_velocity = has_velocity
         elif kind == "GPS_RAW_INT":
             self._set_gnss(message, arrival_ns)
         elif kind == "ALTITUDE":

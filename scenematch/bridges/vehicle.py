@@ -22,7 +22,8 @@ ANGLE_VARIANCE = math.radians(10.0) ** 2
 MOUNT_VARIANCE = math.radians(1.0) ** 2
 """Variance of each angle between camera and autopilot, which a fix does not measure; added to its attitude's."""
 
-_STALE_NS = 500_000_000  # largest time between a sample and a capture that it describes
+STALE_NS = 500_000_000
+"""Largest time between a sample and a capture that it describes."""
 _MAX_SAMPLES = 128  # of each quantity
 _ARDUPILOT_M_PER_1E7_DEG = 0.011131884502145034
 _PX4_EARTH_M = 6371000.0
@@ -133,13 +134,13 @@ class RecentValues:
     def nearest(self, time_ns: int) -> tuple[float, ...] | None:
         """Values of the sample nearest to a time; None beyond 0.5 s."""
         near = min(self._samples, key=lambda s: abs(s[0] - time_ns), default=None)
-        return near[1] if near is not None and abs(near[0] - time_ns) <= _STALE_NS else None
+        return near[1] if near is not None and abs(near[0] - time_ns) <= STALE_NS else None
 
     def at(self, time_ns: int) -> tuple[float, ...] | None:
         """Values interpolated at a time; the nearest sample if one side is missing, None beyond 0.5 s."""
         before = next((s for s in reversed(self._samples) if s[0] <= time_ns), None)
         after = next((s for s in self._samples if s[0] >= time_ns), None)
-        near = [s for s in (before, after) if s is not None and abs(s[0] - time_ns) <= _STALE_NS]
+        near = [s for s in (before, after) if s is not None and abs(s[0] - time_ns) <= STALE_NS]
         if len(near) < 2 or near[0][0] == near[1][0]:
             return near[0][1] if near else None
         (t0, first), (t1, last) = near

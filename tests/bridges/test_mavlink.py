@@ -931,6 +931,24 @@ def test_a_velocity_that_the_estimator_does_not_know_is_none(flags, known):
     assert (heard(status, position).east_velocity_mps is not None) == known
 
 
+@pytest.mark.parametrize(("armed", "period_s", "known"), [(True, 0.2, 11), (True, 2.0, 5), (False, 0.2, 0)])
+def test_an_estimator_that_aligned_in_the_air_knows_its_velocity_after_two_seconds_of_fixes(
+    armed, period_s, known
+):
+    """At 5 Hz; of slower fixes each counts as half a second. On the ground it knows that it stands."""
+    telemetry, time_ns = MavlinkTelemetry(), NOW_NS
+    beat = mavlink.MAVLink_heartbeat_message(2, 3, 128 if armed else 0, 0, 4, 3)
+    for flags in (167, 831):
+        telemetry.update(beat, time_ns)
+        telemetry.update(mavlink.MAVLink_ekf_status_report_message(flags, 0, 0, 0, 0, 0), time_ns)
+    telemetry.update(mavlink.MAVLink_global_position_int_message(5, 1, 1, 0, 9, 0, 0, 0, 0), time_ns)
+    sent = 0
+    while telemetry.vehicle(time_ns).east_velocity_mps is None:
+        telemetry.add_sent(NOW_NS + round(sent * period_s * 1e9))
+        sent += 1
+    assert sent == known
+
+
 def test_each_firmware_is_asked_for_what_it_has(loop):
     made, pilot = loop(pilot={})
     fly(made.bridge, lambda: len(pilot.of("COMMAND_LONG")) >= 8)
