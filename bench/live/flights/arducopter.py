@@ -2,8 +2,10 @@
 
 SITL is the program ``arducopter`` in its source tree, of which it takes the default parameters. It climbs on GNSS,
 selects the fixes, switches the receiver off and flies the course of :mod:`bench.live.flights.fly` for so long, in
-wind; with ``--faults`` the bridge is killed and the camera covered, frozen and shifted meanwhile. What the EKF and
-the fixes were off is from SITL's own log.
+wind. With ``--faults`` the bridge is killed and the camera covered, frozen and shifted; with ``--drifts`` wind
+carries the vehicle away until the EKF lets go of its position, or the EKF leaves fixes out. ``--boots`` flies so
+often beside one bridge: the simulator ends in the air and is started anew. What the EKF and the fixes were off is
+from SITL's own log.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +32,13 @@ from bench.live.bridge_counts import free_port
 from bench.live.flights.faults import Fault, events
 from bench.live.flights.fly import FAR_M, FLIGHT_S, RATE_HZ, Bridge, change, conditions
 from bench.live.flights.recorded import recorded
-from bench.live.flights.sitl import RATES_HZ, Motion, Pilot, take_off
+from bench.live.flights.sitl import Motion, Pilot, climb
 from engine.geo import LocalFrame
 from scenematch.runs.simulation import write_flight
 from scenematch.simulator import plan_flight
 
 DELAY_MS = 80.0
+_PILOT_AT = "udpin:127.0.0.1:14552"
 FAULTS = (
     Fault("bridge killed", 30.0, 3.0),
     Fault("worker killed", 60.0),
@@ -44,10 +48,15 @@ FAULTS = (
     Fault("bridge killed", 215.0, 15.0),
     Fault("map shifted", 270.0, 20.0),
 )
+DRIFTS = (
+    Fault("camera covered", 15.0, 20.0, 2.0),
+    Fault("camera covered", 60.0, 20.0, 4.0),
+    Fault("camera covered", 105.0, 20.0, 8.0),
+    Fault("fixes not used", 150.0, 12.0),
+)
 _AFTER_S = 30.0  # from the last fault to the end
-_SOURCE_SET_2, _GNSS_OFF = (mavutil.mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2.0), ("SIM_GPS1_ENABLE", 0.0)
 Track = NDArray[np.float64]
-"""(N, 3) seconds since the simulator's start, metres east and north."""
+"""(N, 3 or 4) seconds since the simulator's start, metres east and north, and when a fix came."""
 
 
 def sitl_bridge(
@@ -117,14 +126,10 @@ def fly(pilot: LoggedPilot, motion: Motion, duration_s: float, bridge: Bridge, f
     Returns:
         The simulator's time at which the receiver was switched off.
     """
-    for message_id, rate_hz in RATES_HZ.items():
-        pilot.command(mavutil.mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
-    take_off(pilot, motion(0.0).height_m)
-    if not pilot.listen(60.0, lambda: any("fixes begin" in text for text in pilot.texts)):
-        raise SystemExit("no fixes within a minute")
-    pilot.command(*_SOURCE_SET_2)
+    climb(pilot, motion(0.0).height_m)
+    pilot.select(is_fixes=True)
     pilot.listen(10.0)
-    pilot.link.param_set_send(*_GNSS_OFF)
+    pilot.link.param_set_send("SIM_GPS1_ENABLE", 0.0)
     pilot.part, asked_s = "course", 0.0
     begin_s = pilot.times_s[-1][1]
 
@@ -142,26 +147,24 @@ def fly(pilot: LoggedPilot, motion: Motion, duration_s: float, bridge: Bridge, f
 
 def endure(
     pilot: Pilot, bridge: Bridge, faults: Sequence[Fault], duration_s: float, steer: Callable[[float], None]
-) -> list[tuple[Fault, float]]:
-    """Steer for so long, by the seconds that are gone, with faults; when each ended on this machine's clock."""
-    due, begin, ended = events(faults), time.monotonic(), []
+) -> None:
+    """Steer for so long, by the seconds that are gone, with faults."""
+    due, begin = events(faults), time.monotonic()
     while (gone_s := time.monotonic() - begin) < duration_s:
         while due and due[0][0] <= gone_s:
             _, is_over, fault = due.pop(0)
             pilot.say(f"{fault.name} {'over' if is_over else 'begins'}")
+            pilot.meet(fault, is_over=is_over)
             change(fault, bridge, is_over=is_over)
-            if is_over:
-                ended.append((fault, time.monotonic()))
         steer(gone_s)
-    return ended
 
 
 def read_log(log: Path, pilot: LoggedPilot) -> tuple[Track, Track, Track]:
-    """The truth, the EKF and the fixes by their time of capture, of SITL's log."""
+    """The truth, the EKF and the fixes by their time of capture, of SITL's log; these with when they came."""
     place, (here_s, there_s) = pilot.place, np.array(pilot.times_s).T
     lead_s = sliding_window_view(np.pad(there_s - here_s, 50, mode="edge"), 101).max(axis=1)  # of the quickest
     reader = mavutil.mavlink_connection(str(log))
-    tracks: dict[str, list[tuple[float, float, float]]] = {"SIM": [], "POS": [], "VISP": []}
+    tracks: dict[str, list[tuple[float, ...]]] = {"SIM": [], "POS": [], "VISP": []}
     origin = place
     while (row := reader.recv_match(type=["SIM", "POS", "VISP", "ORGN"])) is not None:
         kind = row.get_type()
@@ -171,49 +174,55 @@ def read_log(log: Path, pilot: LoggedPilot) -> tuple[Track, Track, Track]:
             lat_deg, lon_deg = origin.geodetic_from_enu(row.PY, row.PX)
             captured_s = row.RTimeUS * 1e-6
             captured_s += float(np.interp(captured_s, here_s, lead_s))
-            tracks[kind].append((captured_s, *_metres(place, lat_deg, lon_deg)))
+            tracks[kind].append((captured_s, *place.enu_from_geodetic(lat_deg, lon_deg)[:2], row.TimeUS * 1e-6))
         elif kind != "VISP":
-            tracks[kind].append((row.TimeUS * 1e-6, *_metres(place, row.Lat, row.Lng)))
-    return tuple(np.array(tracks[kind]).reshape(-1, 3) for kind in ("SIM", "POS", "VISP"))  # type: ignore[return-value]
-
-
-def _metres(place: LocalFrame, lat_deg: Any, lon_deg: Any) -> tuple[float, float]:
-    east_m, north_m = place.enu_from_geodetic(lat_deg, lon_deg)[:2]
-    return float(east_m), float(north_m)
+            tracks[kind].append((row.TimeUS * 1e-6, *place.enu_from_geodetic(row.Lat, row.Lng)[:2]))
+    widths = {"SIM": 3, "POS": 3, "VISP": 4}
+    return tuple(np.array(tracks[kind]).reshape(-1, n) for kind, n in widths.items())  # type: ignore[return-value]
 
 
 def off_m(truth: Track, track: Track) -> NDArray[np.float64]:
     """How far a track is from the truth at its times."""
     true = np.column_stack([np.interp(track[:, 0], truth[:, 0], truth[:, k]) for k in (1, 2)])
-    return np.asarray(np.hypot(*(track[:, 1:] - true).T))
+    return np.asarray(np.hypot(*(track[:, 1:3] - true).T))
 
 
-def report(log: Path, pilot: LoggedPilot, begin_s: float, duration_s: float, faults: tuple[Fault, ...]) -> str:
-    """A table of the flight without GNSS, and one of its faults."""
-    truth, ekf, fixes = (t[(t[:, 0] > begin_s) & (t[:, 0] < begin_s + duration_s)] for t in read_log(log, pilot))
+def _rms_and_worst(off: NDArray[np.float64]) -> str:
+    return f"{np.sqrt((off**2).mean()):.2f}, {off.max():.2f} m" if len(off) else "none"
+
+
+def report(tracks: Sequence[Track], begin_s: float, duration_s: float, faults: tuple[Fault, ...]) -> str:
+    """A table of the flight without GNSS, and one of its faults, by the truth, the EKF and the fixes of a log."""
+    truth, ekf, fixes = (t[(t[:, 0] > begin_s) & (t[:, 0] < begin_s + duration_s)] for t in tracks)
     ekf_m, fixes_m = off_m(truth, ekf), off_m(truth, fixes)
-    rms = [float(np.sqrt((v**2).mean())) for v in (ekf_m, fixes_m)]
     gaps_s = np.diff([begin_s, *fixes[:, 0], begin_s + duration_s])
+    age_ms = np.percentile((fixes[:, 3] - fixes[:, 0]) * 1e3 - DELAY_MS, (50, 99)) if len(fixes) else (nan, nan)
     lines = [
-        "| EKF to truth, RMS and worst | fixes | fixes to truth, RMS and worst | beyond 5 m | longest gap |",
-        "|---|---|---|---|---|",
-        f"| {rms[0]:.2f}, {ekf_m.max():.2f} m | {len(fixes)} | {rms[1]:.2f}, {fixes_m.max():.2f} m "
-        f"| {(fixes_m > FAR_M).sum()} | {gaps_s.max():.1f} s |",
+        "| EKF to truth, RMS, worst | fixes | to truth, RMS, worst | beyond 5 m | longest gap | age p50, p99 |",
+        "|---|---|---|---|---|---|",
+        f"| {_rms_and_worst(ekf_m)} | {len(fixes)} | {_rms_and_worst(fixes_m)} "
+        f"| {(fixes_m > FAR_M).sum()} | {gaps_s.max():.1f} s | {age_ms[0]:.0f}, {age_ms[1]:.0f} ms |",
     ]
     for row, off in zip(fixes[fixes_m > FAR_M], fixes_m[fixes_m > FAR_M], strict=True):
         lines.append(f"\n{off:.1f} m off, {row[0] - begin_s:.1f} s after the receiver's end")
     if not faults:
         return "\n".join(lines)
-    titles = ("fault", "EKF to truth meanwhile, worst", "first fix after its end, off by")
-    lines += ["", f"| {' | '.join(titles)} |", "|---|---|---|"]
+    lines += ["", "| fault | EKF to truth, worst | drift; first fix after its end; then worst, longest gap |"]
+    lines.append("|---|---|---|")
     worst_m, firsts = defaultdict[str, float](float), defaultdict[str, list[str]](list)
     for fault, until in zip(faults, [*[f.begin_s for f in faults[1:]], duration_s], strict=True):
+        end_s = begin_s + fault.end_s
         during = (ekf[:, 0] >= begin_s + fault.begin_s) & (ekf[:, 0] < begin_s + until)
-        after = np.flatnonzero((fixes[:, 0] > begin_s + fault.end_s) & (fixes[:, 0] < begin_s + until))
-        first_s = fixes[after, 0] - begin_s - fault.end_s
+        after = np.flatnonzero((fixes[:, 0] > end_s) & (fixes[:, 0] < begin_s + until))
+        moved = [np.diff(np.interp([end_s - 1.0, end_s], truth[:, 0], truth[:, k])) for k in (1, 2)]
         worst_m[fault.name] = max(worst_m[fault.name], float(ekf_m[during].max()))
-        firsts[fault.name].append(f"{first_s[0]:.2f} s, {fixes_m[after[0]]:.2f} m" if len(after) else "none")
-    lines += [f"| {name} | {far_m:.2f} m | {'; '.join(firsts[name])} |" for name, far_m in worst_m.items()]
+        said = f"{np.hypot(*moved)[0]:.1f} m/s; "
+        if len(after):
+            times_s = fixes[after, 0]
+            gap_s = np.diff([*times_s, begin_s + until]).max()
+            said += f"{times_s[0] - end_s:.2f} s; {fixes_m[after].max():.2f} m, {gap_s:.1f} s"
+        firsts[fault.name].append(said if len(after) else f"{said}none")
+    lines += [f"| {name} | {far_m:.2f} m | {' / '.join(firsts[name])} |" for name, far_m in worst_m.items()]
     return "\n".join(lines)
 
 
@@ -224,15 +233,17 @@ def parser_of(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--method", choices=("auto", "ncc"), default="auto")
     parser.add_argument("--wind-mps", type=float, default=5.0)
     parser.add_argument("--seconds", type=float, default=300.0, help="without GNSS")
-    parser.add_argument("--faults", type=int, nargs="?", const=1, default=0, help="how often each")
+    rounds = parser.add_mutually_exclusive_group()
+    rounds.add_argument("--faults", type=int, nargs="?", const=1, default=0, help="how often each")
+    rounds.add_argument("--drifts", type=int, nargs="?", const=1, default=0, help="how often each")
     return parser
 
 
 def planned(arguments: argparse.Namespace) -> tuple[Path, tuple[Fault, ...], float]:
     """The flight's folder, drawn if there is none, its faults, and its seconds without GNSS."""
-    folder, round_s = arguments.flight.absolute(), FAULTS[-1].end_s + _AFTER_S
-    rounds = range(arguments.faults)
-    faults = tuple(replace(fault, begin_s=fault.begin_s + k * round_s) for k in rounds for fault in FAULTS)
+    folder, kinds = arguments.flight.absolute(), DRIFTS if arguments.drifts else FAULTS
+    rounds, round_s = range(arguments.drifts or arguments.faults), kinds[-1].end_s + _AFTER_S
+    faults = tuple(replace(fault, begin_s=fault.begin_s + k * round_s) for k in rounds for fault in kinds)
     if not folder.exists():
         write_flight(folder, plan_flight(1, frames=round(FLIGHT_S * RATE_HZ), rate_hz=RATE_HZ))
     return folder, faults, len(rounds) * round_s if faults else arguments.seconds
@@ -244,23 +255,26 @@ def main() -> None:
     parser.add_argument("sitl", type=Path, help="arducopter, in build/sitl/bin of ArduPilot")
     parser.add_argument("--message", default="vision_position_estimate")
     parser.add_argument("--realtime", action="store_true", help="bridge.realtime")
+    parser.add_argument("--boots", type=int, default=1, help="flights, of one bridge")
     arguments, before, port = parser.parse_args(), os.getloadavg()[0], free_port()
+    if not os.access(arguments.sitl, os.X_OK) or arguments.sitl.is_dir():
+        parser.error(f"sitl: expected the program arducopter in build/sitl/bin, got {arguments.sitl}")
     folder, faults, seconds = planned(arguments)
     motion, place, _ = recorded(folder)
-    with (
-        simulator(arguments.sitl.absolute(), folder, place, port, arguments.message, arguments.wind_mps) as logs,
-        contextlib.ExitStack() as stack,
-    ):
-        bridge = sitl_bridge(folder, port, arguments.method, arguments.message, realtime=arguments.realtime)
+    bridge = sitl_bridge(folder, port, arguments.method, arguments.message, realtime=arguments.realtime)
+    world = (arguments.sitl.absolute(), folder, place, port, arguments.message, arguments.wind_mps)
+    with contextlib.ExitStack() as stack:
         stack.callback(bridge.kill)
-        link = mavutil.mavlink_connection("udpin:127.0.0.1:14552", source_system=255)
-        link.wait_heartbeat()
-        pilot = LoggedPilot(link, place)
-        begin_s = fly(pilot, motion, seconds, bridge, faults)
-        pilot.listen(2.0)
-    what = f"{arguments.method}, {arguments.message}, wind {arguments.wind_mps:g} m/s"
-    print(f"{what}, {conditions(before)}\n")
-    print(report(max(logs.glob("*.BIN")), pilot, begin_s, seconds, faults))
+        for _ in range(arguments.boots):
+            with simulator(*world) as logs, contextlib.closing(mavutil.mavlink_connection(_PILOT_AT)) as link:
+                link.wait_heartbeat()
+                pilot = LoggedPilot(link, place)
+                begin_s = fly(pilot, motion, seconds, bridge, faults)
+                pilot.listen(2.0)
+            what = f"{arguments.method}, {arguments.message}, wind {arguments.wind_mps:g} m/s"
+            print(f"{what}, {conditions(before)}\n")
+            tracks = read_log(max(logs.glob("*.BIN")), pilot)
+            print(report(tracks, begin_s, seconds, faults), flush=True)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,12 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: what, when after the first picture, for how long."""
+    """One fault: what, when after the first picture, for how long, in which wind if another one begins with it."""
 
     kind: str
     begin_s: float
     seconds: float = 0.0
+    wind_mps: float | None = None
 
     @property
     def end_s(self) -> float:
@@ -23,7 +24,8 @@ class Fault:
     @property
     def name(self) -> str:
         """For a table."""
-        return f"{self.kind} {self.seconds:g} s" if self.seconds else self.kind
+        name = f"{self.kind} {self.seconds:g} s" if self.seconds else self.kind
+        return name if self.wind_mps is None else f"{name}, wind {self.wind_mps:g} m/s"
 
 
 def reigning(fault_file: Path) -> str:

@@ -1,59 +1,71 @@
 """``python -m bench.live.flights.px4 FLIGHT BUILD``: PX4 with simulated hardware (SIH), the bridge and a town.
 
 BUILD is the folder of a build of PX4 for SITL, with ``bin/px4`` in it, best of ``px4_sitl_sih`` without lockstep.
-The flight is that of :mod:`bench.live.flights.arducopter`, in OFFBOARD; EKF and truth are compared by PX4's own
-stamps. A fault's row has the time from its end to the bridge's "fixes begin" on the ground station.
+The flight is that of :mod:`bench.live.flights.arducopter`, in OFFBOARD, and so is its report, made from PX4's own
+log, which the extra ``logs`` reads.
 """
 
 from __future__ import annotations
 
 import contextlib
-import math
 import os
+import struct
 import subprocess
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pymavlink import mavutil
 
-from bench.live.flights.arducopter import DELAY_MS, endure, launch, off_m, parser_of, planned, sitl_bridge
+from bench.live.flights.arducopter import (
+    DELAY_MS,
+    LoggedPilot,
+    Track,
+    endure,
+    launch,
+    parser_of,
+    planned,
+    report,
+    sitl_bridge,
+)
 from bench.live.flights.faults import Fault
 from bench.live.flights.fly import FLIGHT_S, Bridge, conditions
 from bench.live.flights.recorded import recorded
-from bench.live.flights.sitl import Motion, Pilot
+from bench.live.flights.sitl import Motion
 from engine.geo import LocalFrame
 
 _OFFBOARD = (1.0, 6.0)  # custom mode enabled, PX4's main mode
-_INT32 = 6
+_INT32, _REAL32 = 6, 9
+_WIND = {"SIH_WIND_N": 0.87, "SIH_WIND_E": 0.5}
 _CLIMB_S = 150.0
-_OWN = {"EKF2_GPS_CTRL": 7, "NAV_DLL_ACT": 0, "NAV_RCL_ACT": 0, "COM_RC_IN_MODE": 4, "CBRK_SUPPLY_CHK": 894281}
+_OWN = {
+    "SDLOG_PROFILE": 129,
+    "EKF2_GPS_CTRL": 7,
+    "NAV_DLL_ACT": 0,
+    "NAV_RCL_ACT": 0,
+    "COM_RC_IN_MODE": 4,
+    "CBRK_SUPPLY_CHK": 894281,
+}
 """Parameters of the flight; the bridge's file switches the receiver off, this program only after the climb."""
 
 
-class Px4Pilot(Pilot):
-    """A pilot that keeps the EKF's positions and the true ones with PX4's stamps."""
+class Px4Pilot(LoggedPilot):
+    """A pilot of PX4."""
 
-    def __init__(self, link: Any, place: LocalFrame) -> None:
-        super().__init__(link, place)
-        self.tracks: dict[str, list[tuple[float, float, float]]] = {"EKF": [], "truth": []}
-        self.begun_s: list[float] = []  # when fixes began
+    def meet(self, fault: Fault, *, is_over: bool) -> None:
+        """Let the simulated vehicle feel what of a fault concerns it."""
+        if fault.wind_mps is not None:
+            for name, share in _WIND.items():
+                self.link.mav.param_set_send(1, 1, name.encode(), fault.wind_mps * share, _REAL32)
+        if fault.kind == "fixes not used":
+            self.set_integer("EKF2_EV_CTRL", int(is_over))
 
-    def take(self, message: Any) -> None:
-        """Note what a message says, and when."""
-        kind = message.get_type()
-        if kind == "HIL_STATE_QUATERNION":
-            self.tracks["truth"].append((message.time_usec * 1e-6, *self._metres(message.lat, message.lon)))
-            return
-        if kind == "GLOBAL_POSITION_INT":
-            self.tracks["EKF"].append((message.time_boot_ms * 1e-3, *self._metres(message.lat, message.lon)))
-        elif kind == "STATUSTEXT" and "fixes begin" in message.text:
-            self.begun_s.append(time.monotonic())
-        super().take(message)
+    def set_integer(self, name: str, value: int) -> None:
+        """Set a parameter of whole numbers, whose bits PX4 takes for those of a float."""
+        bits = struct.unpack("<f", struct.pack("<i", value))[0]
+        self.link.mav.param_set_send(1, 1, name.encode(), bits, _INT32)
 
 
 @contextlib.contextmanager
@@ -69,7 +81,7 @@ def simulator(build: Path, folder: Path, place: LocalFrame, wind_mps: float) -> 
     subprocess.run([*command, *written], check=True)
     lines = (run / "scenematch.params").read_text(encoding="ascii").splitlines()
     values = dict(line.split("\t")[2:4] for line in lines if not line.startswith("#")) | _OWN
-    values |= {"SIH_KDV": 0.3, "SIH_WIND_N": wind_mps * 0.87, "SIH_WIND_E": wind_mps * 0.5}
+    values |= {"SIH_KDV": 0.3, **{name: wind_mps * share for name, share in _WIND.items()}}
     environment = os.environ | {f"PX4_PARAM_{name}": str(value) for name, value in values.items()}
     environment |= {"PX4_SYS_AUTOSTART": "10040", "PX4_SIM_MODEL": "sihsim_quadx", "PX4_HOME_ALT": "0"}
     environment |= {"PX4_HOME_LAT": str(place.lat_deg), "PX4_HOME_LON": str(place.lon_deg)}
@@ -93,44 +105,48 @@ def follow(pilot: Px4Pilot, motion: Motion, begin_s: float, asked_s: float) -> f
     return asked_s
 
 
-def fly(
-    pilot: Px4Pilot, motion: Motion, duration_s: float, bridge: Bridge, faults: tuple[Fault, ...]
-) -> tuple[float, list[tuple[Fault, float]]]:
+def fly(pilot: Px4Pilot, motion: Motion, duration_s: float, bridge: Bridge, faults: tuple[Fault, ...]) -> float:
     """Climb by the receiver, switch it off, and fly the course over and over.
 
     Returns:
-        PX4's time at which the receiver was switched off, and when each fault ended on this machine's clock.
+        PX4's time at which the receiver was switched off.
     """
     first, asked_s, begin = motion(0.0), 0.0, time.monotonic()
-    pilot.command(mavutil.mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 115, 40_000)
-    while pilot.height_m < first.height_m - 2.0 or not pilot.begun_s:
+    while pilot.height_m < first.height_m - 2.0 or not any("fixes begin" in text for text in pilot.texts):
         if time.monotonic() - begin > _CLIMB_S:
             raise SystemExit(f"at {pilot.height_m:.0f} m after {_CLIMB_S:g} s: {pilot.texts[-5:]}")
         asked_s = follow(pilot, lambda _: first, begin, asked_s)
         if not pilot.armed and pilot.mode == "OFFBOARD":
             pilot.command(mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
-    pilot.link.mav.param_set_send(1, 1, b"EKF2_GPS_CTRL", 0.0, _INT32)
+    pilot.set_integer("EKF2_GPS_CTRL", 0)
     pilot.part, begin = "course", time.monotonic()
-    begin_s = pilot.tracks["EKF"][-1][0]
+    begin_s = pilot.times_s[-1][1]
 
     def steer(_: float) -> None:
         nonlocal asked_s
         asked_s = follow(pilot, motion, begin, asked_s)
 
-    return begin_s, endure(pilot, bridge, faults, duration_s, steer)
+    endure(pilot, bridge, faults, duration_s, steer)
+    return begin_s
 
 
-def report(pilot: Px4Pilot, begin_s: float, ended: list[tuple[Fault, float]]) -> str:
-    """A table of the flight without GNSS, and one of its faults."""
-    ekf, truth = (np.array(pilot.tracks[name]) for name in ("EKF", "truth"))
-    off = off_m(truth, ekf[(ekf[:, 0] > begin_s) & (ekf[:, 0] < truth[-1, 0])])
-    lines = [f"EKF to truth, RMS and worst: {np.sqrt((off**2).mean()):.2f}, {off.max():.2f} m of {len(off)}", ""]
-    lines += ["| fault | fixes begin after its end |", "|---|---|"] * bool(ended)
-    firsts = defaultdict[str, list[str]](list)
-    for (fault, end_s), until_s in zip(ended, [*(at_s for _, at_s in ended[1:]), math.inf], strict=True):
-        after = [begun - end_s for begun in pilot.begun_s if end_s < begun < until_s]
-        firsts[fault.name].append(f"{after[0]:.2f} s" if after else "none")
-    return "\n".join([*lines, *(f"| {name} | {'; '.join(those)} |" for name, those in firsts.items())])
+def read_log(log: Path, place: LocalFrame) -> list[Track]:
+    """The truth, the EKF and the fixes by their time of capture, of a ULog; these with when they came."""
+    from pyulog import ULog
+
+    names = ("vehicle_global_position_groundtruth", "vehicle_global_position", "vehicle_visual_odometry")
+    data = {each.name: each.data for each in ULog(str(log), [*names, "vehicle_local_position"]).data_list}
+    tracks = []
+    for name in names[:2]:
+        known = data[name]
+        east_m, north_m = place.enu_from_geodetic(known["lat"], known["lon"])[:2]
+        tracks.append(np.column_stack([known["timestamp"] * 1e-6, east_m, north_m]))
+    origin, fixes = data["vehicle_local_position"], data["vehicle_visual_odometry"]
+    frame = LocalFrame(origin["ref_lat"][-1], origin["ref_lon"][-1])
+    lat_deg, lon_deg = frame.geodetic_from_enu(fixes["position[1]"], fixes["position[0]"])
+    east_m, north_m = place.enu_from_geodetic(lat_deg, lon_deg)[:2]
+    stamps_s = fixes["timestamp_sample"] * 1e-6, fixes["timestamp"] * 1e-6
+    return [*tracks, np.column_stack([stamps_s[0], east_m, north_m, stamps_s[1]])]
 
 
 def main() -> None:
@@ -149,9 +165,10 @@ def main() -> None:
         link = mavutil.mavlink_connection("udpin:127.0.0.1:14550", source_system=255)
         link.wait_heartbeat()
         pilot = Px4Pilot(link, place)
-        begin_s, ended = fly(pilot, motion, seconds, bridge, faults)
+        begin_s = fly(pilot, motion, seconds, bridge, faults)
     print(f"{arguments.method}, wind {arguments.wind_mps:g} m/s, {conditions(before)}\n")
-    print(report(pilot, begin_s, ended))
+    tracks = read_log(max((folder / "px4").rglob("*.ulg"), key=os.path.getmtime), place)
+    print(report(tracks, begin_s, seconds, faults))
 
 
 if __name__ == "__main__":

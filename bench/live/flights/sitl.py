@@ -12,6 +12,7 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from bench.live.flights.faults import Fault
 from bench.live.standin import State
 from engine.geo import LocalFrame
 
@@ -58,6 +59,17 @@ class Pilot:
             math.radians(state.heading_deg), 0.0,
         )  # fmt: skip
 
+    def select(self, *, is_fixes: bool) -> None:
+        """Let the EKF use the fixes, or the receiver (source sets 2 and 1)."""
+        self.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2.0 if is_fixes else 1.0)
+
+    def meet(self, fault: Fault, *, is_over: bool) -> None:
+        """Let the simulated vehicle feel what of a fault concerns it."""
+        if fault.wind_mps is not None:
+            self.link.param_set_send("SIM_WIND_SPD", fault.wind_mps)
+        if fault.kind == "fixes not used":
+            self.select(is_fixes=is_over)
+
     def take(self, message: Any) -> None:
         """Note what a message of the vehicle says."""
         kind = message.get_type()
@@ -100,6 +112,19 @@ def take_off(pilot: Pilot, height_m: float) -> None:
         raise SystemExit(f"not at {height_m:.0f} m after {_PATIENCE_S:g} s: {pilot.texts[-3:]}")
 
 
+def climb(pilot: Pilot, height_m: float) -> None:
+    """Take off by the receiver and wait for the bridge's fixes.
+
+    Raises:
+        SystemExit: it did not take off, or the bridge sent no fixes.
+    """
+    for message_id, rate_hz in RATES_HZ.items():
+        pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
+    take_off(pilot, height_m)
+    if not pilot.listen(60.0, lambda: any("fixes begin" in text for text in pilot.texts)):
+        raise SystemExit("no fixes within a minute")
+
+
 def follow(pilot: Pilot, motion: Motion, seconds: float) -> bool:
     """Send ten targets a second; returns whether the vehicle took them to the end."""
     begin = time.monotonic()
@@ -115,13 +140,8 @@ def fly(pilot: Pilot, motion: Motion, duration_s: float, hold_s: float) -> None:
     Raises:
         SystemExit: it did not take off, or the bridge sent no fixes.
     """
-    for message_id, rate_hz in RATES_HZ.items():
-        pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
     first, last = (replace(motion(time_s), east_mps=0.0, north_mps=0.0) for time_s in (0.0, duration_s))
-    take_off(pilot, first.height_m)
-    if not pilot.listen(60.0, lambda: any("fixes begin" in text for text in pilot.texts)):
-        raise SystemExit("no fixes within a minute")
-
+    climb(pilot, first.height_m)
     legs: tuple[tuple[str, Motion, float], ...] = (
         ("hold, GNSS", lambda _: first, 10.0),
         ("hold, fixes", lambda _: first, 5.0),
@@ -132,7 +152,7 @@ def fly(pilot: Pilot, motion: Motion, duration_s: float, hold_s: float) -> None:
     for part, course, seconds in legs:
         pilot.part = part
         if part == "hold, fixes":
-            pilot.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2.0)
+            pilot.select(is_fixes=True)
         elif part == "hold, GNSS off":
             pilot.link.param_set_send("SIM_GPS1_ENABLE", 0.0)
         if not follow(pilot, course, seconds):

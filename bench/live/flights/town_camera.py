@@ -23,8 +23,8 @@ from bench.live.flights.recorded import recorded
 from bench.live.flights.video_camera import film
 from bench.live.standin import State
 from engine.values import Attitude
-from scenematch.simulator import build_town, picture_at
-from scenematch.simulator.flight import paper_camera
+from scenematch.simulator import build_town, render_frame
+from scenematch.simulator.flight import DRONE_SENSOR, grid_at, paper_camera
 
 SHIFT_M = 40.0
 
@@ -35,6 +35,8 @@ class TownView:
     def __init__(self, flight: Path, town: int, fault_file: Path) -> None:
         self.place, self._fault_file = recorded(flight)[1], fault_file
         self._town, self._camera = build_town(town), paper_camera()
+        # A colour for each ray must do: several cannot be drawn in time at a tilt of 30 degrees.
+        self._world = replace(self._town.world, rgb=np.asarray(cv2.blur(self._town.world.rgb, (3, 3)), np.uint8))
         self._roof_m = float(self._town.world.height_m.max())
         self._noise, self._last = np.random.default_rng(1), np.zeros((300, 300, 3), np.uint8)
 
@@ -51,7 +53,9 @@ class TownView:
             return self._noise.integers(0, 30, self._last.shape, np.uint8)
         where = np.array([vehicle.east_m, vehicle.north_m, vehicle.height_m])
         attitude = Attitude(vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg % 360.0)
-        seen = picture_at(self._town, self._camera, self.place, where, attitude, self._noise)
+        grid = grid_at(self._town, self.place, where)
+        sharp = render_frame(self._world, self._camera, grid, vehicle.height_m, attitude, supersample=1)
+        seen = self._town.condition.sensor(DRONE_SENSOR).develop(sharp, self._noise)
         self._last = np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGB2BGR), np.uint8)
         return self._last
 
