@@ -17,8 +17,8 @@ pytest.importorskip("pymavlink", reason="pymavlink is not installed")
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from bench.live.flights import fly, sitl
-from bench.live.flights.faults import FAULTS
+from bench.live.flights import arducopter, fly, sitl
+from bench.live.flights.faults import FAULTS, Fault
 from bench.live.flights.recorded import captured_s, off_m, recorded
 from bench.live.flights.sitl import Pilot
 from bench.live.flights.video_camera import SIZE, Footage, ground_from_pixel, recorded_from_shown
@@ -46,6 +46,23 @@ def test_a_fault_is_scored_by_the_first_fix_after_its_end():
     assert "| bridge killed 3 s | 2.50 | 0.30 | 14.5 |" in lines
     assert "| worker killed | 1.00 | 0.40 | 9.0 |" in lines
     assert "| camera covered 10 s | none | | 20.0 |" in lines
+
+
+def test_a_simulators_flight_is_scored_by_its_log():
+    """East at 4 m/s, a fault from 109.5 to 129.5 s; fixes each second, 0.5 m off, to 110 s and from 133 s."""
+    times_s = np.arange(100.0, 161.0)
+    truth = np.column_stack([times_s, 4.0 * times_s, 0.0 * times_s])
+    ekf = truth + np.array([0.0, 0.0, 2.0])
+    fixes = np.column_stack([truth + np.array([0.0, 0.5, 0.0]), times_s + 0.1])[
+        (times_s < 110.5) | (times_s > 132.5)
+    ]
+    fixes[3, 2] = 6.0
+    covered = Fault("camera covered", 10.0, 20.0, 4.0)
+    lines = arducopter.report([truth, ekf, fixes], 99.5, 61.0, (covered,)).splitlines()
+    assert "| 2.00, 2.00 m | 39 | 1.08, 6.02 m | 1 | 23.0 s | 20, 20 ms |" in lines
+    assert "6.0 m off, 3.5 s after the receiver's end" in lines
+    drift = "4.0 m/s; 3.50 s; 0.50 m, 1.0 s"
+    assert f"| camera covered 20 s, wind 4 m/s | 2.00 m | {drift} |" in lines
 
 
 def test_a_global_position_is_stamped_when_it_is_sent_and_says_how_long_it_took():
