@@ -250,7 +250,11 @@ class TrackGuard:
 
 
 def _match(result: Fix | NoFix) -> Fix | None:
-    """The match of a frame, including one refused for contradicting the navigator's own track."""
+    """The match of a frame, including one that only the navigator's own track speaks against."""
     if isinstance(result, Fix):
         return result
-    return result.match if result.reason is Reason.INCONSISTENT else None
+    match = result.match
+    if match is None or result.reason is Reason.INCONSISTENT:
+        return match
+    suffices = result.reason is Reason.UNCONFIRMED and math.isfinite(match.protection_level_m())
+    return match if suffices else None

@@ -554,14 +554,19 @@ def test_silence_is_told(node, sim_site, monkeypatch):
 
 def test_an_empty_name_leaves_a_topic_out(maker, node, sim_site):
     with bridge_of(node, sim_site) as (bridge, _):
-        handlers = bridge.handlers(RosTopics(compass="", velocity=""))
+        handlers = bridge.handlers(RosTopics(velocity=""))
         kinds = {topic: kind for topic, (kind, _) in handlers.items()}
         handlers[RosTopics().height][1](maker.float64(42.0))
         assert bridge.telemetry.vehicle(NOW_NS).height_agl_m == 42.0
-        both = {topic: kind for topic, (kind, _) in bridge.handlers(RosTopics(odometry="/vio")).items()}
+        both = {
+            topic: kind for topic, (kind, _) in bridge.handlers(RosTopics(odometry="/vio", range="/r")).items()
+        }
         assert both["/vio"] == "nav_msgs/msg/Odometry"
-        assert both[RosTopics().velocity] == "geometry_msgs/msg/TwistStamped"
-    assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height, RosTopics().range}
+        assert (both["/r"], both[RosTopics().velocity]) == (
+            "sensor_msgs/msg/Range",
+            "geometry_msgs/msg/TwistStamped",
+        )
+    assert set(kinds) == {RosTopics().image, RosTopics().imu, RosTopics().height}
     known = set(STORES["ros1"].types) & set(STORES["ros2"].types)
     assert known >= {*kinds.values(), *both.values()}
 

@@ -1,5 +1,7 @@
 """The guard before the autopilot: a shifted map is not followed, a covered camera is recovered from."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,8 +18,8 @@ def fix(east_m, north_m=0.0, sigma_m=0.3):
     return a_fix(east_m, north_m, sigma_m)
 
 
-def refused(result):
-    return lambda east_m: NoFix(reason=Reason.INCONSISTENT, match=result(east_m))
+def refused(result, reason=Reason.INCONSISTENT, **stated):
+    return lambda east_m: NoFix(reason=reason, match=replace(result(east_m), **stated))
 
 
 class Flight:
@@ -83,6 +85,14 @@ def test_matches_that_return_to_the_track_end_the_dispute(flight, seconds, wrong
     answers = flight.fly(1.0, true)
     assert not any(answers[:2])
     assert all(answers[3:])
+
+
+@pytest.mark.parametrize(("confidence", "is_heard"), [(0.99995, True), (0.999, False)])
+def test_a_match_that_suffices_by_itself_counts_though_the_navigator_doubts_it(flight, confidence, is_heard):
+    """It followed the shifted map, and may take ten seconds to leave it."""
+    assert not any(flight.fly(20.0, shifted))
+    flight.fly(10.0, refused(true, Reason.UNCONFIRMED, confidence=confidence), velocity=False)
+    assert all(flight.fly(5.0, true)) == is_heard
 
 
 def test_a_refused_match_is_never_sent_however_well_it_agrees(flight):
