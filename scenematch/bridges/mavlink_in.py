@@ -78,7 +78,7 @@ _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
 # ESTIMATOR_STATUS of PX4 has the same bits as EKF_STATUS_REPORT of ArduPilot.
 _VELOCITY_KNOWN, _CONSTANT_POSITION = mavlink.EKF_VELOCITY_HORIZ, mavlink.EKF_CONST_POS_MODE
 _SUPPORT_NS = (
-    2_000_000_000  # of fixes: before, an estimator that aligned in the air states its velocity some m/s off
+    2_000_000_000  # of fixes, before which an estimator that aligned in the air only guesses its velocity
 )
 _MIN_GNSS_SIGMA_M, _DEFAULT_GNSS_SIGMA_M = 0.5, 5.0  # the latter if the receiver states no accuracy
 
@@ -208,8 +208,8 @@ class MavlinkTelemetry:
     def add_sent(self, captured_ns: int) -> None:
         """Count a fix that was sent towards those that an estimator needs to know its velocity."""
         with self._lock:
-            self._owed_ns = max(self._owed_ns - max(min(captured_ns - self._sent_ns, STALE_NS), 0), 0)
-            self._sent_ns = captured_ns
+            since_ns = min(max(captured_ns - self._sent_ns, 0), STALE_NS)
+            self._owed_ns, self._sent_ns = max(self._owed_ns - since_ns, 0), captured_ns
 
     def unix_ns(self, time_ns: int) -> int:
         """Nanoseconds since 1970 of a local time, by the autopilot's UTC or, if it has none, this machine's."""
