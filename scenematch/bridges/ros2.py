@@ -33,7 +33,7 @@ class Node:
         try:
             import rclpy
             from rcl_interfaces.msg import ParameterDescriptor
-            from rclpy.exceptions import NameValidationException
+            from rclpy.exceptions import NameValidationException, ParameterException
             from rclpy.executors import ExternalShutdownException
             from rclpy.qos import qos_profile_sensor_data
             from rclpy.signals import SignalHandlerOptions
@@ -43,7 +43,7 @@ class Node:
             # rclpy's own handlers would end its context in another thread while this one still publishes.
             rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
             self._node = rclpy.create_node(name)
-        except RuntimeError as error:  # rclpy's errors are
+        except (RuntimeError, ParameterException) as error:
             reason = str(error).splitlines()[0]
             raise OptionError(f"ros_arguments: expected arguments of ROS 2, got {reason}") from None
         self._rclpy, self._qos = rclpy, qos_profile_sensor_data

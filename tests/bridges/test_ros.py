@@ -603,6 +603,10 @@ class NameValidationError(Exception):
     """As rclpy's NameValidationException."""
 
 
+class ParameterError(Exception):
+    """As rclpy's ParameterException."""
+
+
 class Rclpy(ModuleType):
     """As much of rclpy as the node uses: what is subscribed to is delivered once when it is spun.
 
@@ -627,6 +631,8 @@ class Rclpy(ModuleType):
         return self.turns < 20
 
     def create_node(self, name):
+        if "use_sim_time:=yes" in self.arguments:
+            raise ParameterError("Trying to set parameter 'use_sim_time'")
         return self
 
     def create_publisher(self, kind, topic, depth):
@@ -663,7 +669,8 @@ def rclpy_with(monkeypatch):
         rclpy = Rclpy(dict(messages), **options)
         monkeypatch.setitem(sys.modules, "rclpy", rclpy)
         stand_in(monkeypatch, "rclpy.qos", qos_profile_sensor_data="best effort")
-        stand_in(monkeypatch, "rclpy.exceptions", NameValidationException=NameValidationError)
+        exceptions = {"NameValidationException": NameValidationError, "ParameterException": ParameterError}
+        stand_in(monkeypatch, "rclpy.exceptions", **exceptions)
         stand_in(monkeypatch, "rclpy.executors", ExternalShutdownException=ShutdownError)
         stand_in(monkeypatch, "rclpy.signals", SignalHandlerOptions=SimpleNamespace(NO="none"))
         stand_in(monkeypatch, "rcl_interfaces.msg", ParameterDescriptor=SimpleNamespace)
@@ -712,8 +719,11 @@ def test_what_ros2_does_not_take_is_one_line(rclpy_with):
             node.parameter(name, default)
     with pytest.raises(OptionError, match=r"^topic: expected a name that ROS 2 permits, got 'a b'$"):
         node.wait_for("a b", "sensor_msgs/msg/CameraInfo", 0.01)
-    with pytest.raises(OptionError, match=r"^ros_arguments: .* got Failed to parse global arguments$"):
-        ros2.Node("scenematch", ["wrong"])
+    for argument, reason in {
+        "wrong": "Failed to parse global arguments", "use_sim_time:=yes": "Trying to set parameter 'use_sim_time'",
+    }.items():  # fmt: skip
+        with pytest.raises(OptionError, match=f"^ros_arguments: .* got {reason}$"):
+            ros2.Node("scenematch", [argument])
 
 
 @pytest.mark.parametrize("given", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, {"ROS_LOCALHOST_ONLY": "0"}])

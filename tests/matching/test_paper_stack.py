@@ -6,6 +6,7 @@ import math
 import re
 import sys
 from types import ModuleType, SimpleNamespace
+from unittest.mock import Mock
 from xml.etree import ElementTree
 
 import numpy as np
@@ -123,6 +124,13 @@ def test_the_node_of_ros_2_takes_the_parameters_of_its_file():
         name: type(value) for name, value in stated.items() if name != "threads"}  # fmt: skip
     with pytest.raises(OptionError, match="map: expected a file"):
         module.settings_of(Parameters())
+
+
+def test_the_node_of_ros_2_goes_on_when_its_launcher_has_ended(monkeypatch):
+    closed = Mock(write=Mock(side_effect=BrokenPipeError))
+    monkeypatch.setattr(sys, "stdout", closed)
+    loaded(ROS2 / "scenematch_ros/node.py").Printed().message("nobody reads this")
+    assert closed.write.called
 
 
 @pytest.mark.parametrize("stack", [STACK, ROS2], ids=["classic", "harmonic"])

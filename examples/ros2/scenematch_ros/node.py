@@ -1,6 +1,7 @@
 """The node: takes the options of `scenematch bridge ros` as ROS parameters."""
 
 import sys
+from contextlib import suppress
 
 from engine import EngineError, OptionError, set_threads
 from scenematch import BridgeSettings, CameraInput, MapInput, Progress, RosSettings, run_ros_bridge
@@ -16,8 +17,9 @@ class Printed(Progress):
     """Prints the node's messages, one line each, for ros2 launch."""
 
     def message(self, text):
-        """Print it at once, even if standard output is buffered."""
-        print(text, flush=True)
+        """Print it at once; if what started the node has ended, nobody reads it, and the node goes on."""
+        with suppress(BrokenPipeError):
+            print(text, flush=True)
 
 
 def settings_of(node):
@@ -50,7 +52,8 @@ def main():
         node = Node("scenematch", sys.argv)
         set_threads(node.parameter("threads", 1))
         ros, matching = settings_of(node)
-        print(run_ros_bridge(ros, matching, node=node, progress=Printed()).line(), flush=True)
+        printed = Printed()
+        printed.message(run_ros_bridge(ros, matching, node=node, progress=printed).line())
     except KeyboardInterrupt:  # while loading
         print("ended before it began", flush=True)
     except EngineError as error:
