@@ -139,14 +139,14 @@ def read_log(log: Path, place: LocalFrame) -> list[Track]:
     tracks = []
     for name in names[:2]:
         known = data[name]
-        east_m, north_m = place.enu_from_geodetic(known["lat"], known["lon"])[:2]
-        tracks.append(np.column_stack([known["timestamp"] * 1e-6, east_m, north_m]))
+        east_north = place.enu_from_geodetic(known["lat"], known["lon"])
+        tracks.append(np.column_stack([known["timestamp"] * 1e-6, east_north]))
     origin, fixes = data["vehicle_local_position"], data["vehicle_visual_odometry"]
     frame = LocalFrame(origin["ref_lat"][-1], origin["ref_lon"][-1])
     lat_deg, lon_deg = frame.geodetic_from_enu(fixes["position[1]"], fixes["position[0]"])
-    east_m, north_m = place.enu_from_geodetic(lat_deg, lon_deg)[:2]
+    east_north = place.enu_from_geodetic(lat_deg, lon_deg)
     stamps_s = fixes["timestamp_sample"] * 1e-6, fixes["timestamp"] * 1e-6
-    return [*tracks, np.column_stack([stamps_s[0], east_m, north_m, stamps_s[1]])]
+    return [*tracks, np.column_stack([stamps_s[0], east_north, stamps_s[1]])]
 
 
 def main() -> None:
