@@ -77,9 +77,7 @@ _UNIX_RANGE_US = (1_420_070_400_000_000, 4_102_444_800_000_000)  # 2015 to 2100:
 _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
 # ESTIMATOR_STATUS of PX4 has the same bits as EKF_STATUS_REPORT of ArduPilot.
 _VELOCITY_KNOWN, _CONSTANT_POSITION = mavlink.EKF_VELOCITY_HORIZ, mavlink.EKF_CONST_POS_MODE
-_SUPPORT_NS = (
-    2_000_000_000  # of fixes, before which an estimator that aligned in the air only guesses its velocity
-)
+_SUPPORT_NS = 2_000_000_000  # of fixes: before, an estimator that aligned in the air guesses its velocity
 _MIN_GNSS_SIGMA_M, _DEFAULT_GNSS_SIGMA_M = 0.5, 5.0  # the latter if the receiver states no accuracy
 
 

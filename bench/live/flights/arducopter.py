@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import os
 import subprocess
 import sys
@@ -19,7 +20,6 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +30,11 @@ from pymavlink import mavutil
 
 from bench.live.bridge_counts import free_port
 from bench.live.flights.faults import Fault, events
-from bench.live.flights.fly import FAR_M, FLIGHT_S, RATE_HZ, Bridge, change, conditions
+from bench.live.flights.fly import FAR_M, FLIGHT_S, RATE_HZ, Bridge, change, conditions, longest_silence_s
 from bench.live.flights.recorded import recorded
 from bench.live.flights.sitl import Motion, Pilot, climb
 from engine.geo import LocalFrame
+from scenematch.report.loop_record import rms
 from scenematch.runs.simulation import write_flight
 from scenematch.simulator import plan_flight
 
@@ -188,20 +189,21 @@ def off_m(truth: Track, track: Track) -> NDArray[np.float64]:
 
 
 def _rms_and_worst(off: NDArray[np.float64]) -> str:
-    return f"{np.sqrt((off**2).mean()):.2f}, {off.max():.2f} m" if len(off) else "none"
+    return f"{rms(off):.2f}, {off.max():.2f} m" if len(off) else "none"
 
 
 def report(tracks: Sequence[Track], begin_s: float, duration_s: float, faults: tuple[Fault, ...]) -> str:
     """A table of the flight without GNSS, and one of its faults, by the truth, the EKF and the fixes of a log."""
     truth, ekf, fixes = (t[(t[:, 0] > begin_s) & (t[:, 0] < begin_s + duration_s)] for t in tracks)
     ekf_m, fixes_m = off_m(truth, ekf), off_m(truth, fixes)
-    gaps_s = np.diff([begin_s, *fixes[:, 0], begin_s + duration_s])
-    age_ms = np.percentile((fixes[:, 3] - fixes[:, 0]) * 1e3 - DELAY_MS, (50, 99)) if len(fixes) else (nan, nan)
+    silence_s = longest_silence_s(fixes[:, 0], begin_s, begin_s + duration_s)
+    ages_ms = (fixes[:, 3] - fixes[:, 0]) * 1e3 - DELAY_MS
+    p50_ms, p99_ms = np.percentile(ages_ms, (50, 99)) if len(fixes) else (math.nan, math.nan)
     lines = [
         "| EKF to truth, RMS, worst | fixes | to truth, RMS, worst | beyond 5 m | longest gap | age p50, p99 |",
         "|---|---|---|---|---|---|",
         f"| {_rms_and_worst(ekf_m)} | {len(fixes)} | {_rms_and_worst(fixes_m)} "
-        f"| {(fixes_m > FAR_M).sum()} | {gaps_s.max():.1f} s | {age_ms[0]:.0f}, {age_ms[1]:.0f} ms |",
+        f"| {(fixes_m > FAR_M).sum()} | {silence_s:.1f} s | {p50_ms:.0f}, {p99_ms:.0f} ms |",
     ]
     for row, off in zip(fixes[fixes_m > FAR_M], fixes_m[fixes_m > FAR_M], strict=True):
         lines.append(f"\n{off:.1f} m off, {row[0] - begin_s:.1f} s after the receiver's end")
@@ -214,14 +216,14 @@ def report(tracks: Sequence[Track], begin_s: float, duration_s: float, faults: t
         end_s = begin_s + fault.end_s
         during = (ekf[:, 0] >= begin_s + fault.begin_s) & (ekf[:, 0] < begin_s + until)
         after = np.flatnonzero((fixes[:, 0] > end_s) & (fixes[:, 0] < begin_s + until))
-        moved = [np.diff(np.interp([end_s - 1.0, end_s], truth[:, 0], truth[:, k])) for k in (1, 2)]
+        moved = [[np.interp(t, truth[:, 0], truth[:, k]) for k in (1, 2)] for t in (end_s - 1.0, end_s)]
         worst_m[fault.name] = max(worst_m[fault.name], float(ekf_m[during].max()))
-        said = f"{np.hypot(*moved)[0]:.1f} m/s; "
+        found = "none"
         if len(after):
-            times_s = fixes[after, 0]
-            gap_s = np.diff([*times_s, begin_s + until]).max()
-            said += f"{times_s[0] - end_s:.2f} s; {fixes_m[after].max():.2f} m, {gap_s:.1f} s"
-        firsts[fault.name].append(said if len(after) else f"{said}none")
+            first_s = fixes[after[0], 0]
+            gap_s = longest_silence_s(fixes[:, 0], first_s, begin_s + until)
+            found = f"{first_s - end_s:.2f} s; {fixes_m[after].max():.2f} m, {gap_s:.1f} s"
+        firsts[fault.name].append(f"{math.dist(*moved):.1f} m/s; {found}")
     lines += [f"| {name} | {far_m:.2f} m | {' / '.join(firsts[name])} |" for name, far_m in worst_m.items()]
     return "\n".join(lines)
 

@@ -112,7 +112,7 @@ def fly(pilot: Px4Pilot, motion: Motion, duration_s: float, bridge: Bridge, faul
         PX4's time at which the receiver was switched off.
     """
     first, asked_s, begin = motion(0.0), 0.0, time.monotonic()
-    while pilot.height_m < first.height_m - 2.0 or not any("fixes begin" in text for text in pilot.texts):
+    while pilot.height_m < first.height_m - 2.0 or not pilot.has_fixes:
         if time.monotonic() - begin > _CLIMB_S:
             raise SystemExit(f"at {pilot.height_m:.0f} m after {_CLIMB_S:g} s: {pilot.texts[-5:]}")
         asked_s = follow(pilot, lambda _: first, begin, asked_s)

@@ -33,6 +33,11 @@ class Pilot:
         self._estimate: tuple[float, float] | None = None
 
     @property
+    def has_fixes(self) -> bool:
+        """Whether the bridge has said that fixes begin."""
+        return any("fixes begin" in text for text in self.texts)
+
+    @property
     def is_steered(self) -> bool:
         """Whether the vehicle still takes targets: armed in GUIDED, or not heard yet."""
         return not self.mode or (self.mode == "GUIDED" and self.armed)
@@ -121,7 +126,7 @@ def climb(pilot: Pilot, height_m: float) -> None:
     for message_id, rate_hz in RATES_HZ.items():
         pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
     take_off(pilot, height_m)
-    if not pilot.listen(60.0, lambda: any("fixes begin" in text for text in pilot.texts)):
+    if not pilot.listen(60.0, lambda: pilot.has_fixes):
         raise SystemExit("no fixes within a minute")
 
 
