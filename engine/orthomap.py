@@ -167,10 +167,10 @@ class OrthoMap(Georeference):
         return site
 
     def _attach(self, surface: SurfaceModel, surface_grid: Grid) -> None:
-        known = self._known_heights(surface, self.grid.lattice(257))
+        known = self._known_heights(surface, self.grid.points(257))
         if known.size < _MIN_KNOWN:  # a surface of a small part of the map, or a map of small parts
             to_map = warp_between(surface_grid, self.grid)
-            known = self._known_heights(surface, to_map(surface_grid.lattice(257)))
+            known = self._known_heights(surface, to_map(surface_grid.points(257)))
         if known.size == 0:
             raise MapError("surface: expected known heights under the valid part of the map, got none")
         self._surface, self.has_surface = surface, True

@@ -113,8 +113,8 @@ def _drawn(taken: OrthoMap, camera: Camera, sides_m: tuple[float, float], rng: R
             continue
         image = picture(gray, taken, camera, place_m, *pose)
         roll, pitch, turn = np.array([roll_deg, pitch_deg, heading_deg]) + rng.normal(0.0, ATTITUDE_SD_DEG)
-        told_m = height_m * rng.normal(1.0, HEIGHT_SHARE_SD)
-        return Frame(image, None, told_m, turn % 360.0, roll, pitch), place_px
+        stated_m = height_m * rng.normal(1.0, HEIGHT_SHARE_SD)
+        return Frame(image, None, stated_m, turn % 360.0, roll, pitch), place_px
     return None
 
 

@@ -222,7 +222,7 @@ def _coarse_rest(
 
 
 def _refined(levels: _Levels, scores: FloatImage, x: int, y: int) -> tuple[Peak | None, bool]:
-    """A coarse position at full resolution, and whether it is a summit there and not at the edge of anything.
+    """A coarse position at full resolution, and whether it is a maximum there and not at the edge of anything.
 
     None if it is on the border of the coarse level, or too much of it on nodata.
     """

@@ -113,7 +113,7 @@ def _derivatives(positions: NDArray[np.int64], powers: list[tuple[int, int]], n:
 
 _WIDE = np.concatenate([NEAR, FAR], axis=1)
 _SUMMITS = {3: (NEAR + 1, _derivatives(NEAR, _QUADRATIC, 3)), 5: (_WIDE + 2, _derivatives(_WIDE, _QUARTIC, 5))}
-_NEWTON_STEPS = 5  # which end within 1e-8 px of the summit
+_NEWTON_STEPS = 5  # which end within 1e-8 px of the maximum
 
 
 def fit_peak(patch: NDArray[np.float64]) -> tuple[float, float, NDArray[np.float64]]:

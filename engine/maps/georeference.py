@@ -46,7 +46,7 @@ class Georeference:
         self.gsd_m_per_px = math.sqrt(abs(np.linalg.det(self.enu_jacobian(grid.centre_px))))
         if not GSD_RANGE_M[0] <= self.gsd_m_per_px <= GSD_RANGE_M[1]:
             raise MapError(f"map: expected 1 mm to 1 km a pixel, got {self.gsd_m_per_px:.3g} m; is its CRS right?")
-        lonlat = self._to_geodetic(grid.lattice())
+        lonlat = self._to_geodetic(grid.points())
         (west, south), (east, north) = lonlat.min(axis=0), lonlat.max(axis=0)
         self.bounds_deg = (float(west), float(south), float(east), float(north))
 

@@ -47,7 +47,7 @@ class Warp:
         self._exact = exact
         self._centre, self._half = (box[0] + box[1]) / 2.0, (box[1] - box[0]) / 2.0
         chebyshev = np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0)  # nodes that spread the error evenly
-        nodes, between = square_lattice(chebyshev), square_lattice(np.linspace(-1.0, 1.0, 17))
+        nodes, between = square_points(chebyshev), square_points(np.linspace(-1.0, 1.0, 17))
         values = exact(self._centre + self._half * nodes)
         self._coefficients: Array = np.zeros((6, 6, 2))
         self.fitted = bool(np.isfinite(values).all())
@@ -81,7 +81,7 @@ def _powers(points: Array) -> Array:
     return np.asarray(polyvander2d(points[:, 0], points[:, 1], [5, 5]), np.float64)
 
 
-def square_lattice(x: Array) -> Array:
+def square_points(x: Array) -> Array:
     """All points whose coordinates are two of these numbers, row by row.
 
     Args:
@@ -215,7 +215,7 @@ class Grid:
         grow = 0.5 + margin * max(self.width_px, self.height_px)
         return np.array([[-grow, -grow], [self.width_px - 1 + grow, self.height_px - 1 + grow]])
 
-    def lattice(self, count: int = 33) -> Array:
+    def points(self, count: int = 33) -> Array:
         """Points spread evenly over the picture, including its outer edges.
 
         Args:
@@ -225,7 +225,7 @@ class Grid:
             (count ** 2, 2) pixels.
         """
         low, high = self.box()
-        unit = square_lattice(np.linspace(-1.0, 1.0, count))
+        unit = square_points(np.linspace(-1.0, 1.0, count))
         return np.asarray((low + high) / 2.0 + (high - low) / 2.0 * unit)
 
     @property
@@ -314,5 +314,5 @@ def window_about(points: Array, shape: tuple[int, ...], margin_px: int) -> Windo
 
 def overlap(grid: Grid, other: Grid) -> Window | None:
     """The part of another grid that a grid covers, widened by two pixels; None if they do not overlap."""
-    points = warp_between(grid, other)(grid.lattice())
+    points = warp_between(grid, other)(grid.points())
     return window_about(points[np.isfinite(points).all(axis=1)], (other.height_px, other.width_px), margin_px=2)

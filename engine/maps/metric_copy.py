@@ -47,7 +47,7 @@ def _metric_grid(source: Grid) -> Grid:
     utm = CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
     to_utm = source.pixels_of(utm)[0]
     near = to_utm(source.centre_px + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]))
-    outline = to_utm(source.lattice())
+    outline = to_utm(source.points())
     low, high = outline.min(axis=0), outline.max(axis=0)
     with np.errstate(invalid="ignore"):  # outside UTM's range coordinates are infinite, and refused below
         step = float(min(np.linalg.norm(near[1] - near[0]), np.linalg.norm(near[3] - near[2])))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.errors import MapError
-from engine.maps.grids import Array, Grid, Warp, overlap, part_grid, square_lattice, warp_between
+from engine.maps.grids import Array, Grid, Warp, overlap, part_grid, square_points, warp_between
 from engine.maps.rasters import COARSE_LIMIT_PX, MEMORY_LIMIT_PX, Source, map_errors
 from engine.maps.tiles import TILE_PX
 from engine.values import Window
@@ -23,7 +23,7 @@ HEIGHT_RANGE_M = (-1000.0, 20000.0)
 """Surface heights outside are nodata, whether tagged or not (-9999, -32768, 3e38)."""
 GROUND_PERCENT = 20.0
 """Percentile of the surface used as the ground level."""
-_LATTICE = square_lattice(np.linspace(-1.0, 1.0, 15))
+_POINTS = square_points(np.linspace(-1.0, 1.0, 15))
 """Sample positions of a plane fit, relative to half the side of the square."""
 _ROUNDS = 8
 _ON_PLANE_M = 0.3  # residual below which a height counts as on the plane
@@ -123,9 +123,9 @@ class SurfaceModel:
         """
         from engine.kernels.lower_plane import lower_plane  # numba takes a while to import
 
-        heights_m = self.sample(map_xy + _LATTICE * reach_px)
-        plane, known = lower_plane(_LATTICE, heights_m, GROUND_PERCENT / 100.0, _ON_PLANE_M, _ROUNDS)
-        return None if 2 * known < len(_LATTICE) else float(plane[0])
+        heights_m = self.sample(map_xy + _POINTS * reach_px)
+        plane, known = lower_plane(_POINTS, heights_m, GROUND_PERCENT / 100.0, _ON_PLANE_M, _ROUNDS)
+        return None if 2 * known < len(_POINTS) else float(plane[0])
 
     @property
     def range_m(self) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from engine.camera import SIDE_STEPS, Camera
 from engine.geo import inverse_2x2
-from engine.kernels.lattice import places_between_nodes
+from engine.kernels.between_nodes import places_between_nodes
 from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.values import Attitude, Frame
 

@@ -77,7 +77,7 @@ class PeakCandidate(Candidate):
 
     @property
     def is_inside(self) -> bool:
-        """Whether it is a summit, and no slope at the window's edge."""
+        """Whether it is a maximum, and no slope at the window's edge."""
         return bool(self.peak.curvature.any())
 
     @property

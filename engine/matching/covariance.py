@@ -35,7 +35,7 @@ def tilt_covariance(cam_from_map: Array, sigma_rad: float) -> Array:
     return np.asarray(sigma_rad**2 * horizontal @ horizontal.T)
 
 
-def scale_doubt_m(off_m: float, height_m: float, camera_down: Array, told_down: Array | None) -> float:
+def scale_doubt_m(off_m: float, height_m: float, camera_down: Array, stated_down: Array | None) -> float:
     """Position error to allow for if a measured height is not the telemetry's.
 
     A focal length that is wrong by some share scales the height and the optical axis's angle off the vertical;
@@ -46,13 +46,13 @@ def scale_doubt_m(off_m: float, height_m: float, camera_down: Array, told_down: 
         off_m: how far the heights are apart.
         height_m: as measured.
         camera_down: (3,) optical axis in east, north, up, as measured.
-        told_down: the same by the telemetry; None if that is unknown.
+        stated_down: the same by the telemetry; None if that is unknown.
 
     Returns:
         One standard deviation per axis.
     """
     aside = float(np.hypot(*camera_down[:2])) / max(-float(camera_down[2]), 1e-3) + _ASIDE
-    turned = 0.0 if told_down is None else math.acos(min(1.0, float(told_down @ camera_down)))
+    turned = 0.0 if stated_down is None else math.acos(min(1.0, float(stated_down @ camera_down)))
     return math.hypot(off_m * aside, height_m * math.tan(min(turned, _MAX_TURNED)))
 
 

@@ -49,7 +49,7 @@ class FeatureMatcher:
         options: settings.
         finder: finds the matched points instead of features.
         method: name of the method in fixes and refusals.
-        doubts_tilt: whether the told roll and pitch are no better known than untold ones.
+        doubts_tilt: whether the stated roll and pitch are no better known than missing ones.
     """
 
     query: Query
@@ -140,9 +140,9 @@ class FeatureMatcher:
             return None
         height_m = query.above_ground_m(np.array(fix.map_xy_px), fix.up_m)
         heading_deg = fix.attitude.heading_deg + query.site.frame.convergence_deg(fix.lat_deg, fix.lon_deg)
-        told_m, told_deg = hypothesis.height_m, query.telemetry.grid_heading_deg
-        turn_deg = math.inf if told_deg is None else abs(wrap_difference_deg(heading_deg - told_deg))
-        is_near = told_m is not None and abs(height_m - told_m) < VOTE_SHARE * told_m
+        stated_m, stated_deg = hypothesis.height_m, query.telemetry.grid_heading_deg
+        turn_deg = math.inf if stated_deg is None else abs(wrap_difference_deg(heading_deg - stated_deg))
+        is_near = stated_m is not None and abs(height_m - stated_m) < VOTE_SHARE * stated_m
         if height_m < MIN_HEIGHT_M or (is_near and turn_deg < TURNS_DEG[-1] / 2.0):
             return None
         doubts_tilt = self.doubts_tilt or SPREAD_SIGMAS * query.errors.heading_deg < turn_deg < math.inf
@@ -204,24 +204,24 @@ class FeatureMatcher:
         if not options.use_attitude:
             return self._by_matches(found, None)
         errors = query.errors
-        told_deg, sigma_deg = query.telemetry.grid_heading_deg, errors.heading_deg
-        heading_deg, doubts_tilt = told_deg, self.doubts_tilt
+        stated_deg, sigma_deg = query.telemetry.grid_heading_deg, errors.heading_deg
+        heading_deg, doubts_tilt = stated_deg, self.doubts_tilt
         if heading_deg is None or hypothesis.x_axis_deg is None:
             free = self._by_matches(found, None)
             if free is None:
                 return None
             heading_deg = attitude_from_rotation(free.rotation.T @ query.camera.mount.T)[2]
-            if told_deg is not None:
-                doubts_tilt |= abs(wrap_difference_deg(heading_deg - told_deg)) > SPREAD_SIGMAS * sigma_deg
+            if stated_deg is not None:
+                doubts_tilt |= abs(wrap_difference_deg(heading_deg - stated_deg)) > SPREAD_SIGMAS * sigma_deg
             sigma_deg = _MATCHED_HEADING_SIGMA_DEG
-        told = self._solved(found, heading_deg, sigma_deg, errors)
-        if told is None or not doubts_tilt:
-            return told
+        stated = self._solved(found, heading_deg, sigma_deg, errors)
+        if stated is None or not doubts_tilt:
+            return stated
         doubting = replace(errors, tilt_deg=max(errors.tilt_deg, errors.unknown_tilt_deg))
         seen = self._solved(found, heading_deg, sigma_deg, doubting)
-        above_m = query.above_ground_m(query.site.pixel_from_enu(told.center_m[:2]), float(told.center_m[2]))
-        told = _with_tilt_doubt(told, above_m, math.radians(doubting.tilt_deg))
-        return min(filter(None, (told, seen)), key=lambda each: float(np.trace(each.covariance_center_m2)))
+        above_m = query.above_ground_m(query.site.pixel_from_enu(stated.center_m[:2]), float(stated.center_m[2]))
+        stated = _with_tilt_doubt(stated, above_m, math.radians(doubting.tilt_deg))
+        return min(filter(None, (stated, seen)), key=lambda each: float(np.trace(each.covariance_center_m2)))
 
     def _solved(
         self, found: Matched, heading_deg: float, sigma_deg: float, errors: AssumedErrors

@@ -238,8 +238,8 @@ def _refined(correlator: Correlator, peak: Peak, aligned: Aligned) -> tuple[Peak
                 continue
             low, high = sides[0][0].score, sides[1][0].score
             bend = low - 2.0 * best[0].score + high
-            summit = float(np.clip(0.5 * (low - high) / bend if bend < 0 else np.sign(high - low), -1.5, 1.5))
-            tried = _moved(correlator, best, summit * turn, summit * share)
+            vertex = float(np.clip(0.5 * (low - high) / bend if bend < 0 else np.sign(high - low), -1.5, 1.5))
+            tried = _moved(correlator, best, vertex * turn, vertex * share)
             best = max([best, *(s for s in (*sides, tried) if s is not None)], key=lambda pair: pair[0].score)
         step /= 2.0
     return best

@@ -40,7 +40,7 @@ class Query:
         scheduler: times its stages and decides which steps time allows.
         risk: allowed probability of a wrong fix.
         assumed: errors of telemetry and map, of those that the frame does not state.
-        told_height_m: the height that the frame came with, if a search replaced it.
+        stated_height_m: the height that the frame came with, if a search replaced it.
         looks: what was known after each look so far.
     """
 
@@ -53,7 +53,7 @@ class Query:
     scheduler: Scheduler = field(repr=False)
     risk: float
     assumed: AssumedErrors
-    told_height_m: float | None = None
+    stated_height_m: float | None = None
     looks: list[Look] = field(default_factory=list, repr=False)
 
     @property
@@ -172,15 +172,15 @@ class Query:
         Returns:
             One standard deviation per axis, 0 if the heights agree to within two standard deviations.
         """
-        told_m = self.told_height_m or self.telemetry.height_agl_m
-        if told_m is None:
+        stated_m = self.stated_height_m or self.telemetry.height_agl_m
+        if stated_m is None:
             return 0.0
-        off_m = abs(measured_m - told_m)
-        if off_m <= _AGREE_SIGMAS * self.errors.height_sigma_m(told_m):
+        off_m = abs(measured_m - stated_m)
+        if off_m <= _AGREE_SIGMAS * self.errors.height_sigma_m(stated_m):
             return 0.0
-        told = self.telemetry.grid_attitude if self.telemetry.has_tilt else None
-        told_down = None if told is None else self.camera.enu_from_camera(told)[:, 2]
-        return scale_doubt_m(off_m, measured_m, camera_down, told_down)
+        stated = self.telemetry.grid_attitude if self.telemetry.has_tilt else None
+        stated_down = None if stated is None else self.camera.enu_from_camera(stated)[:, 2]
+        return scale_doubt_m(off_m, measured_m, camera_down, stated_down)
 
     def at(self, pose: GridPose) -> Query:
         """The same query with the heading and height that a search found, as accurate as its steps."""
@@ -192,7 +192,7 @@ class Query:
             height_agl_m=height_m,
             height_sigma_m=_FOUND_HEIGHT_SHARE * height_m,
         )
-        return replace(self, frame=found, told_height_m=self.frame.height_agl_m)
+        return replace(self, frame=found, stated_height_m=self.frame.height_agl_m)
 
     # --------------------------------------------------------------------------------------------- answers
 

@@ -114,7 +114,7 @@ class Sift(Method):
         return None if scale is None else replace(self._few, scale=scale)
 
     def find_few(self, query: Query, options: SiftOptions) -> PoseCandidate | NoFix:
-        """The pose by half as many keypoints, a level coarser and not upsampled; it follows the told attitude."""
+        """The pose by half as many keypoints, a level coarser, not upsampled; it follows the stated attitude."""
         found = FeatureMatcher(query, self.landmarks, options).find_at_once()
         if isinstance(found, NoFix):
             return found

@@ -163,19 +163,19 @@ class _Look:
         peak = find_peak(np.nan_to_num(own, nan=-1.0), exclusion_px=correlator.exclusion_px(aligned.level))
         # Streets run in few directions: elsewhere the frame itself may reach more than when it is mirrored.
         chance = [np.minimum(own, peak.second_score), *others]
-        # Where blocks give way the surface is flat: the place is that of the summit nearby where they do not.
-        reach = slack_px(aligned.template.shape, self._blocks) + 2  # a summit needs two neighbours
+        # Where blocks give way the surface is flat: the place is that of the maximum nearby where they do not.
+        reach = slack_px(aligned.template.shape, self._blocks) + 2  # a maximum needs two neighbours
         x, y = max(round(peak.x) - reach, 0), max(round(peak.y) - reach, 0)
         near = np.nan_to_num(rigid[y : y + 2 * reach + 1, x : x + 2 * reach + 1], nan=-1.0)
-        summit = find_peak(near, exclusion_px=0.0)
+        sharp = find_peak(near, exclusion_px=0.0)
         rival = max(float(np.nanmax(each)) for each in chance)
         if found.by_search and found.peak.score > 0.0:  # only the search knows the rest of the map
             rival = max(rival, found.peak.second_score / found.peak.score * peak.score)
-        place = crop.x0 + x + summit.x, crop.y0 + y + summit.y
+        place = crop.x0 + x + sharp.x, crop.y0 + y + sharp.y
         seen = candidate_of(
             correlator,
             aligned,
-            Peak(*place, peak.score, rival, summit.curvature),
+            Peak(*place, peak.score, rival, sharp.curvature),
             self.window,
             is_fitted=found.is_fitted,
             tried=found.evidence.tried * (2.0 * self.coarser + 1.0),  # with the surfaces of other levels

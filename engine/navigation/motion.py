@@ -41,12 +41,12 @@ class Ways:
 
     Attributes:
         interval_s: between them.
-        told: by the telemetry's velocity, if both came with one or the later did.
+        stated: by the telemetry's velocity, if both came with one or the later did.
         seen: by pictures, if they were followed.
     """
 
     interval_s: float
-    told: Step | None = None
+    stated: Step | None = None
     seen: Step | None = None
 
 
@@ -217,7 +217,7 @@ def velocity_of(frame: Frame) -> Array | None:
     return np.array([frame.east_velocity_mps, frame.north_velocity_mps])
 
 
-def told_step(before: Step | None, frame: Frame, interval_s: float, options: NavigatorOptions) -> Step | None:
+def stated_step(before: Step | None, frame: Frame, interval_s: float, options: NavigatorOptions) -> Step | None:
     """The way to a frame by the velocities that came with it and with the one before.
 
     Between the two the velocity walks at random, by the vehicle's acceleration.

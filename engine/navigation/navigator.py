@@ -21,7 +21,7 @@ from engine.navigation.motion import (
     en_m,
     is_valid,
     position_of,
-    told_step,
+    stated_step,
 )
 from engine.navigation.odometry import VisualOdometry
 from engine.navigation.repeats import Picture
@@ -235,13 +235,13 @@ class Navigator:
         interval_s, last, stamp_ns = self._interval_s(frame), self._last, frame.timestamp_ns
         self._motion = motion = self._seen_motion(frame)
         if last is None:
-            ways, tracks = Ways(0.0, told_step(None, frame, 0.0, self._options)), Tracks(self._options)
+            ways, tracks = Ways(0.0, stated_step(None, frame, 0.0, self._options)), Tracks(self._options)
             begun = tracks.begun(self._start, ways) if self._start else tracks
             return _Moment(0.0, stamp_ns, ways, Picture.of(frame), begun)
         seen = None
         if motion is not None and math.isclose(motion.interval_s, interval_s, abs_tol=1e-6):
             seen = motion.step(last.ways.seen)  # not seen if a frame in between failed
-        ways = Ways(interval_s, told_step(last.ways.told, frame, interval_s, self._options), seen)
+        ways = Ways(interval_s, stated_step(last.ways.stated, frame, interval_s, self._options), seen)
         return _Moment(
             last.time_s + interval_s,
             last.stamp_ns if stamp_ns is None else stamp_ns,

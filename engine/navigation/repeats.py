@@ -35,7 +35,7 @@ class Picture:
 
     def next(self, frame: Frame, ways: Ways) -> Picture:
         """The last new picture at the next frame, which this is the way to."""
-        new, step = Picture.of(frame), ways.told or ways.seen
+        new, step = Picture.of(frame), ways.stated or ways.seen
         if new.digest != self.digest:
             return new
         way_m = np.full(2, np.nan) if step is None else step.moved_m

@@ -279,12 +279,12 @@ def considered(fix: Fix, frame: Frame, shown: Frame, camera: Camera | None) -> F
     if frame.height_agl_m is None or shown.height_agl_m in (None, frame.height_agl_m):
         return fix
     assert shown.height_agl_m is not None
-    told = Attitude(shown.roll_deg or 0.0, shown.pitch_deg or 0.0, shown.heading_deg or 0.0)
-    down, told_down = (
+    stated = Attitude(shown.roll_deg or 0.0, shown.pitch_deg or 0.0, shown.heading_deg or 0.0)
+    down, stated_down = (
         np.array([0.0, 0.0, -1.0]) if camera is None else camera.enu_from_camera(attitude)[:, 2]
-        for attitude in (fix.attitude or told, told)
+        for attitude in (fix.attitude or stated, stated)
     )
-    doubt_m = scale_doubt_m(shown.height_agl_m - frame.height_agl_m, shown.height_agl_m, down, told_down)
+    doubt_m = scale_doubt_m(shown.height_agl_m - frame.height_agl_m, shown.height_agl_m, down, stated_down)
     return replace(fix, covariance_m2=fix.covariance_m2 + np.diag([doubt_m**2, doubt_m**2, 0.0]))
 
 

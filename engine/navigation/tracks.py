@@ -150,7 +150,7 @@ class Track:
     def carried(self, ways: Ways, options: NavigatorOptions) -> Track:
         """The track at the next frame."""
         kept = math.exp(-ways.interval_s / options.memory_s)
-        step = ways.told if self.trusts_velocity and ways.told is not None else ways.seen
+        step = ways.stated if self.trusts_velocity and ways.stated is not None else ways.seen
         moved = self._drifted(ways.interval_s, options) if step is None else self._led(step, ways.interval_s)
         moved_m, velocity_mps, covariance = moved
         return replace(
@@ -342,8 +342,8 @@ class Tracks:
         led = free = begun.with_velocity(np.zeros(2), 0.5 * self.options.max_speed_mps)
         if ways.seen is not None:
             led = free = begun.with_velocity(ways.seen.end_mps, ways.seen.sigma_mps)
-        if ways.told is not None:
-            led = begun.with_velocity(ways.told.end_mps, ways.told.sigma_mps)
+        if ways.stated is not None:
+            led = begun.with_velocity(ways.stated.end_mps, ways.stated.sigma_mps)
         return [led, replace(free, support=support - CERTAIN, trusts_velocity=False)]
 
     def _kept(self, tracks: Iterable[Track], count: int | None = None) -> Tracks:

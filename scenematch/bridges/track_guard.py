@@ -58,11 +58,11 @@ class _Course:
         self, stated_mps: Array | None, sigma_mps: float, elapsed_s: float, options: NavigatorOptions
     ) -> _Course:
         """The course at a later frame: by the stated velocity, of which the error changes, else by inertia."""
-        told = None
+        stated = None
         if stated_mps is not None:
             changed_m2 = options.acceleration_mps2**2 * elapsed_s**3 / 3.0  # of a velocity that walks at random
-            told = Step(stated_mps * elapsed_s, self.stated_mps, stated_mps, sigma_mps, changed_m2)
-        track = self.track.carried(Ways(elapsed_s, told), options)
+            stated = Step(stated_mps * elapsed_s, self.stated_mps, stated_mps, sigma_mps, changed_m2)
+        track = self.track.carried(Ways(elapsed_s, stated), options)
         return replace(self, track=track, stated_mps=stated_mps, silent_s=self.silent_s + elapsed_s)
 
     def continued(self, fix: Fix) -> _Course:

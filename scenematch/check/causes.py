@@ -19,7 +19,7 @@ _GAIN_SHARE = 0.5  # a change of the attitude must reduce the cost by the lesser
 _PENALTY = {"discrete": 0.15, "offset": 0.25, "shift": 0.3, "rotation": 0.5}
 _ANGLES = ("roll", "pitch", "heading")
 # An offset below both, as a share of the height and in sigmas, is named only if single pictures contradict it.
-_LEAST_HEIGHT_SHARE, _LEAST_HEIGHT_SIGMAS = 0.04, 5.0
+_MIN_HEIGHT_SHARE, _MIN_HEIGHT_SIGMAS = 0.04, 5.0
 _SHIFTS_S = np.concatenate([np.arange(-3.0, -0.07, 0.05), np.arange(0.1, 3.01, 0.05)])
 _FEET = 0.3048
 IN_CALIBRATION = " in the calibration"
@@ -62,9 +62,9 @@ def is_known(series: TelemetrySeries, seen: Sequence[Sighting]) -> tuple[str, ..
 # ------------------------------------------------------------------------------------------------ attitude
 
 
-def _cost(measured_deg: Array, told_deg: Array) -> float:
+def _cost(measured_deg: Array, stated_deg: Array) -> float:
     """Mean chi-square of a component, with each value capped."""
-    off = wrap_difference_deg(measured_deg - told_deg) / SIGMA_DEG
+    off = wrap_difference_deg(measured_deg - stated_deg) / SIGMA_DEG
     known = np.isfinite(off)
     return capped_cost(off[known]) if known.any() else 0.0
 
@@ -108,9 +108,9 @@ def _attitude(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | No
     angles = series.angles_deg[index]
     if np.isfinite(angles).sum() < 2 * MIN_SEEN:
         return None
-    as_told = _cost(measured, angles)
+    as_stated = _cost(measured, angles)
     contradicted = _contradicted(series, seen, _ANGLES)
-    if as_told < MISFIT and not contradicted:
+    if as_stated < MISFIT and not contradicted:
         return None
     tried: list[tuple[float, Finding]] = [
         (_cost(measured, change(angles)) + _PENALTY["discrete"], Finding(cause, text, cure))
@@ -120,7 +120,7 @@ def _attitude(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | No
     others = (_turned_mount(measured, angles, series.mount), _late(measured, series, index))
     tried += [other for other in others if other is not None]
     cost, finding = min(tried, key=lambda row: row[0])
-    if cost < as_told - min(GAIN, _GAIN_SHARE * as_told):
+    if cost < as_stated - min(GAIN, _GAIN_SHARE * as_stated):
         return finding
     suspected = _listed(contradicted or _ANGLES)
     text = f"{suspected} of the telemetry and of the pictures differ, and no single change would make them agree"
@@ -250,7 +250,7 @@ def _height(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding | None
     off_m, factor = float(np.median(measured - height)), float(np.median(measured / height))
     by_offset, by_factor = cost(height + off_m), cost(height * factor)
     sigma_m = _sigma_of_median(measured - height, 0.5)
-    is_small = abs(off_m) < min(_LEAST_HEIGHT_SHARE * float(np.median(measured)), _LEAST_HEIGHT_SIGMAS * sigma_m)
+    is_small = abs(off_m) < min(_MIN_HEIGHT_SHARE * float(np.median(measured)), _MIN_HEIGHT_SIGMAS * sigma_m)
     if cost(height) < MISFIT or (is_small and not _contradicted(series, seen, ("height",))):
         return None
     if min(by_offset, by_factor) > cost(height) - GAIN:

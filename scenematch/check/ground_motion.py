@@ -16,8 +16,8 @@ from scenematch.check.sightings import Sighting
 
 _VELOCITY_FACTORS = {"km/h": 1 / 3.6, "knots": 0.5144, "feet per second": 0.3048}
 # For offsets that turn with the heading: minimum reduction of the cost, its share, and the least offset reported.
-_TURNING_GAIN, _TURNING_RATIO, _TURNING_SIGMAS, _TURNING_LEAST_DEG = 0.35, 2.5, 4.0, 1.2
-_LEAST_COST = 0.1
+_TURNING_GAIN, _TURNING_RATIO, _TURNING_SIGMAS, _TURNING_MIN_DEG = 0.35, 2.5, 4.0, 1.2
+_MIN_COST = 0.1
 # Legs that show them: the vehicle turns, the telemetry agrees, and the tilt at both ends is usual.
 _TURN_DEG, _TURN_OFF_DEG, _TILT_OFF_DEG = 15.0, 10.0, 8.0
 _MAX_LEG_S, _MIN_LEG_M = 120.0, 4.0
@@ -117,21 +117,21 @@ def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding
     tilts_deg = np.array([(one.attitude.roll_deg, one.attitude.pitch_deg) for one in seen])
     off_deg = np.abs(tilts_deg - np.median(tilts_deg, axis=0)).max(axis=1)
     usual = [one for one, tilt_off_deg in zip(seen, off_deg, strict=True) if tilt_off_deg < _TILT_OFF_DEG]
-    legs = [leg for leg in _legs(series, usual) if _turns_as_told(series, leg)]
+    legs = [leg for leg in _legs(series, usual) if _turns_as_stated(series, leg)]
     turning = np.array([abs(leg.turn_deg) > _TURN_DEG for leg in legs], bool)
     if len(legs) < MIN_SEEN or not turning.any():
         return None
     rows, off = np.array([leg.turned for leg in legs]), np.array([leg.off for leg in legs])
     aside_m, information = _common_offset(rows, off, turning)
-    as_told, best = capped_cost(off), capped_cost(off - rows @ aside_m)
+    as_stated, best = capped_cost(off), capped_cost(off - rows @ aside_m)
     height_m = float(np.median([one.height_agl_m for one in seen]))
     # Most legs are more accurate than assumed.
-    sigma_m = math.sqrt(max(best, _LEAST_COST) * float(np.trace(np.linalg.inv(information))))
+    sigma_m = math.sqrt(max(best, _MIN_COST) * float(np.trace(np.linalg.inv(information))))
     size_m = float(np.hypot(*aside_m))
     aside_deg = math.degrees(math.atan2(size_m, height_m))
-    if as_told - best < _TURNING_GAIN or best > as_told / _TURNING_RATIO:
+    if as_stated - best < _TURNING_GAIN or best > as_stated / _TURNING_RATIO:
         return None
-    if size_m < _TURNING_SIGMAS * sigma_m or aside_deg < _TURNING_LEAST_DEG:
+    if size_m < _TURNING_SIGMAS * sigma_m or aside_deg < _TURNING_MIN_DEG:
         return None
     off_px = series.focal_px / height_m * (series.mount.T @ [*aside_m, 0.0])[:2]
     text = (
@@ -142,7 +142,7 @@ def optical_centre(series: TelemetrySeries, seen: Sequence[Sighting]) -> Finding
     return Finding("mount", text, cure, aside_deg, math.degrees(sigma_m / height_m))
 
 
-def _turns_as_told(series: TelemetrySeries, leg: _Leg) -> bool:
+def _turns_as_stated(series: TelemetrySeries, leg: _Leg) -> bool:
     """Whether the telemetry confirms the turn: legs to and from a false sighting would show the same offset."""
     first_deg, last_deg = series.angles_deg[[leg.first.index, leg.last.index], 2].tolist()
     off_deg: float = wrap_difference_deg(leg.turn_deg - (last_deg - first_deg))

@@ -20,7 +20,7 @@ _ENOUGH_SHARE = 0.25  # of the pictures; with fewer, the search continues
 _LEAST = 4
 _PROBED = 5  # pictures used to try a change
 _HEIGHT_FACTORS = (1.0, 0.88, 1.14, 0.77, 1.3)
-_MOST_S = 15.0  # longest search for height and turn
+_MAX_S = 15.0  # longest search for height and turn
 _TURNS_DEG = (0, 8, -8, 16, -16, 24, -24, 32, -32, 40, -40)
 
 
@@ -110,7 +110,7 @@ def _by_correlation(
     usable = [k for k in _with_pose(frames) if priors[k] is not None]  # else: the whole map
     probed = usable[:: max(1, len(usable) // _PROBED)][:_PROBED]
     best: tuple[int, float, float] = (0, 1.0, 0.0)
-    until_s = time.monotonic() + _MOST_S
+    until_s = time.monotonic() + _MAX_S
     for factor, turn_deg in product(_HEIGHT_FACTORS, _TURNS_DEG):
         hits = 0
         for k in probed:

@@ -19,7 +19,7 @@ _NUMBERS = tuple(f.name for f in fields(TelemetryRow) if f.name != "frame")
 _NUMBER = r"[0-9]+(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?"
 _RULE = re.compile(rf"(\w+)=([+-]?)(?:({_NUMBER})\*)?([A-Za-z]\w*)([+-]{_NUMBER})?")
 _OFFSETS = {"heading_offset_deg": 360.0, "height_offset_m": 1e4, "offset_s": 1e5}
-_MOST_RADIANS = 2.0 * math.pi + 1e-3  # of a heading; a larger one was negative before wrapping
+_MAX_RADIANS = 2.0 * math.pi + 1e-3  # of a heading; a larger one was negative before wrapping
 _INTERPOLATED = (
     *_ANGLES, "height_agl_m", "alt_amsl_m", "east_velocity_mps", "north_velocity_mps", "lat_deg", "lon_deg",
 )  # fmt: skip
@@ -146,7 +146,7 @@ def _scaled(row: TelemetryRow, name: str, factor: float, offset: float) -> float
     value: float | None = getattr(row, name)
     if value is None or (factor == 1.0 and offset == 0.0):
         return value
-    if name == "heading_deg" and abs(factor) > 1.0 and value > _MOST_RADIANS:
+    if name == "heading_deg" and abs(factor) > 1.0 and value > _MAX_RADIANS:
         value -= 360.0
     return factor * value + offset
 

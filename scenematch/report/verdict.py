@@ -30,7 +30,7 @@ MEANINGS = {
 """One sentence for each reason; ``docs/integrity.md`` has the rules behind them."""
 
 # Of fixes with a consistent covariance 1 % lie beyond three sigmas, and the mean NEES is 2.
-_BEYOND_SHARE, _MOST_NEES = 0.05, 8.0
+_BEYOND_SHARE, _MAX_NEES = 0.05, 8.0
 _CAUTIOUS = 2.0  # ratio of sigmas to errors from which sigmas are called cautious
 Figures = tuple[tuple[str, str, Callable[[Any], str]], ...]
 """Names for people, keys of the summary, and what writes the value."""
@@ -99,7 +99,7 @@ def _judged(summary: Mapping[str, Any], budget_ms: float | None) -> Verdict:
     beyond, nees = summary["beyond_3_sigma"], summary["nees_mean"]
     if nees is None:
         return Verdict("mixed", f"{fixed}, without a covariance to judge them by; {spread}.", late)
-    if beyond > max(1, _BEYOND_SHARE * summary["scored_fixes"]) or nees > _MOST_NEES:
+    if beyond > max(1, _BEYOND_SHARE * summary["scored_fixes"]) or nees > _MAX_NEES:
         text = f"{beyond} of {summary['scored_fixes']} fixes are off by more than three of their own sigmas"
         text += f" (mean NEES {nees:.0f}, 2 is expected): something is off by more than it states"
         return Verdict("bad", f"{text}; {fixed}, {spread}.", late)

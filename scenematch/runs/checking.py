@@ -16,7 +16,7 @@ from scenematch.runs.output import SILENT, Progress
 from scenematch.runs.settings import TrackSettings
 
 _TRUTH_SIGMA_M = 1.0
-_LEAST_SEEN = 3
+_MIN_SEEN = 3
 
 
 def diagnose_flight(
@@ -105,7 +105,7 @@ def as_rows(found: Diagnosis, *, corrected: bool = False) -> list[tuple[str, str
     for one in found.findings:
         cure = f"try {one.cure}{more}" if one.cure.startswith("--") else one.cure
         out.append((one.cause.replace("_", " "), f"{one.text}; {cure}"))
-    if found.seen < _LEAST_SEEN:
+    if found.seen < _MIN_SEEN:
         seen += (
             ", too few to say more: does the map show this place and season, and is the calibration this camera's?"
         )

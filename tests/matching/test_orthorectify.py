@@ -39,7 +39,7 @@ def places(photo, count=200):
     ],
 )
 def test_a_pixel_comes_from_where_its_ground_point_is_seen(attitude, within_px):
-    """Between the nodes of a lattice it is interpolated: what is drawn there comes from there all the same."""
+    """Between the nodes of the grid it is interpolated: what is drawn there comes from there all the same."""
     photo = orthorectify(GRAY, CAMERA, attitude, 120.0, JACOBIAN)
     at = places(photo)
     seen = projected(attitude, 120.0, at + photo.offset_px)

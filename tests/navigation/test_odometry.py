@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine import Attitude, Budget, Camera, Frame, Navigator, NavigatorOptions, NoFix, OptionError, Prior, Reason
-from engine.navigation.motion import GroundMotion, PositionEstimate, Ways, told_step
+from engine.navigation.motion import GroundMotion, PositionEstimate, Ways, stated_step
 from engine.navigation.odometry import NoMotion, VisualOdometry
 from engine.navigation.tracks import Track
 from scenematch.runs.settings import TrackSettings, load_settings
@@ -223,7 +223,7 @@ def test_a_motion_counts_over_its_own_interval_only(monkeypatch):
 @pytest.mark.parametrize(("sigma_mps", "expected_mps"), [(None, 0.5), (0.1, 0.1), (2.0, 2.0)])
 def test_a_velocity_with_its_own_accuracy_is_taken_at_its_word(sigma_mps, expected_mps):
     stated = {"east_velocity_mps": 1.0, "north_velocity_mps": 0.0, "velocity_sigma_mps": sigma_mps}
-    assert told_step(None, still(1.0, **stated), 1.0, NavigatorOptions()).sigma_mps == expected_mps
+    assert stated_step(None, still(1.0, **stated), 1.0, NavigatorOptions()).sigma_mps == expected_mps
 
 
 def test_a_navigator_follows_the_ground_where_it_is_asked_to():

@@ -38,10 +38,10 @@ def position_and_velocity(track):
     return track.covariance[np.ix_([0, 2], [0, 2])]
 
 
-def match(fix, searched_m2=AREA_M2, *, told=None, seen=None, **known):
+def match(fix, searched_m2=AREA_M2, *, stated=None, seen=None, **known):
     """A match a fifth of a second after the frame before."""
     usual = {"height_m": None, "refusals": 0, "given": None, "is_about_given": False}
-    return Match(fix, searched_m2, Ways(0.2, told, seen), **(usual | known))
+    return Match(fix, searched_m2, Ways(0.2, stated, seen), **(usual | known))
 
 
 # Motion
@@ -50,7 +50,7 @@ def match(fix, searched_m2=AREA_M2, *, told=None, seen=None, **known):
 def test_a_measured_step_carries_position_and_velocity_with_the_error_that_matches_found():
     """Told 4 to 6 m/s east, found to be 1 m/s less: 5 m/s over 2 s, less 2 m."""
     step = Step(np.array([10.0, 0.0]), np.array([4.0, 0.0]), np.array([6.0, 0.0]), sigma_mps=0.5, noise_m2=0.3)
-    track = a_track(velocity=(3.0, 0.0)).carried(Ways(2.0, told=step), OPTIONS)
+    track = a_track(velocity=(3.0, 0.0)).carried(Ways(2.0, stated=step), OPTIONS)
     assert track.en_m == pytest.approx([8.0, 0.0])
     assert track.velocity_mps == pytest.approx([5.0, 0.0])
     expected = np.array([[4.0 + 2 * 2.0 + 4 * 2.0 + 0.3, 5.0], [5.0, 2.0]])
@@ -59,7 +59,7 @@ def test_a_measured_step_carries_position_and_velocity_with_the_error_that_match
 
 def test_the_error_of_a_measured_velocity_is_never_known_better_than_it_may_change():
     step = Step(np.zeros(2), np.zeros(2), np.zeros(2), sigma_mps=0.5, noise_m2=0.0)
-    track = a_track(covariance=((1.0, 0.0), (0.0, 1e-6))).carried(Ways(1.0, told=step), OPTIONS)
+    track = a_track(covariance=((1.0, 0.0), (0.0, 1e-6))).carried(Ways(1.0, stated=step), OPTIONS)
     assert track.covariance[2, 2] == 0.25
 
 
@@ -115,7 +115,7 @@ def test_a_new_account_moves_as_the_pictures_show():
 
 @given(
     legs=st.lists(
-        st.tuples(st.floats(0.01, 30.0), st.sampled_from(["told", "seen", "blind"]), st.floats(0.05, 30.0)),
+        st.tuples(st.floats(0.01, 30.0), st.sampled_from(["stated", "seen", "blind"]), st.floats(0.05, 30.0)),
         min_size=1,
         max_size=12,
     )
@@ -125,7 +125,7 @@ def test_a_covariance_stays_one_whatever_happens(legs):
     track = a_track()
     for interval_s, source, sigma_m in legs:
         step = Step(np.ones(2), None if sigma_m > 10 else np.ones(2), np.ones(2), 0.01 * sigma_m, 0.01)
-        ways = {"told": Ways(interval_s, told=step), "seen": Ways(interval_s, seen=step)}
+        ways = {"stated": Ways(interval_s, stated=step), "seen": Ways(interval_s, seen=step)}
         track = track.carried(ways.get(source, Ways(interval_s)), OPTIONS)
         assert np.linalg.eigvalsh(position_and_velocity(track))[0] > 0.0
         track = track.matched(PositionEstimate(np.zeros(2), sigma_m), fix_at(0.0), 20.0)
@@ -134,11 +134,11 @@ def test_a_covariance_stays_one_whatever_happens(legs):
 
 def test_a_way_in_two_parts_is_the_whole_way():
     begin, between, end = np.array([[4.0, 0.0], [4.6, 0.6], [6.0, 2.0]])
-    way = Ways(2.0, told=Step(np.array([10.0, 0.0]), begin, end, 0.5, 0.3))
+    way = Ways(2.0, stated=Step(np.array([10.0, 0.0]), begin, end, 0.5, 0.3))
     whole = a_track(velocity=(3.0, 1.0)).carried(way, OPTIONS)
     parts = a_track(velocity=(3.0, 1.0))
-    parts = parts.carried(Ways(0.6, told=Step(np.array([3.0, 0.0]), begin, between, 0.5, 0.09)), OPTIONS)
-    parts = parts.carried(Ways(1.4, told=Step(np.array([7.0, 0.0]), between, end, 0.5, 0.21)), OPTIONS)
+    parts = parts.carried(Ways(0.6, stated=Step(np.array([3.0, 0.0]), begin, between, 0.5, 0.09)), OPTIONS)
+    parts = parts.carried(Ways(1.4, stated=Step(np.array([7.0, 0.0]), between, end, 0.5, 0.21)), OPTIONS)
     assert parts.en_m == pytest.approx(whole.en_m)
     assert parts.velocity_mps == pytest.approx(whole.velocity_mps)
     assert parts.covariance == pytest.approx(whole.covariance)
@@ -181,8 +181,8 @@ def test_a_match_of_the_same_ground_counts_half_and_its_agreement_nothing(moved_
 
 def test_of_two_motions_the_better_one_gains_whatever_the_ground():
     near, far = (
-        a_track(trusts_velocity=told, covariance=((v, 0.0), (0.0, 1.0)))
-        for told, v in ((True, 3.0), (False, 15.0))
+        a_track(trusts_velocity=stated, covariance=((v, 0.0), (0.0, 1.0)))
+        for stated, v in ((True, 3.0), (False, 15.0))
     )
     weighed = tracks_of(near, far).weighed(match(fix_at(0.0)))
     first, second = weighed.tracks.known
@@ -239,8 +239,8 @@ def test_after_refusals_a_new_place_needs_more_evidence():
 def test_the_set_is_bounded_and_sorted_and_holds_two_motions_of_each_account(places):
     tracks = Tracks(OPTIONS)
     for place in places:
-        told = Step(np.zeros(2), None, np.zeros(2), sigma_mps=0.5, noise_m2=0.0)
-        tracks = tracks.carried(Ways(0.2)).weighed(match(fix_at(*place), told=told)).tracks
+        stated = Step(np.zeros(2), None, np.zeros(2), sigma_mps=0.5, noise_m2=0.0)
+        tracks = tracks.carried(Ways(0.2)).weighed(match(fix_at(*place), stated=stated)).tracks
         kinds = [(id(each.fix), each.trusts_velocity) for each in tracks.known]
         assert len(kinds) == len(set(kinds)) <= MAX_TRACKS
         firsts = [each.log_odds for each in tracks.known[::2]]
@@ -307,7 +307,7 @@ FAULTS = {
 }
 
 
-def measured(told=lambda v: v, seconds=30.0, rate_hz=5.0, seed=1):
+def measured(stated=lambda v: v, seconds=30.0, rate_hz=5.0, seed=1):
     """How many frames are refused of a vehicle that turns and brakes, and the navigator."""
     rng, count = np.random.default_rng(seed), int(seconds * rate_hz)
     place, places, velocities, phase = np.zeros(2), [], [], rng.uniform(0, 2 * math.pi)
@@ -315,7 +315,7 @@ def measured(told=lambda v: v, seconds=30.0, rate_hz=5.0, seed=1):
         course = phase + 0.8 * math.sin(0.2 * k / rate_hz + phase)
         speed_mps = 7.0 * (0.6 + 0.4 * math.cos(0.3 * k / rate_hz))
         velocity = speed_mps * np.array([math.sin(course), math.cos(course)])
-        velocities.append(told(velocity + rng.normal(0.0, 0.2, 2)).tolist())
+        velocities.append(stated(velocity + rng.normal(0.0, 0.2, 2)).tolist())
         places.append((place + rng.normal(0.0, 0.3, 2)).tolist())
         place = place + velocity / rate_hz
     start = Prior(east_m=0.0, north_m=0.0, sigma_m=5.0)

@@ -1,4 +1,4 @@
-"""Places in a frame between the nodes of a lattice, bilinear: two products with sparse weights."""
+"""Places in a frame between the nodes of a grid, bilinear: two products with sparse weights."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FloatImage = NDArray[np.float32]
 def places_between_nodes(
     nodes: FloatImage, frame: tuple[int, ...], size: tuple[int, int]
 ) -> tuple[FloatImage, FloatImage, NDArray[np.bool_]]:
-    """Interpolate a lattice at every pixel of a picture, from corner to corner.
+    """Interpolate a grid of nodes at every pixel of a picture, from corner to corner.
 
     Args:
         nodes: (n, n, 3) float32 place x and y in the frame, and 1 where the frame can show it, else 0.
