@@ -215,3 +215,10 @@ def test_samples_of_another_length_are_refused_where_they_are_added():
     with pytest.raises(OptionError, match=r"^values: expected 2, as before, got 1$"):
         values.add(2, 2.0)
     assert values.at(2) == (2.0, 3.0)
+
+
+def test_only_the_values_said_to_be_angles_go_the_shorter_way_round():
+    values = RecentValues((False, True))
+    for time_ns, degrees in ((0, 359.0), (10, 5.0)):
+        values.add(time_ns, degrees, degrees, degrees)
+    assert values.at(5) == (182.0, 362.0, 182.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +104,8 @@ class RecentValues:
         roll_deg, pitch_deg, heading_deg, height_agl_m = vehicle.at(exposure_ns)
 
     Args:
-        angles: which of the values are angles in degrees, interpolated along the shorter arc; empty for none.
+        angles: which of the values are angles in degrees, interpolated along the shorter arc, so that a heading
+            may exceed 360; the values beyond these are none.
     """
 
     def __init__(self, angles: tuple[bool, ...] = ()) -> None:
@@ -145,9 +147,9 @@ class RecentValues:
             return near[0][1] if near else None
         (t0, first), (t1, last) = near
         share = (time_ns - t0) / (t1 - t0)
-        steps = [b - a for a, b in zip(first, last, strict=True)]
-        steps = [math.remainder(d, 360.0) if i < len(self._angles) else d for i, d in enumerate(steps)]
-        return tuple(a + share * d for a, d in zip(first, steps, strict=True))
+        steps = zip_longest((b - a for a, b in zip(first, last, strict=True)), self._angles, fillvalue=False)
+        moved = [share * (math.remainder(d, 360.0) if is_angle else d) for d, is_angle in steps]
+        return tuple(a + d for a, d in zip(first, moved, strict=True))
 
 
 def scalar(values: tuple[float, ...] | None) -> float | None:
