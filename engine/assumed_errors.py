@@ -28,6 +28,9 @@ class AssumedErrors:
         surface_slope_deg: slope accuracy of the surface model under one frame, if it does not state its own.
         unknown_slope_deg: slope of the ground if flat ground is assumed: the scale of a mixture of small and
             larger slopes (:mod:`engine.matching.unknown_slope`).
+
+    Raises:
+        OptionError: a value is out of range.
     """
 
     height_m: float = 0.5

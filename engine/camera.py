@@ -82,7 +82,8 @@ class Camera:
         mount: (3, 3) rotation, v_body = mount @ v_camera.
 
     Raises:
-        CalibrationError: a field has the wrong shape, is not finite, or is not a rotation.
+        CalibrationError: a field is out of range, has the wrong shape or is not finite, the distortion model is
+            unknown, or the mount is no rotation.
     """
 
     width_px: int
@@ -125,7 +126,11 @@ class Camera:
 
     @classmethod
     def from_fov(cls, width_px: int, height_px: int, fov_deg: float) -> Camera:
-        """An ideal nadir camera from its horizontal field of view: f = W / (2 tan(fov / 2))."""
+        """An ideal nadir camera from its horizontal field of view: f = W / (2 tan(fov / 2)).
+
+        Raises:
+            CalibrationError: the field of view is not between 0 and 180 degrees, or the size is not positive.
+        """
         if not 0.0 < fov_deg < 180.0:
             raise CalibrationError(f"fov_deg: expected above 0 and below 180, got {fov_deg}")
         focal = width_px / (2.0 * np.tan(np.radians(fov_deg) / 2.0))

@@ -66,10 +66,10 @@ def sift(
         upright: Use ``up_deg`` as every angle instead of the dominant gradient's; faster, for a known heading.
         up_deg: From +x towards +y; the angles of two pictures must differ by the rotation between them.
         mask: (B, 1, H, W) bool, True where keypoints are allowed.
-        upsample: Samples per image pixel of the first octave: 1, or 2. The scales are the same. kornia's: 2.
+        upsample: Samples per image pixel of the first octave: 1 or 2, kornia only 2. No scale depends on it.
         contrast_threshold: Lowe's, as OpenCV counts it: a keypoint's DoG is at least a third of it.
-        spread: Cells along each side of the image; keypoints beyond a cell's double share rank after all others. 1
-            ranks by strength alone: contrast times the square root of scale.
+        spread: Cells along each side of the image; of each cell, keypoints beyond twice its even share rank last.
+            1 ranks by strength alone: contrast times the square root of scale.
 
     Returns:
         Features as arrays or tensors, as the images are, on their device; no value is NaN.

@@ -36,16 +36,18 @@ _DOUBLE = ("float64", "int32")  # float32 would round these
 def ncc(search: Given, templates: Given, *, zero_mean: bool = True) -> Given:
     """Scores in [-1, 1]: normalised cross-correlation of templates with every position in a window.
 
-    All arguments are tensors, or all are arrays. On the CPU torch is used only for float64.
+    All arguments are tensors, or all are arrays. On the CPU torch is used only for float64 and int32.
 
     Args:
         search: (B, H, W), any of uint8, int16, uint16, int32, float16, float32, float64.
         templates: (B, T, h, w) with h <= H and w <= W, on the same device.
-        zero_mean: subtract the means (OpenCV's ``TM_CCOEFF_NORMED``); False is equation 1 (``TM_CCORR_NORMED``).
+        zero_mean: subtract the means (OpenCV's ``TM_CCOEFF_NORMED``); False is the paper's equation 1 as it
+            stands (``TM_CCORR_NORMED``).
 
     Returns:
-        (B, T, H-h+1, W-w+1), float64 if either input is float64, else float32. A perfect match scores 1, an
-        inverted one -1; if patch or template is flat the score is 0, never NaN.
+        (B, T, H-h+1, W-w+1), float64 if either input is float64, else float32. A perfect match scores 1; with
+        ``zero_mean`` an inverted one -1 and a flat patch or template 0, without it one that is 0 throughout.
+        Never NaN.
 
     Raises:
         ShapeError: the shapes do not fit each other.

@@ -28,7 +28,10 @@ class PoseOptions:
     Attributes:
         reprojection_px: Largest reprojection distance of an inlier.
         distinct_px: Matches nearer to each other than this count once: they see the same pixels. In pixels of the
-            picture whose matches vote, and of the frame if nothing was voted for.
+            frame as it was matched, rectified if its height and heading are known.
+
+    Raises:
+        OptionError: a value is out of range.
     """
 
     reprojection_px: float = 3.0
@@ -39,7 +42,7 @@ class PoseOptions:
 
     @property
     def min_spread_px(self) -> float:
-        """Smallest standard deviation of inliers in any direction: what one sees spreads as much by itself."""
+        """Least standard deviation of inliers in any direction: that of ``distinct_px`` evenly covered."""
         return self.distinct_px / math.sqrt(12.0)
 
 
@@ -51,6 +54,9 @@ class NccOptions:
         exhaustive: score every place of the window at full resolution.
         refine: refine the pose densely after the peak.
         exclusion_m: rivals nearer than this are the peak itself.
+
+    Raises:
+        OptionError: a value is out of range.
     """
 
     exhaustive: bool = False
@@ -67,15 +73,15 @@ class SiftOptions:
 
     Attributes:
         scale: the frame is reduced to this before detection.
-        max_keypoints: features taken from a frame of usual size; the map's are as dense.
-        keypoints_per_px: features taken from a larger frame, per map pixel that it covers on its level.
+        max_keypoints: features of a frame, unless the next setting asks for more; the map's are as dense.
+        keypoints_per_px: features per pixel that the frame covers on the map's level.
         backend: computes the features of frame and map: "compiled" loops on the CPU, whatever the device, or
             "kornia" on the device; "auto" is "compiled".
         upsample: samples per pixel in the first octave of a frame that is drawn in the map's pixels. 2 locates
             small keypoints more exactly and takes three times as long. The map always has 2.
         tolerance_px: distance, in pixels of the map's level, within which a match agrees with the voted pose.
-        search_widely: if too little is found, search again without the heading and with heights that make up a
-            level of the map's pyramid either way: from half to double.
+        search_widely: if too little is found, search again without the heading, and with heights from half of the
+            telemetry's to double.
         max_height_m: the largest height to search if the height is unknown.
         matcher: replaces the features: it gets the reduced frame and the map's crop; its matches are lifted and
             solved for the pose like those of features.
@@ -83,6 +89,9 @@ class SiftOptions:
             errors; a few features alone hardly separate a tilt from a displacement.
         refine: refine the pose densely after PnP, if height, heading, tilt and surface are known.
         pose: settings of PnP and RANSAC.
+
+    Raises:
+        OptionError: a value is out of range.
     """
 
     scale: float = PAPER_SCALE
@@ -114,10 +123,13 @@ class LearnedOptions:
 
     Attributes:
         weights: files of LoFTR, or of LightGlue with DISK or ALIKED.
-        max_picture_px: most pixels that a frame covers on the map level it is matched on.
-        max_keypoints: most keypoints of a frame, and a quarter of those of a window; LoFTR has none.
+        max_picture_px: largest number of pixels that a frame covers on the map level it is matched on.
+        max_keypoints: largest number of keypoints of a frame; a window has up to four times as many, LoFTR none.
         max_window_px: a window with more pixels on its level is not searched.
         tolerance_px: replaces SIFT's; networks locate points less exactly.
+
+    Raises:
+        OptionError: a value is out of range.
     """
 
     weights: tuple[str, ...] = ()
@@ -143,6 +155,9 @@ class MatcherOptions:
         ncc: settings of the NCC method.
         sift: settings of the SIFT method.
         learned: settings of the learned method.
+
+    Raises:
+        OptionError: a value is out of range.
     """
 
     risk: float = RISK
@@ -170,16 +185,19 @@ class NavigatorOptions:
         default_interval_s: time between frames without a timestamp.
         gate: chi-square of two degrees of freedom, beyond which a fix contradicts a prediction.
         risk: allowed probability, by all evidence of the flight, that a fix is wrong.
-        lost_sigma_m: uncertainty of the prediction above which the whole map is searched as well.
-        memory_s: time in which the evidence of past fixes fades: however long a flight, matches that agree with
-            each other outweigh it.
-        attitude_lag_s: standard deviation of the attitude telemetry's delay before images have measured it.
+        lost_sigma_m: uncertainty of the prediction above which the whole map is searched instead, if it can be.
+        memory_s: time constant with which the evidence of past fixes fades, so that even late in a flight matches
+            that agree with each other can outweigh it.
+        attitude_lag_s: standard deviation of the delay of the attitude telemetry, until images measure it.
         attitude_jitter_s: standard deviation of one frame's delay about the mean delay, in attitude and position.
-        tilt_bias_deg: standard deviation of a lasting error in roll and in pitch before images have measured it.
+        tilt_bias_deg: standard deviation of a lasting error in roll and in pitch, until images measure it.
         heading_bias_deg: the same for the heading.
         healthy_s: age of the last fix up to which the navigator calls itself healthy.
         odometry: whether to measure motion from image to image for frames without a velocity; see
             ``docs/odometry.md``.
+
+    Raises:
+        OptionError: a value is out of range.
     """
 
     measured_velocity_sigma_mps: float = 0.5

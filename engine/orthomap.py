@@ -53,7 +53,7 @@ class OrthoMap(Georeference):
         levels: number of levels of the pyramid.
         open_file: opens the map's file again, such as for its colours; None for a map of arrays.
         georeference_sigma_m: georeferencing accuracy, one standard deviation per axis; None if unknown.
-        surface_datum: vertical system of a surface in metres above the sea, by its file; None if unknown.
+        surface_datum: vertical datum of the surface, as its file names it; None unless that is above the sea.
         slope_sigma_deg: slope accuracy of the surface under a frame, one standard deviation; None if unknown.
     """
 
@@ -106,7 +106,8 @@ class OrthoMap(Georeference):
             on_copy: called while a resampled copy is created.
 
         Raises:
-            MapError: a file cannot be read or has no georeference, or the surface does not overlap the map.
+            MapError: a file cannot be read, has no georeference or another than that given, or the surface does
+                not overlap the map.
             OptionError: an accuracy is not a number above 0.
         """
         opened = partial(open_source, path, bounds_deg=bounds_deg, bounds_crs=bounds_crs, crs=crs)
@@ -285,7 +286,7 @@ class OrthoMap(Georeference):
         return np.where(np.isnan(heights), self.ground_m, heights)
 
     def ground_at(self, xy_px: ArrayLike) -> float:
-        """Level of the bare ground at one pixel: of a plane with a fifth of the surface below it.
+        """Height of the bare ground at one pixel, on a plane about it that has a fifth of the surface below it.
 
         This puts it below roofs and crowns but, unlike a plain percentile, not below the middle of a slope.
 

@@ -30,7 +30,7 @@ SIGNIFICANCE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """Attitude of the body (forward-right-down), in aerospace order: yaw, then pitch, then roll.
+    """Attitude of the body (forward-right-down): turned by yaw first, then pitch, then roll.
 
     Convention:
         ``heading_deg`` clockwise from true north in [0, 360), or from grid north if a name says ``grid_``;
@@ -57,12 +57,12 @@ class Frame:
         timestamp_ns: capture time on the vehicle's clock, or None.
         height_agl_m: height above the ground, positive, or None if unknown.
         heading_deg: clockwise from true north, or None if unknown.
-        roll_deg: positive right side down; None is a wide guess about level.
-        pitch_deg: positive nose up; None is a wide guess about level.
+        roll_deg: positive right side down; None, if unknown, is level with a wide sigma.
+        pitch_deg: positive nose up; likewise.
         east_velocity_mps: velocity over ground, or None if unknown.
         north_velocity_mps: velocity over ground, or None if unknown.
-        height_sigma_m: standard deviation of the height; None takes the matcher's assumption, as for the next two.
-            How far heights and headings are searched follows from it.
+        height_sigma_m: standard deviation of the height. None, here and for the next two, takes the matcher's
+            assumption. Heights and headings are searched within three of these sigmas.
         heading_sigma_deg: standard deviation of the heading; with 180 any heading is possible.
         tilt_sigma_deg: standard deviation of roll and of pitch.
         velocity_sigma_mps: standard deviation of the velocity, per axis; None takes the navigator's assumption.
@@ -70,7 +70,8 @@ class Frame:
     Raises:
         ShapeError: the image is not (H, W) or (H, W, 3), or is empty.
         DtypeError: the image is not uint8.
-        TelemetryError: a number is not finite, or the height or a standard deviation is not positive.
+        TelemetryError: a number is not finite, the height or a standard deviation is not positive, or a standard
+            deviation is above :data:`MAX_SIGMA_M`.
     """
 
     image: NDArray[np.uint8] | Tensor
@@ -333,8 +334,8 @@ class Fix:
         window: the crop of the map that was searched.
         timings: milliseconds per stage.
         map_xy_px: the camera's nadir in map pixels (x, y).
-        stage: last stage within the budget: "coarse" at reduced resolution, "fine" at full, "refined" in all of
-            the pose, "verified" by both methods; "unconfirmed" if the picture does not confirm the attitude.
+        stage: last stage reached within the budget: "coarse" at reduced resolution, "fine" at full; "refined": the
+            whole pose was; "verified": NCC and SIFT agree; "unconfirmed": no picture confirms the attitude.
         confidence: probability in (0, 1) that the position is correct, see ``docs/integrity.md``; None if the
             method states none, as in the paper's profile.
         map_sigma_m: the georeference's part of ``covariance_m2``, one standard deviation per axis. All fixes on a

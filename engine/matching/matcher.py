@@ -65,7 +65,7 @@ class SceneMatcher:
         options: settings. The accuracy that the map states overrides theirs.
 
     Raises:
-        OptionError: the method is unknown.
+        OptionError: the method or the device has an unknown name, or "learned" has no weights.
         DeviceError: the device was requested by name and is missing.
     """
 
@@ -199,8 +199,8 @@ class SceneMatcher:
             frames: of the camera's resolution.
             priors: one per frame; None searches the whole map.
             budget: of each frame.
-            workers: most processes. None is one per core, or 1 if other Python threads run. A number always forks;
-                no other thread may then hold a lock that matching needs.
+            workers: largest number of processes. None is one per core, or 1 if other Python threads run. A number
+                above 1 may fork even then: no other thread may hold a lock that matching needs.
 
         Raises:
             OptionError: frames and priors differ in number, or this number of workers is impossible.
@@ -252,6 +252,7 @@ class SceneMatcher:
 
         Raises:
             OptionError: the matcher has no such method.
+            CalibrationError: the frame is not of the camera's resolution.
         """
         if method not in (None, self.method, *self._method.parts):
             known = ", ".join(self._method.parts or [self.method])

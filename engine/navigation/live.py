@@ -36,6 +36,9 @@ class LiveOptions:
         patience_ms: time beyond the deadline after which a worker counts as hanging and is replaced; also the
             pause after a navigator could not be created.
         realtime: how to schedule the worker and the watchdog; None leaves scheduling unchanged.
+
+    Raises:
+        OptionError: a wait is not positive, or is longer than a minute.
     """
 
     deadline_ms: float = 121.0
@@ -136,7 +139,7 @@ class Live:
             return Counts(**self._counts)
 
     def submit(self, frame: Frame, *, prior: Prior | None = None, captured_ns: int | None = None) -> None:
-        """Submit the newest frame; one still waiting is dropped. Blocks only as long as a lock is held.
+        """Submit the newest frame, and return at once; one that still waits is dropped.
 
         Args:
             frame: newer than every frame before it.
@@ -156,10 +159,10 @@ class Live:
             self._changed.notify_all()
 
     def restart(self, start: Prior) -> None:
-        """Match the next frame by a new navigator: this one follows a wrong track.
+        """Match the next frame with a new navigator, since the present one follows a wrong track.
 
         Args:
-            start: where it starts.
+            start: where the new one starts.
         """
         with self._changed:
             self._anew = start

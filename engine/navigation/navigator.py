@@ -139,7 +139,7 @@ class Navigator:
 
     @property
     def healthy(self) -> bool:
-        """Whether the position is based on a fix from the last ``healthy_s`` seconds."""
+        """Whether the flight is not lost, and the last fix was at most ``healthy_s`` old at the newest frame."""
         age_s = self.anchor_age_s
         return age_s is not None and age_s <= self._options.healthy_s and self._frames_lost == 0
 
@@ -150,7 +150,7 @@ class Navigator:
 
     @property
     def prediction(self) -> Prior | None:
-        """Dead reckoning at the newest frame with its uncertainty; None without a start or a fix."""
+        """Dead reckoning at the newest frame with its uncertainty; None before one, or without start and match."""
         if self._last is None:
             return None
         tracks, last = self._last.tracks, self._accepted

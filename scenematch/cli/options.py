@@ -3,7 +3,7 @@
 Options:
     surface: Surface model, a GeoTIFF of heights.
     correct: Correct the telemetry as check suggests: heading_offset_deg=3, roll_deg=-pitch_deg; repeatable.
-    start: Where the flight begins (default: the telemetry's first position, or anywhere on the map).
+    start: Where the flight begins; replaces the telemetry's positions (default: those, or anywhere on the map).
     method: auto: ncc, and sift where that leaves doubt (default).
     device: Device to compute on (default: auto).
     settings: Settings as `doctor --settings` lists them; repeatable.
@@ -18,6 +18,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -89,7 +90,7 @@ class CameraOptions:
     """The camera.
 
     Attributes:
-        camera: Calibration file (default: from the bag, the topic or EXIF).
+        camera: Calibration file (default: from the bag or EXIF).
         hfov_deg: Horizontal field of view, instead of --camera.
         mount: nadir (the picture's top towards the nose), nadir-right, nadir-tail, nadir-left, or forward-45.
     """
@@ -112,7 +113,8 @@ class FlightOptions(CameraOptions, MapOptions):
 
     Attributes:
         frames: Folder of pictures, a video, or a ROS bag.
-        telemetry: telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the video's .SRT, or EXIF).
+        telemetry: telemetry.csv, or a log: .BIN, .ulg, .SRT, bag (default: the bag's own, the .SRT beside the
+            video, or EXIF).
         truth: truth.csv, a log or photographs (default: truth.csv beside the telemetry).
     """
 
@@ -153,10 +155,11 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """Replace a command's parameters of the types above by their fields, one option each, and add ``--json``.
 
     The help of an option is its description in a docstring: under "Options" of the command, whose own help leaves
-    them out, under "Attributes" of the type, or for shared options under "Options" of this module.
+    them out, else under "Attributes" of the type, or for shared options under "Options" of this module.
     """
     hints = get_type_hints(command, include_extras=True)
     about, _, _ = (inspect.getdoc(command) or "").partition("Options:\n")
+    own = field_descriptions(command, "Options")
     groups: dict[str, type[Any]] = {
         name: kind for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)
     }
@@ -164,21 +167,19 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     for name, parameter in inspect.signature(command).parameters.items():
         kind, keyword = groups.get(name), inspect.Parameter.KEYWORD_ONLY
         if kind is None:
-            _describe(hints[name], field_descriptions(command, "Options").get(name) or _SHARED.get(name))
-            parameters.append(parameter.replace(kind=keyword, annotation=hints[name]))
+            described = _described(hints[name], own.get(name) or _SHARED.get(name))
+            parameters.append(parameter.replace(kind=keyword, annotation=described))
             continue
         types = get_type_hints(kind, include_extras=True)
-        described = _SHARED | {
-            n: text for owner in kind.__mro__[::-1] for n, text in field_descriptions(owner).items()
-        }
+        of_kind = {n: text for owner in kind.__mro__[::-1] for n, text in field_descriptions(owner).items()}
+        texts = _SHARED | of_kind | own
         for each in fields(kind):
-            _describe(types[each.name], described.get(each.name))
+            described = _described(types[each.name], texts.get(each.name))
             default = inspect.Parameter.empty if each.default is MISSING else each.default
-            parameters.append(inspect.Parameter(each.name, keyword, default=default, annotation=types[each.name]))
+            parameters.append(inspect.Parameter(each.name, keyword, default=default, annotation=described))
 
-    _describe(JsonOption, _SHARED["as_json"])
-    json = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=JsonOption)
-    parameters.append(json)
+    described = _described(JsonOption, _SHARED["as_json"])
+    parameters.append(inspect.Parameter("as_json", keyword, default=False, annotation=described))
 
     @wraps(command)
     def call(*, as_json: bool, **given: Any) -> None:
@@ -195,10 +196,14 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
-def _describe(hint: Any, text: str | None) -> None:
-    """Give an option or argument its help, unless it has one."""
-    for info in getattr(hint, "__metadata__", ()):
+def _described(hint: Any, text: str | None) -> Any:
+    """The type of an option or argument with this help, unless it has one; commands share the type."""
+    if not hasattr(hint, "__metadata__"):
+        return hint
+    infos = [copy(info) for info in hint.__metadata__]
+    for info in infos:
         info.help = info.help or text
+    return Annotated[hint.__origin__, *infos]
 
 
 def read_settings(texts: Sequence[str] | None) -> Settings:

@@ -89,21 +89,21 @@ class FetchSettings:
         around: "LAT,LON", the centre of the map, or a folder of photographs with positions.
         radius_m: half the side of the square to cover at least; None covers what the photographs show, plus 50 m.
         source: template of tiles with {z}, {x}, {y}, or the address of a WMS or WMTS.
-        gsd_m_per_px: as coarse as the map may be; of a WMS its pixels. None is 0.5, around photographs that were
-            taken from less than 150 m as much less.
+        gsd_m_per_px: coarsest ground sample distance; that of a WMS's picture. None is 0.5, or proportionally less
+            for photographs taken from less than 150 m.
         layer: of a service that has several.
         crs: of a service that offers several, EPSG:N.
         image_format: of a service that offers several, such as image/jpeg.
         tile_px: side of the tiles of a template.
-        map_sigma_m: georeferencing accuracy per axis, which the file states then.
-        attribution: whom to credit, which the file states then.
-        licence: what may be done with it, which the file states then.
+        map_sigma_m: georeferencing accuracy per axis, written into the file.
+        attribution: whom to credit, written into the file.
+        licence: what may be done with it, written into the file.
         surface: file or URL of heights, or a template with {lat} and {lon}.
         surface_datum: vertical datum of its heights, EPSG:N.
-        surface_slope_sigma_deg: slope accuracy over one frame, which the file states then.
-        max_tiles: as many as may be asked for.
+        surface_slope_sigma_deg: slope accuracy over one frame, written into the file.
+        max_tiles: most tiles to request.
         pause_ms: between requests.
-        timeout_s: without a byte.
+        timeout_s: longest wait for data.
         dry_run: only plan.
         force: whether the files may be there already.
     """

@@ -29,7 +29,7 @@ class BridgeFiles:
         map: the map with its surface.
         camera: the camera; taken from the recorded pictures if not given.
         frames: recorded pictures, a folder or a video, replayed in real time.
-        telemetry: telemetry.csv or a log that times the replay; None uses a video's own times.
+        telemetry: telemetry.csv or a log that times the replay; None uses a video's .SRT or own times, or EXIF.
         camera_source: number of a camera, URL of a stream, or ``exec:COMMAND`` that writes JPEG pictures.
         rate_hz: rate of pictures without timestamps; None is 10.
         every: replay every Nth picture, at its own time.

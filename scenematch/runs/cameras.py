@@ -23,7 +23,8 @@ class CameraInput:
     Attributes:
         camera: calibration of ROS, OpenCV or Kalibr, or a bag that has one.
         hfov_deg: horizontal field of view, instead of a calibration.
-        mount: a key of :data:`engine.camera.MOUNTS`; None uses the calibration's, else nadir.
+        mount: a key of :data:`engine.camera.MOUNTS`; None uses the calibration's, or nadir if that has none or
+            ``camera_pitch_deg`` is given.
         camera_pitch_deg: pitch of the optical axis, -90 looks straight down.
         scale_calibration: scale the calibration to pictures of another size but the same aspect ratio.
 

@@ -32,7 +32,7 @@ def diagnose_flight(
     Args:
         files: files of the flight.
         start: where it begins, "LAT,LON" or "LAT,LON,SIGMA_M"; None uses the telemetry's positions.
-        columns: the column names of telemetry.csv, by our names.
+        columns: telemetry.csv's own names of standard columns: ``{"height_agl_m": "alt"}``.
         inputs: the inputs, if :func:`scenematch.runs.inputs.open_inputs` has already read them.
         progress: receives progress and messages.
 

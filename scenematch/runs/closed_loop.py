@@ -51,7 +51,7 @@ class ClosedLoopSettings:
     Attributes:
         minutes: of flight.
         method: "auto", "ncc" or "sift".
-        fault: fault to inject: "none", "killed", "shifted" or "frozen".
+        fault: "none", or what happens in flight: engine "killed", map "shifted", or picture "frozen".
 
     Raises:
         OptionError: a word or a number is invalid.
@@ -93,6 +93,9 @@ def fly_closed_loop(
 
     Returns:
         The figures, as loop.json has them.
+
+    Raises:
+        OptionError, MapError: an argument or the map is invalid.
     """
     out, world, loop = Path(out), world or WorldSettings(), loop or ClosedLoopSettings()
     if world.camera_pitch_deg != NADIR_PITCH_DEG:

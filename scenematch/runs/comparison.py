@@ -17,7 +17,7 @@ from scenematch.runs.tracking import track
 
 TABLE = "table.json"
 DEFAULT_RUNS = ("ncc/paper", "ncc/engine", "sift/paper", "sift/engine")
-"""The default runs: the paper's Table I."""
+"""The default runs: both methods, each in both profiles, as in the paper's Table I."""
 
 
 def parse_runs(
@@ -77,6 +77,9 @@ def compare(
 
     Returns:
         The summaries by name, which ``table.json`` holds too.
+
+    Raises:
+        OptionError, TelemetryError, CalibrationError, MapError: an argument or a file is invalid.
     """
     out, runs = Path(out), parse_runs() if runs is None else runs
     check_folder(out, force)

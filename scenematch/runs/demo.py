@@ -34,6 +34,9 @@ def run_demo(
 
     Returns:
         The summaries by the name of their run, such as "ncc-paper".
+
+    Raises:
+        OptionError: an argument is invalid.
     """
     out = Path(out)
     check_folder(out, force)

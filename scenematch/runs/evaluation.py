@@ -35,7 +35,7 @@ def evaluate(
     Args:
         folder: folder of a finished run.
         truth: truth.csv, a log or a folder of photographs; None uses the run's own.
-        force: without another truth, allow the page to lose frames that no longer exist.
+        force: allow the page to lose pictures that no longer exist; not needed with another truth.
         progress: receives progress and messages.
 
     Returns:

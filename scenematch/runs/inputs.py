@@ -126,7 +126,7 @@ class FlightFiles:
         """The frames with their corrected telemetry.
 
         Args:
-            columns: the column names of telemetry.csv, by our names.
+            columns: telemetry.csv's own names of standard columns: ``{"height_agl_m": "alt"}``.
 
         Raises:
             OptionError: columns are named, but the telemetry is not a table.

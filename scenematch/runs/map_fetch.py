@@ -34,7 +34,7 @@ _MUCH_EMPTY = 0.5  # of a map: more is reported
 def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT) -> dict[str, Any]:
     """Fetch a map into one GeoTIFF, and a surface model beside it.
 
-    What has been fetched is kept beside the file until that is complete: the same call goes on later.
+    What has been fetched is kept beside the map until it is complete: the same call resumes.
 
     Args:
         settings: what, and how.
@@ -46,6 +46,7 @@ def fetch_map(settings: FetchSettings, out: StrPath, progress: Progress = SILENT
 
     Raises:
         OptionError: a setting is invalid, more tiles are needed than allowed, or a file already exists.
+        TelemetryError: the photographs state no positions.
         MapError: a server refuses, cannot be reached, or sends something else.
     """
     out = Path(out)

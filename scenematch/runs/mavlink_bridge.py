@@ -54,8 +54,8 @@ class MavlinkSettings(MavlinkOptions):
         firmware: firmware of the autopilot, "ardupilot" or "px4".
         message: message that carries the fixes; "" is the firmware's default.
         max_sigma_m: largest sigma of a fix that is sent.
-        set_origin: set the map's origin on an autopilot that has none.
-        origin_alt_m: height of that origin above sea level; None uses the map's ground.
+        set_origin: set an origin on an autopilot that has none: the start, else the map's centre.
+        origin_alt_m: height of that origin above sea level; None uses the ground there.
         use_velocity: use the autopilot's velocity between fixes.
         check_gnss: check the first fixes against the autopilot's GNSS receiver, if it has a fix.
         gps_id: number of the receiver that GPS_INPUT emulates; 0 is the autopilot's first.
@@ -84,7 +84,7 @@ class MavlinkSettings(MavlinkOptions):
     def origin(self, site: OrthoMap, start: Prior | None) -> NedOrigin | None:
         """The start of the flight, or the map's centre; None if no origin should be set.
 
-        Its height is the given one, the ground there, or else the map's mean ground.
+        Its height is the given one, else the ground there; at the map's centre the map's usual ground.
         """
         if not self.set_origin:
             return None
@@ -101,7 +101,8 @@ class BridgeSettings(TrackSettings):
     """Settings of a bridge: those of matching and navigation, and its own.
 
     Attributes:
-        deadline_ms: largest age of an answer; None uses the limit of the fixes' receiver.
+        deadline_ms: largest age of an answer; None is 250 for MAVLink, which ArduPilot takes at most, and 121 for
+            ROS.
         seconds: stop after this time; None stops when the pictures end.
         realtime: match with real-time priority and locked memory (Linux).
         nice: with realtime, a nice value, -20 to -1, instead of SCHED_FIFO.

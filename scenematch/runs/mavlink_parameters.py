@@ -33,6 +33,10 @@ def write_parameter_file(
         link: what is sent to the autopilot.
         settings: of the file; None uses the defaults.
         force: whether the file may already exist.
+
+    Raises:
+        OptionError: a setting is invalid, or the file exists and ``force`` was not given.
+        BackendError: pymavlink is not installed.
     """
     require("pymavlink", "mavlink")
     out, settings = Path(out), settings or ParameterSettings()

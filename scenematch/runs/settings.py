@@ -39,7 +39,7 @@ class TrackSettings(MatcherOptions):
         profile: "engine", or "paper" for the baseline, the paper's own recipe.
         device: "auto", "cpu" or "cuda".
         start: where the flight begins, "LAT,LON" or "LAT,LON,SIGMA_M" in degrees and metres; none uses the
-            telemetry's first position, or searches the whole map if there is none.
+            telemetry's positions, or searches the whole map if it has none.
         budget_ms: longest time per frame, later answers are refused; none sets no limit.
         risk: largest acceptable probability of a wrong fix.
         errors: assumed errors of the telemetry, the map and the ground, if these state none.

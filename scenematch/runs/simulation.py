@@ -124,6 +124,9 @@ def simulate(
 
     Returns:
         Facts about the flight.
+
+    Raises:
+        OptionError, MapError: an argument or the map is invalid.
     """
     out, world = Path(out), world or WorldSettings()
     check_folder(out, force)

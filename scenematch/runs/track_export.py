@@ -28,7 +28,7 @@ def export_track(
     Args:
         folder: folder of a finished run.
         kind: one of :data:`scenematch.files.export.WRITERS`.
-        out: the file; ``track.KIND`` in the folder where None, or ``truth.KIND``.
+        out: the file; None is ``track.KIND`` in the folder or, with ``truth``, ``truth.KIND``.
         truth: write this instead, at the times of the fixes and about the track's origin.
         force: whether the file may already exist.
 

@@ -46,14 +46,14 @@ def track(
 ) -> dict[str, Any]:
     """Track a flight and write the output folder.
 
-    All errors in the input are found before the output folder is created.
+    The inputs are checked before the output folder is created; of a video only the first picture is.
 
     Args:
         files: files of the flight.
         out: the folder, created by this run.
         settings: of the run; None uses the defaults.
         force: whether the folder may already exist.
-        report: whether to draw the page; :func:`scenematch.runs.evaluation.evaluate` draws them later.
+        report: whether to draw the page; :func:`scenematch.runs.evaluation.evaluate` can draw it later.
         diagnosis: whether to check the inputs if few frames were fixed.
         live_view: where to send the live view.
         inputs: the inputs, if :func:`scenematch.runs.inputs.open_inputs` has already read them.

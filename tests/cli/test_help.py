@@ -45,3 +45,17 @@ def test_completion_loads_nothing_that_only_work_needs():
     printed = done_by(program, env=os.environ | asked).stdout
     assert printed.split("HEAVY")[0].split() == ["mavlink"]
     assert printed.endswith("HEAVY []\n")
+
+
+@pytest.mark.parametrize(
+    ("command", "start"),
+    [
+        ("track", "Where the flight begins; replaces the telemetry's positions"),
+        ("locate", "Where to search (default: the whole map)."),
+        ("bridge mavlink", "Where the flight begins (default: the last fix of an earlier bridge"),
+        ("bridge ros", "Where the flight begins (default: anywhere on the map)."),
+    ],
+)
+def test_a_command_says_what_an_option_that_others_share_does_there(command, start, capsys):
+    run([*command.split(), "--help"])
+    assert f"--start LAT,LON[,SIGMA_M] {start}" in " ".join(capsys.readouterr().out.split())

@@ -43,7 +43,7 @@ class PictureOptions(options.CameraOptions):
 
     Attributes:
         frames: Recorded pictures, replayed in real time.
-        telemetry: telemetry.csv that times the replay (default: the video's own timestamps).
+        telemetry: telemetry.csv or a log that times the replay (default: .SRT, EXIF or the video's own times).
         camera_source: A camera, a stream, or a command that writes JPEGs.
     """
 
@@ -101,6 +101,9 @@ def mavlink(
         out: Write the autopilot's parameters for these fixes, then exit.
         measure_delay: Measure the camera's latency, then exit.
         supervise: Keep a loaded standby process that takes over if the worker dies.
+        camera: Calibration file, or use --hfov-deg (default, with --frames: from EXIF).
+        start: Where the flight begins (default: the last fix of an earlier bridge, or anywhere on the map).
+        force: Replace an existing parameter file.
     """
     given = options.read_settings(settings)
     if out is None and connect is None:
@@ -172,6 +175,8 @@ def ros(
         version: rospy or rclpy.
         image: Image topic, raw or compressed; set other topics by --settings ros.topics.imu=NAME.
         firmware: Autopilot behind MAVROS that receives the poses (default: none).
+        camera: Calibration file (default: from the topic of the camera's calibration).
+        start: Where the flight begins (default: anywhere on the map).
     """
     from dataclasses import replace
 

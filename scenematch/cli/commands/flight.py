@@ -22,8 +22,8 @@ def check(
 ) -> None:
     """Find errors in a flight's inputs.
 
-    Locates a few pictures on the map without using the telemetry, then reports which change of unit, sign, offset,
-    mount, focal length or clock would make the telemetry agree with them. Takes the same files as track.
+    Locates a few pictures on the map, relying on the telemetry as little as possible, then reports which change of
+    unit, sign, offset, mount, focal length or clock would make it agree with them. Takes the same files as track.
     """
     from scenematch.runs.checking import as_rows, diagnose_flight
 
@@ -53,8 +53,8 @@ def track(
 ) -> None:
     """Track a flight; write track.csv and a report.
 
-    Writes track.csv (one row per frame), summary.json and report.html into the output folder. Without --start the
-    flight begins at the telemetry's first position, or anywhere on the map if it has none.
+    Writes track.csv (one row per frame), summary.json and report.html into the output folder. Without --start each
+    frame is searched about the position in its telemetry; if there is none, the flight may begin anywhere.
 
     Options:
         profile: paper: the paper's own recipe for ncc or sift (default: engine).
@@ -86,7 +86,7 @@ def compare(
     --settings applies to all runs; a run's own file takes precedence.
 
     Options:
-        runs: One run; repeat for more (default: the paper's Table I).
+        runs: One run; repeat for more (default: ncc and sift, each in both profiles).
     """
     from scenematch.runs.comparison import compare as compare_runs
     from scenematch.runs.comparison import parse_runs
@@ -117,8 +117,9 @@ def evaluate(
 
     Options:
         runs: Output folders of track.
-        truth: truth.csv, log or photographs (default: the one that track used).
+        truth: truth.csv, log or photographs, for one run (default: the one that track used).
         out: Page that compares several runs (default: comparison.html).
+        force: Replace an existing page; for one run, let its report lose pictures that no longer exist.
     """
     from scenematch.runs.evaluation import evaluate as evaluate_track
     from scenematch.runs.evaluation import report
@@ -150,7 +151,7 @@ def export(
     Options:
         directory: Output folder of track.
         kind: What is written.
-        out: File to write (default: track.FORMAT in DIR).
+        out: File to write (default: in DIR, track.FORMAT or, with --truth, truth.FORMAT).
         truth: Export this reference at the times of the fixes instead of the track.
     """
     from scenematch.runs.track_export import export_track

@@ -38,6 +38,8 @@ def locate(
         heading_deg: Degrees clockwise from true north.
         roll_deg: Degrees, right side down.
         pitch_deg: Degrees, nose up.
+        start: Where to search (default: the whole map).
+        camera: Calibration file (default: from EXIF).
     """
     from engine.values import Fix
     from scenematch.files.track import looks_text

@@ -86,10 +86,10 @@ class WantedMap:
     Attributes:
         around: Centre of the map, or a folder of photographs with positions.
         source: Tiles as https://host/{z}/{x}/{y}.png, a WMS or a WMTS.
-        radius_m: Minimum distance from the centre to each edge (default: what the photographs cover).
+        radius_m: Least distance from the centre to each edge (for photographs by default what they cover).
         gsd_m_per_px: Coarsest resolution (default: 0.5, or what the photographs need).
         layer: Layer, if a WMS or WMTS has several.
-        surface: Surface model to fetch too; {lat} and {lon} become N48 and E016.
+        surface: Surface model to fetch too; {lat} and {lon} stand for each degree, such as N48 and E016.
     """
 
     around: Annotated[str, option("--around", "LAT,LON|DIR")]

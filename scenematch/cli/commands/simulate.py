@@ -66,7 +66,7 @@ class LoopOptions:
         closed_loop: Steer by the engine's fixes, with GPS off.
         minutes: With --closed-loop: minutes to fly (default: 5).
         method: With --closed-loop: matching method (default: auto).
-        fault: With --closed-loop: fault to inject.
+        fault: With --closed-loop: engine killed, map shifted, or picture frozen.
     """
 
     closed_loop: Annotated[bool, flag("--closed-loop")] = False
