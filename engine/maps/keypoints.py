@@ -16,7 +16,7 @@ from engine.learned.keypoints import Keypoints
 from engine.learned.matchers import KeypointMatcher
 from engine.maps.landmarks import MAX_LANDMARKS, as_picture
 from engine.maps.recently_used import RecentlyUsed
-from engine.maps.tiles import HALO_PX, tiles_under, widened
+from engine.maps.tiles import HALO_PX, RIM_PX, tiles_under, widened
 from engine.runtime.device import CPU, as_tensor, on_host
 from engine.runtime.tensors import torch
 from engine.values import Window
@@ -28,7 +28,6 @@ TILE_PX = 512
 """Tiles begin on multiples of this in every level."""
 PX_PER_KEYPOINT = 64
 """A tile has at most one keypoint per this many pixels."""
-_NODATA_PX = 5  # a keypoint this near to a pixel without data may be its edge
 
 
 class KeypointMap:
@@ -81,7 +80,7 @@ class KeypointMap:
 
     def _on_data(self, found: Keypoints, wide: Window, level: int) -> torch.Tensor:
         """Which keypoints (N,) of a window lie on the map's data and not at its edge."""
-        near = np.ones((2 * _NODATA_PX + 1, 2 * _NODATA_PX + 1), np.uint8)
+        near = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)
         solid = cv2.erode(self._site.valid(wide, level).astype(np.uint8), near) > 0
         x, y = np.clip(on_host(found.xy_px.round().long()), 0, [wide.width_px - 1, wide.height_px - 1]).T
         return torch.from_numpy(solid[y, x]).to(found.xy_px.device)

@@ -10,6 +10,8 @@ TILE_PX = 256
 """Side of the tiles of a level in which it is prepared, described and sampled, and of those of a surface."""
 WHOLE_LEVEL_PX = 8 << 20
 """Levels of at most this many pixels are prepared and sampled as a whole; also the largest picture or window."""
+RIM_PX = 5
+"""Pixels so near to where a picture or the map shows nothing are left out: their gradients are of that edge."""
 HALO_PX = 64
 """Margin around a tile that is read for description; the descriptor of nearly every keypoint ends within it."""
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from engine.camera import SIDE_STEPS, Camera
 from engine.geo import inverse_2x2
 from engine.kernels.between_nodes import places_between_nodes
-from engine.maps.tiles import WHOLE_LEVEL_PX
+from engine.maps.tiles import RIM_PX, WHOLE_LEVEL_PX
 from engine.values import Attitude, Frame
 
 Array = NDArray[np.float64]
@@ -205,8 +205,6 @@ SIDE_STEP_PX = 16
 """Least side of an orthorectified frame, and its step: a flight uses few sizes, and lays out none in the air."""
 MAX_PICTURE_PX = WHOLE_LEVEL_PX
 """Most pixels of one; if it would need more, the height is out of proportion to the map."""
-RIM_PX = 5
-"""Margin left out inside an orthorectified frame's edge, whose gradients are not the ground's."""
 _RIM = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
 
 Relief = Callable[[Array], Array]

@@ -12,7 +12,7 @@ from engine.learned.matchers import KeypointMatcher
 from engine.learned.pairs import PairMatcher
 from engine.maps.keypoints import KeypointMap
 from engine.maps.landmarks import as_picture
-from engine.matching.align import RIM_PX
+from engine.maps.tiles import RIM_PX
 from engine.matching.query import Query
 from engine.matching.views import MapView
 from engine.options import LearnedOptions

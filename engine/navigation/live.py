@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import logging
 import math
+import operator
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 
 from engine.budget import Budget
@@ -70,11 +71,15 @@ class Answer:
 class Counts:
     """Counts of frames: submitted = answered + dropped + at most one waiting and one in work."""
 
-    submitted: int = 0
-    dropped: int = 0
-    answered: int = 0
-    late: int = 0
-    workers_replaced: int = 0
+    submitted: int
+    dropped: int
+    answered: int
+    late: int
+    workers_replaced: int
+
+    def __add__(self, other: Counts) -> Counts:
+        """Those of two pipelines together."""
+        return Counts(*map(operator.add, astuple(self), astuple(other)))
 
 
 @dataclass(slots=True, eq=False)

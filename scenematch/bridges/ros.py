@@ -133,7 +133,7 @@ class RosBridge:
         self._last_image_s = time.monotonic()
         self._fixes = self._unusable = self._restarts = 0
         self._refused: Counter[str] = Counter()
-        self._counts_before = Counts()  # of replaced pipelines
+        self._counts_before: Counts | None = None  # of replaced pipelines
 
     def close(self) -> None:
         """Answer the frame in progress and stop."""
@@ -144,7 +144,7 @@ class RosBridge:
     def status(self) -> RosStatus:
         """Counters since the bridge was created."""
         now, before = self._live.counts, self._counts_before
-        counts = Counts(**{name: getattr(now, name) + getattr(before, name) for name in Counts.__slots__})
+        counts = now if before is None else before + now
         return RosStatus(counts, self._fixes, dict(self._refused), self._unusable, self._restarts)
 
     def handlers(self, topics: RosTopics) -> dict[str, tuple[str, Handler]]:
