@@ -56,6 +56,7 @@ DRIFTS = (
     Fault("fixes not used", 150.0, 12.0),
 )
 _AFTER_S = 30.0  # from the last fault to the end
+_GPS_EPOCH_S, _WEEK_S, _FIX_3D = 315_964_800 - 18, 604_800, 3  # since 1970, less the leap seconds
 Track = NDArray[np.float64]
 """(N, 3 or 4) seconds since the simulator's start, metres east and north, and when a fix came."""
 
@@ -64,9 +65,14 @@ def sitl_bridge(
     folder: Path, port: int, method: str, message: str, *, realtime: bool, firmware: str = "ardupilot"
 ) -> Bridge:
     """The bridge with the camera over the town."""
-    settings = [f"input.exposure_to_grab_ms={DELAY_MS}", *["bridge.realtime=true"] * realtime]
+    settings = [f"input.exposure_to_grab_ms={DELAY_MS}", *["bridge.realtime=true"] * realtime, *_receiver(message)]
     more = [word for setting in settings for word in ("--settings", setting)] + ["--firmware", firmware]
     return Bridge(folder, port, method, message, f"exec:cat {folder / 'camera'}", more)
+
+
+def _receiver(message: str) -> list[str]:
+    """The setting for fixes that pose as a second receiver, which is used once the first is off."""
+    return ["mavlink.gps_id=1"] if message == "gps_input" else []
 
 
 class LoggedPilot(Pilot):
@@ -75,11 +81,14 @@ class LoggedPilot(Pilot):
     def __init__(self, link: Any, place: LocalFrame) -> None:
         super().__init__(link, place)
         self.times_s: list[tuple[float, float]] = []  # of this machine's monotonic clock, and the simulator's
+        self.began_s = 0.0  # the simulator's start, since 1970 by its own clock
 
     def take(self, message: Any) -> None:
         """Note what a message says, and when."""
         if message.get_type() == "GLOBAL_POSITION_INT":
             self.times_s.append((time.monotonic(), message.time_boot_ms * 1e-3))
+        elif message.get_type() == "SYSTEM_TIME":
+            self.began_s = message.time_unix_usec * 1e-6 - message.time_boot_ms * 1e-3
         super().take(message)
 
 
@@ -95,7 +104,8 @@ def simulator(
     os.mkfifo(pipe)
     for log in (run / "logs").glob("*.BIN"):
         log.unlink()
-    settings = ["parameters.takeoff=gnss", f"mavlink.message={message}", "parameters.delay_ms=100"]
+    sent = [f"mavlink.message={message}", *_receiver(message)]
+    settings = ["parameters.takeoff=gnss", "parameters.delay_ms=100", *sent]
     command = [sys.executable, "-m", "scenematch", "bridge", "mavlink", "--force"]
     written = [part for setting in settings for part in ("--settings", setting)]
     subprocess.run([*command, *written, "--write-params", str(run / "scenematch.param")], check=True)
@@ -121,14 +131,22 @@ def launch(world: contextlib.ExitStack, command: Sequence[object], **how: Any) -
     world.callback(process.kill)
 
 
-def fly(pilot: LoggedPilot, motion: Motion, duration_s: float, bridge: Bridge, faults: tuple[Fault, ...]) -> float:
+def fly(
+    pilot: LoggedPilot,
+    motion: Motion,
+    duration_s: float,
+    bridge: Bridge,
+    faults: tuple[Fault, ...],
+    message: str,
+) -> float:
     """Fly the course over and over; enter GUIDED again where a failsafe took over.
 
     Returns:
         The simulator's time at which the receiver was switched off.
     """
     climb(pilot, motion(0.0).height_m)
-    pilot.select(is_fixes=True)
+    if not _receiver(message):
+        pilot.select(is_fixes=True)
     pilot.listen(10.0)
     pilot.link.param_set_send("SIM_GPS1_ENABLE", 0.0)
     pilot.part, asked_s = "course", 0.0
@@ -165,20 +183,26 @@ def read_log(log: Path, pilot: LoggedPilot) -> tuple[Track, Track, Track]:
     place, (here_s, there_s) = pilot.place, np.array(pilot.times_s).T
     lead_s = sliding_window_view(np.pad(there_s - here_s, 50, mode="edge"), 101).max(axis=1)  # of the quickest
     reader = mavutil.mavlink_connection(str(log))
-    tracks: dict[str, list[tuple[float, ...]]] = {"SIM": [], "POS": [], "VISP": []}
+    tracks: dict[str, list[tuple[float, ...]]] = {"SIM": [], "POS": [], "fixes": []}
     origin = place
-    while (row := reader.recv_match(type=["SIM", "POS", "VISP", "ORGN"])) is not None:
+    while (row := reader.recv_match(type=["SIM", "POS", "VISP", "GPS", "ORGN"])) is not None:
         kind = row.get_type()
         if kind == "ORGN":
             origin = LocalFrame(row.Lat, row.Lng) if row.Type == 0 else origin
-        elif kind == "VISP" and not row.Ign:  # without a position it says only that the camera works
-            lat_deg, lon_deg = origin.geodetic_from_enu(row.PY, row.PX)
-            captured_s = row.RTimeUS * 1e-6
-            captured_s += float(np.interp(captured_s, here_s, lead_s))
-            tracks[kind].append((captured_s, *place.enu_from_geodetic(lat_deg, lon_deg)[:2], row.TimeUS * 1e-6))
-        elif kind != "VISP":
+        elif kind in tracks:
             tracks[kind].append((row.TimeUS * 1e-6, *place.enu_from_geodetic(row.Lat, row.Lng)[:2]))
-    widths = {"SIM": 3, "POS": 3, "VISP": 4}
+        elif (kind == "VISP" and row.Ign) or (kind == "GPS" and not (row.I == 1 and row.Status >= _FIX_3D)):
+            continue  # without a position it says only that the camera works; the first receiver is a real one
+        else:
+            if kind == "VISP":
+                captured_s, (lat_deg, lon_deg) = row.RTimeUS * 1e-6, origin.geodetic_from_enu(row.PY, row.PX)
+                captured_s += float(np.interp(captured_s, here_s, lead_s))
+            else:
+                captured_s = _GPS_EPOCH_S + row.GWk * _WEEK_S + row.GMS * 1e-3 - pilot.began_s
+                lat_deg, lon_deg = row.Lat, row.Lng
+            east_north = place.enu_from_geodetic(lat_deg, lon_deg)[:2]
+            tracks["fixes"].append((captured_s, *east_north, row.TimeUS * 1e-6))
+    widths = {"SIM": 3, "POS": 3, "fixes": 4}
     return tuple(np.array(tracks[kind]).reshape(-1, n) for kind, n in widths.items())  # type: ignore[return-value]
 
 
@@ -271,7 +295,7 @@ def main() -> None:
             with simulator(*world) as logs, contextlib.closing(mavutil.mavlink_connection(_PILOT_AT)) as link:
                 link.wait_heartbeat()
                 pilot = LoggedPilot(link, place)
-                begin_s = fly(pilot, motion, seconds, bridge, faults)
+                begin_s = fly(pilot, motion, seconds, bridge, faults, arguments.message)
                 pilot.listen(2.0)
             what = f"{arguments.method}, {arguments.message}, wind {arguments.wind_mps:g} m/s"
             print(f"{what}, {conditions(before)}\n")

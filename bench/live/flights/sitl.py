@@ -17,7 +17,11 @@ from bench.live.standin import State
 from engine.geo import LocalFrame
 
 Motion = Callable[[float], State]
-RATES_HZ = {mavlink.MAVLINK_MSG_ID_SIM_STATE: 25, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 25}
+RATES_HZ = {
+    mavlink.MAVLINK_MSG_ID_SIM_STATE: 25,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 25,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1,
+}
 _PATIENCE_S = 240.0  # to arm, and to climb
 _LANDING_S = 600.0  # that a vehicle may take to come home and down by itself
 _IGNORED = 0x9C0  # of POSITION_TARGET_TYPEMASK: the accelerations and the yaw's rate
