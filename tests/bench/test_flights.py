@@ -7,14 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from engine.errors import TelemetryError
-from engine.geo import LocalFrame
-from tests.support.subtitles import write_subtitles
-from tests.support.videos import write_video
-
-pytest.importorskip("pymavlink", reason="pymavlink is not installed")
-
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from bench.live.flights import arducopter, fly, sitl
@@ -23,6 +15,10 @@ from bench.live.flights.recorded import captured_s, off_m, recorded
 from bench.live.flights.sitl import Pilot
 from bench.live.flights.video_camera import SIZE, Footage, ground_from_pixel, recorded_from_shown
 from bench.live.standin import State
+from engine.geo import LocalFrame
+from tests.support.refusals import refusal
+from tests.support.subtitles import write_subtitles
+from tests.support.videos import write_video
 
 PLACE = LocalFrame(33.64, 72.99)
 
@@ -179,8 +175,9 @@ def test_it_flies_the_positions_and_the_velocity_of_the_subtitles(tmp_path):
 
 
 def test_subtitles_without_a_heading_are_refused(tmp_path):
-    with pytest.raises(TelemetryError, match="expected subtitles beside it with position, rel_alt and gimbal"):
-        recorded(video(tmp_path, ""))
+    assert "expected subtitles beside it with position, rel_alt and gimbal" in refusal(
+        recorded, video(tmp_path, "")
+    )
 
 
 # --------------------------------------------------------------------------------------- the camera that shows one

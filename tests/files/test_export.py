@@ -7,7 +7,9 @@ import warnings
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
+import gpxpy
 import numpy as np
+import pyogrio
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -51,7 +53,6 @@ def test_the_180th_meridian_ends_a_segment_and_longitudes_stay_on_their_circle()
 
 
 def test_gpx_has_a_segment_a_run_with_places_times_and_heights_in_the_order_of_the_schema():
-    gpxpy = pytest.importorskip("gpxpy", reason="gpxpy is not installed")
     rows = [replace(row, alt_amsl_m=170.0 + 0.125 * k) if row.fixed else row for k, row in enumerate(ROWS)]
     text, begin = export.to_gpx(rows), datetime.datetime.fromtimestamp(T0 / 1e9, datetime.UTC)
     (track,) = gpxpy.parse(text).tracks
@@ -68,10 +69,8 @@ def test_gpx_has_a_segment_a_run_with_places_times_and_heights_in_the_order_of_t
     assert [child.tag.removeprefix(GPX) for child in segment[0]] == ["ele", "time", "name"]
 
 
-def test_gdal_opens_geojson_with_lines_of_two_points_or_more_and_every_fix_with_its_sigma(tmp_path):
-    pyogrio = pytest.importorskip("pyogrio", reason="pyogrio is not installed")
-    path = tmp_path / "track.geojson"
-    path.write_text(export.to_geojson(ROWS), encoding="utf-8")
+def test_gdal_opens_geojson_with_lines_of_two_points_or_more_and_every_fix_with_its_sigma(save):
+    path = save(export.to_geojson(ROWS), "track.geojson")
     with warnings.catch_warnings():  # pyogrio's own, of NumPy 2.5
         warnings.filterwarnings("ignore", "The 'generic' unit for NumPy timedelta", DeprecationWarning)
         facts, _, geometries, values = pyogrio.raw.read(path)

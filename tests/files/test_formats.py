@@ -325,10 +325,9 @@ def test_a_row_that_names_no_picture_is_refused_before_the_flight(folder, save):
 
 
 @pytest.mark.parametrize("name", ["flight.ts", "flight.klv", "GX010001.MP4"])
-def test_metadata_in_a_video_is_refused_with_the_way_out(folder, tmp_path, name):
+def test_metadata_in_a_video_is_refused_with_the_way_out(folder, save, name):
     """The first bytes are those of a transport stream and of a UAS data link's packet (MISB ST 0601)."""
-    path = tmp_path / name
-    path.write_bytes(b"\x47\x40\x11" + bytes.fromhex("060e2b34020b01010e01030101000000"))
+    path = save(b"\x47\x40\x11" + bytes.fromhex("060e2b34020b01010e01030101000000"), name)
     message = refusal(open_flight, folder, path)
     assert message.startswith(f"{path}: expected a table or a flight log, got a video's metadata")
     assert "convert it to a .SRT" in message

@@ -85,10 +85,8 @@ def test_dates_without_a_zone_are_utc_and_said(tmp_path):
         ("2016-12-31T23:59:60.5Z", 1_483_228_800_500_000_000),  # a leap second
     ],
 )
-def test_a_date_to_the_nanosecond(tmp_path, text, ns):
-    path = tmp_path / "t.csv"
-    path.write_text(f'timestamp_utc,frame\n"{text}",a.jpg\n', encoding="utf-8")
-    assert stamps(path) == [ns]
+def test_a_date_to_the_nanosecond(save, text, ns):
+    assert stamps(save(f'timestamp_utc,frame\n"{text}",a.jpg\n')) == [ns]
 
 
 REFUSED = {
@@ -124,10 +122,8 @@ def test_semicolons_and_decimal_commas(tmp_path, delimiter, mark):
     assert rows[1].frame == "1.jpg"
 
 
-def test_the_truth_is_on_the_same_clock(tmp_path):
-    path = tmp_path / "truth.csv"
-    path.write_text("timestamp_ns;lat_deg;lon_deg\n0;48,5;16,5\n500;48,5;16,5\n", encoding="utf-8")
-    rows = read_truth(path)
+def test_the_truth_is_on_the_same_clock(save):
+    rows = read_truth(save("timestamp_ns;lat_deg;lon_deg\n0;48,5;16,5\n500;48,5;16,5\n", "truth.csv"))
     assert [(row.timestamp_ns, row.lat_deg) for row in rows] == [(0, 48.5), (500_000_000, 48.5)]
 
 

@@ -1,16 +1,15 @@
 """compare: several runs over one flight, in one table and one chart."""
 
 import json
-import re
 from dataclasses import replace
 
 import pytest
 
-from engine import OptionError
 from scenematch import FlightFiles, TrackSettings, parse_runs, track
 from scenematch.cli.app import run
 from scenematch.files.track import read_track
 from tests.support.commands import file_options, refusal
+from tests.support.refusals import misuse
 
 
 def command(flight, out, *more):
@@ -43,24 +42,21 @@ def test_each_run_is_what_track_makes_of_it(flight, tmp_path, capsys):
     assert list(json.loads(capsys.readouterr().out)) == ["sift"]
 
 
-def test_nothing_is_flown_or_made_before_every_run_is_found_possible(flight, tmp_path, capsys):
+def test_nothing_is_flown_or_made_before_every_run_is_found_possible(flight, tmp_path, save, capsys):
     """The last run is refused: by what the telemetry lacks, by a place, by a file in its folder's place."""
     text = (flight / "telemetry.csv").read_text(encoding="utf-8").replace("heading_deg", "course_deg")
-    blind = tmp_path / "blind.csv"
-    blind.write_text(text, encoding="utf-8")
-    (tmp_path / "far.toml").write_text('method = "sift"\nstart = "0,0"\n', encoding="utf-8")
-    out = tmp_path / "out"
-    two = ["--run=sift", "--run=ncc"]
+    blind, far = save(text, "blind.csv"), save('method = "sift"\nstart = "0,0"\n', "far.toml")
+    out, two = tmp_path / "out", ["--run=sift", "--run=ncc"]
     line = refusal(capsys, [*command(flight, out, *two), f"--telemetry={blind}"], 1)
     assert "telemetry: ncc needs height_agl_m and heading_deg" in line
     head, *rows = text.splitlines()
     # A heading for the last frame alone.
     blind.write_text("\n".join([f"{head},heading_deg", *(f"{row}," for row in rows)]) + "10\n", encoding="utf-8")
-    assert run([*command(flight, out, *two, f"--run={tmp_path / 'far.toml'}"), f"--telemetry={blind}"]) == 2
+    assert run([*command(flight, out, *two, f"--run={far}"), f"--telemetry={blind}"]) == 2
     said = capsys.readouterr().err
     assert "5 of 6 frames lack heading_deg, so ncc will refuse them; sift and auto do not need it" in said
     assert "no such file" in refusal(capsys, [*command(flight, out, *two), f"--camera={flight / 'none.yaml'}"], 1)
-    line = refusal(capsys, command(flight, out, "--run=ncc", f"--run={tmp_path / 'far.toml'}"))
+    line = refusal(capsys, command(flight, out, "--run=ncc", f"--run={far}"))
     assert line.startswith("--start: expected a place on the map")
     assert not out.exists()
     out.mkdir()
@@ -95,12 +91,9 @@ def test_when_the_frames_of_a_log_were_taken_is_said_as_to_track(flight, tmp_pat
     ],
 )  # fmt: skip
 def test_a_run_that_cannot_be_is_refused(runs, message):
-    with pytest.raises(OptionError, match=f"^{re.escape(message)}$"):
-        parse_runs(runs)
+    assert misuse(parse_runs, runs) == message
 
 
-def test_what_the_command_line_gives_holds_for_every_run(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text("budget_ms = 40\n", encoding="utf-8")
-    runs = parse_runs(["ncc", str(path)], budget_ms=121.0, start=None)
+def test_what_the_command_line_gives_holds_for_every_run(save):
+    runs = parse_runs(["ncc", str(save("budget_ms = 40\n", "mine.toml"))], budget_ms=121.0, start=None)
     assert [settings.budget_ms for settings in runs.values()] == [121.0, 121.0]
