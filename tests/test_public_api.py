@@ -11,14 +11,6 @@ import engine
 from tests.support.interpreters import done_by
 from tests.support.paths import ROOT
 
-PUBLIC = [
-    "Answer", "AssumedErrors", "Attitude", "BackendError", "Budget", "CalibrationError", "Camera", "DeviceError",
-    "DtypeError", "EngineError", "Fix", "Frame", "LearnedOptions", "Live", "LiveOptions", "Look", "MapError",
-    "MatcherOptions", "MissingExtraError", "Navigator", "NavigatorOptions", "NavigatorState", "NccOptions",
-    "NoFix", "OptionError", "OrthoMap", "PoseOptions", "Prior", "Realtime", "Reason", "SceneMatcher", "ShapeError",
-    "SiftOptions", "StateError", "TelemetryError", "Timings", "Window", "features", "ncc_fft", "set_realtime",
-    "set_threads",
-]  # fmt: skip
 MODULES = {
     "scenematch.bridges.mavlink": "pymavlink", "scenematch.bridges.pictures": None, "scenematch.bridges.ros": None,
     "scenematch.bridges.ros1": None, "scenematch.bridges.ros2": None, "scenematch.bridges.vehicle": None,
@@ -66,8 +58,7 @@ def test_importing_the_engine_prints_nothing_and_its_names_load_what_they_use_al
     assert (fresh["rerun"], fresh["cuda"]) == (False, False)
 
 
-def test_the_public_names_are_these_and_there_is_nothing_else():
-    assert engine.__all__ == PUBLIC
+def test_there_is_nothing_but_the_public_names():
     assert dir(engine) == engine.__all__
     with pytest.raises(AttributeError, match="'engine' has no attribute 'Matcher'"):
         engine.Matcher  # noqa: B018
@@ -89,9 +80,7 @@ def test_a_public_module_has_what_it_promises(name):
 def engine_imports(path):
     """Module and name of every import of the engine in a Python file or in a page's Python blocks."""
     text = path.read_text(encoding="utf-8")
-    blocks = (
-        [text] if path.suffix == ".py" else re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    )
+    blocks = [text] if path.suffix == ".py" else re.findall(r"(?ms)^```python\n(.*?)^```", text)
     for block in blocks:
         for node in ast.walk(ast.parse(block)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
