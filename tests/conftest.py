@@ -18,7 +18,7 @@ from engine import Fix
 from scenematch.simulator import plan_flight
 from tests.support import towns
 from tests.support.paths import NO_SHARED, SHARED
-from tests.support.towns import drawn_flight, drawn_once, drawn_town, site_of
+from tests.support.towns import drawn_flight, drawn_town, site_of
 
 hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
 hypothesis.settings.load_profile("tests")
@@ -50,8 +50,8 @@ def _surroundings(tmp_path_factory):
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         # Who draws a town below the tests takes the one that was drawn before.
         for module in ("simulator", "simulator.flight", "runs.simulation"):
-            patch.setattr(f"scenematch.{module}.build_town", drawn_once)
-        patch.setattr("bench.inputs.scenes.build_town", drawn_once)
+            patch.setattr(f"scenematch.{module}.build_town", drawn_town)
+        patch.setattr("bench.inputs.scenes.build_town", drawn_town)
         yield
 
 

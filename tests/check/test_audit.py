@@ -19,8 +19,9 @@ from scenematch.check.self_match import measure_self_match
 from scenematch.cli.app import run
 from scenematch.files.geotiff import write_geotiff
 from scenematch.files.route import read_route
-from tests.support.commands import refusal
+from tests.support.commands import answer, refusal
 from tests.support.rasters import write_sparse
+from tests.support.refusals import misuse
 from tests.support.towns import drawn_town
 
 CAMERA, HEIGHT_M = Camera.from_fov(300, 300, 60.0), 75.0
@@ -77,8 +78,7 @@ def well_inside(found, x0, y0):
 
 
 def test_each_quarter_is_flagged_as_what_it_is(found):
-    quarters = ((HALF, 0, Flag.FLAT), (0, HALF, Flag.REPEATED), (HALF, HALF, Flag.NODATA))
-    for x0, y0, flag in quarters:
+    for x0, y0, flag in ((HALF, 0, Flag.FLAT), (0, HALF, Flag.REPEATED), (HALF, HALF, Flag.NODATA)):
         assert (found.flags[well_inside(found, x0, y0)] == flag).all(), flag.name
     town = well_inside(found, 0, 0)
     assert (found.flags[town] == Flag.GOOD).mean() > 0.7
@@ -106,8 +106,7 @@ def test_more_lead_and_more_score_never_make_a_fix_less_probable():
 
 @pytest.mark.slow
 def test_fine_random_texture_is_less_stable_than_a_town():
-    rng = np.random.default_rng(1)
-    leaves = np.clip(90 + 25 * rng.normal(size=(600, 600)), 0, 255).astype(np.uint8)
+    leaves = np.clip(90 + 25 * np.random.default_rng(1).normal(size=(600, 600)), 0, 255).astype(np.uint8)
     values = []
     for gray in (leaves, np.ascontiguousarray(town_gray()[:600, :600])):
         plan = plan_audit(OrthoMap.from_arrays(gray, GRID, UTM), CAMERA, HEIGHT_M)
@@ -122,15 +121,13 @@ def test_the_same_map_gives_the_same_audit(site, found):
 
 
 def test_a_large_map_gets_no_more_places_than_asked_for(site):
-    plan = plan_audit(site, CAMERA, 20.0, AuditOptions(max_cells=50))
-    assert len(plan) <= 70  # rounded up along both sides
+    assert len(plan_audit(site, CAMERA, 20.0, AuditOptions(max_cells=50))) <= 70  # rounded up along both sides
     assert len(plan_audit(site, CAMERA, 20.0)) > 500
 
 
 @pytest.mark.parametrize("height_m", [0.0, -5.0, float("nan"), float("inf"), 5000.0, 0.5])
 def test_a_height_that_cannot_be_is_refused(site, height_m):
-    with pytest.raises(OptionError, match="height_agl_m: expected"):
-        plan_audit(site, CAMERA, height_m)
+    assert "height_agl_m: expected" in misuse(plan_audit, site, CAMERA, height_m)
 
 
 # ---------------------------------------------------------------------------------------------------- routes
@@ -148,8 +145,7 @@ def test_a_route_over_the_town_is_better_than_one_over_water(site, found):
 
 
 def test_a_poor_stretch_begins_and_ends_where_the_water_does(site, found):
-    route = predict_route(found, *lat_lon(site, [[130, 225], [780, 225]]).T)
-    (stretch,) = route.stretches
+    (stretch,) = predict_route(found, *lat_lon(site, [[130, 225], [780, 225]]).T).stretches
     start = site.pixel_from_geodetic(stretch.start_lat_deg, stretch.start_lon_deg)
     assert abs(start[0] - HALF) < found.plan.view.footprint_px[0]
     assert start[1] == pytest.approx(225, abs=1)
@@ -159,26 +155,22 @@ def test_a_poor_stretch_begins_and_ends_where_the_water_does(site, found):
 
 def test_off_the_map_nothing_is_available(site, found):
     route = predict_route(found, *lat_lon(site, [[-3000, -3000], [-2000, -3000]]).T)
-    assert route.availability == 0.0
-    assert route.stretches[0].flag == "edge"
+    assert (route.availability, route.stretches[0].flag) == (0.0, "edge")
 
 
 @pytest.mark.slow
 def test_where_a_forward_camera_looks_counts_not_where_it_is(site):
     """A camera that is mounted 20 degrees ahead sees the water before it is over it, whichever way it flies."""
     turn = cv2.Rodrigues(np.array([0.0, np.radians(20.0), 0.0]))[0]
-    ahead = Camera(300, 300, CAMERA.matrix, mount=turn @ CAMERA.mount)
-    found = audit_of(plan_audit(site, ahead, HEIGHT_M))
+    found = audit_of(plan_audit(site, Camera(300, 300, CAMERA.matrix, mount=turn @ CAMERA.mount), HEIGHT_M))
     east = predict_route(found, *lat_lon(site, [[HALF, 250], [HALF + 20, 250]]).T)
     west = predict_route(found, *lat_lon(site, [[HALF + 20, 250], [HALF, 250]]).T)
-    assert abs(east.availability - west.availability) > 0.1
     assert (turn @ CAMERA.mount)[0, 2] > 0  # the axis points ahead
-    assert east.availability < west.availability
+    assert east.availability < west.availability - 0.1
 
 
 def test_a_route_without_a_way_is_refused(found):
-    with pytest.raises(OptionError, match="route: expected two or more waypoints"):
-        predict_route(found, [40.0, 40.0], [-100.0, -100.0])
+    assert "route: expected two or more waypoints" in misuse(predict_route, found, [40.0, 40.0], [-100.0, -100.0])
 
 
 def simple(command, *place):
@@ -326,10 +318,8 @@ def test_a_long_way_over_a_huge_map_has_no_more_places_and_no_finer_grid_than_me
 
 
 def test_a_part_of_nothing_is_refused():
-    with pytest.raises(OptionError, match="part: expected around or route"):
-        MapPart()
-    with pytest.raises(OptionError, match="around: expected metres above 0, got 0"):
-        MapPart(around=(40.0, -99.0, 0.0))
+    assert "part: expected around or route" in misuse(MapPart)
+    assert "around: expected metres above 0, got 0" in misuse(MapPart, around=(40.0, -99.0, 0.0))
 
 
 def test_a_part_beside_the_map_is_refused(town):
@@ -383,8 +373,7 @@ def test_the_raster_lies_where_the_map_does(map_file, found, tmp_path):
     assert run(audit(map_file, out)) == 0
     with rasterio.open(out / "matchability.tif") as raster, rasterio.open(map_file) as ground:
         values, cell, pixel = raster.read(1), raster.transform, ground.transform
-        assert raster.crs == ground.crs
-        assert raster.nodata == -1.0
+        assert (raster.crs, raster.nodata) == (ground.crs, -1.0)
     assert values.dtype == np.float32
     assert (cell.c, cell.f) == pytest.approx((pixel.c, pixel.f), abs=0.01)
     assert np.array(values.shape) * (-cell.e, cell.a) == pytest.approx(SIDE * pixel.a, abs=0.01)
@@ -406,10 +395,9 @@ def test_people_get_a_table_and_a_folder_is_kept_unless_forced(map_file, route_f
     printed = capsys.readouterr()
     assert re.search(r"^good +\d+\.\d%$", printed.out, re.MULTILINE)
     assert "poor: flat" in printed.out
-    stated = printed.err.splitlines()
-    assert stated[0] == f"written to {tmp_path / 'out'}"
-    assert len(stated) == 2
-    assert stated[1].startswith("next: scenematch track --map ")
+    first, second = printed.err.splitlines()
+    assert first == f"written to {tmp_path / 'out'}"
+    assert second.startswith("next: scenematch track --map ")
     assert "\x1b" not in printed.out
 
 
@@ -451,12 +439,10 @@ def test_a_huge_map_is_audited_around_a_place_in_a_part_of_the_memory(huge_path,
     import matplotlib.figure  # noqa: F401  an import while memory is traced takes long
 
     tracemalloc.start()
-    code = run(audit(huge_path, tmp_path / "out", place_option(huge, MIDDLE, 80.0), "--json"))
+    summary = answer(capsys, audit(huge_path, tmp_path / "out", place_option(huge, MIDDLE, 80.0)))
     peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert code == 0
     assert peak_bytes < HUGE_SIDE * HUGE_SIDE / 3
-    summary = json.loads(capsys.readouterr().out)
     assert summary["part"]["area_km2"] == pytest.approx(np.pi * 0.08**2, rel=0.15)
     assert summary["part"]["places"] < np.prod(summary["places"])
     assert summary["shares"]["nodata"] == 0.0
@@ -473,12 +459,11 @@ def test_a_huge_map_is_audited_around_a_place_in_a_part_of_the_memory(huge_path,
 
 @pytest.mark.slow
 def test_a_huge_map_is_audited_along_a_route(huge_path, huge_route, tmp_path, capsys):
-    assert run(audit(huge_path, tmp_path / "out", f"--route={huge_route}", "--json")) == 0
-    summary = json.loads(capsys.readouterr().out)
+    summary = answer(capsys, audit(huge_path, tmp_path / "out", f"--route={huge_route}"))
     assert summary["route"]["availability"] > 0.3
     assert 0.02 < summary["part"]["area_km2"] < 0.08
-    assert run(audit(huge_path, tmp_path / "near", f"--route={huge_route}", "--corridor-m=10", "--json")) == 0
-    assert json.loads(capsys.readouterr().out)["part"]["area_km2"] < summary["part"]["area_km2"] / 2
+    near = answer(capsys, audit(huge_path, tmp_path / "near", f"--route={huge_route}", "--corridor-m=10"))
+    assert near["part"]["area_km2"] < summary["part"]["area_km2"] / 2
 
 
 @pytest.mark.parametrize(

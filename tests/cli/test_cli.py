@@ -18,7 +18,7 @@ from engine.errors import OptionError
 from scenematch.cli import console
 from scenematch.cli.app import run
 from scenematch.runs import tracking as track_module
-from tests.support.commands import FILES, file_options, refusal
+from tests.support.commands import FILES, answer, file_options, refusal
 
 FRAMES = 6  # of `flight`
 WRITTEN = {"track.csv", "summary.json", "notes.csv", "report.html"}
@@ -185,8 +185,7 @@ def test_a_second_demo_is_shorter_and_leaves_nothing_of_the_first_beside_it(tmp_
 def test_locate_finds_a_picture_without_a_prior(flight, capsys):
     image, truth = flight / "frames" / "000000.jpg", cells(flight / "truth.csv")[0]
     base = ["locate", str(image), f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
-    assert run([*base, "--json"]) == 0
-    fix = json.loads(capsys.readouterr().out)
+    fix = answer(capsys, base)
     assert fix["status"] == "fix"
     assert abs(fix["lat_deg"] - float(truth["lat_deg"])) < 1e-4
     assert np.shape(fix["covariance_m2"]) == (3, 3)
@@ -200,21 +199,18 @@ def test_a_map_that_lies_badly_makes_a_fix_doubtful_and_a_start_off_it_is_refuse
     """The built-in map says that it is exact; input.map_sigma_m counts more, and adds up with the rest."""
     image, truth = flight / "frames" / "000000.jpg", cells(flight / "truth.csv")[0]
     base = ["locate", str(image), f"--map={flight / 'map.tif'}", f"--camera={flight / 'camera.yaml'}"]
-    place, variances = f"--start={truth['lat_deg']},{truth['lon_deg']}", []
     assert "--start" in refusal(capsys, [*base, "--start=10,10"])
-    for option in ([], ["--settings=input.map_sigma_m=3"]):
-        assert run([*base, place, "--json", *option]) == 0
-        variances.append(np.diag(json.loads(capsys.readouterr().out)["covariance_m2"]))
-    np.testing.assert_allclose(variances[1] - variances[0], 9.0, rtol=1e-4)
+    base += [f"--start={truth['lat_deg']},{truth['lon_deg']}"]
+    given = ([*base, "--settings=input.map_sigma_m=3"], base)
+    doubtful_m2, exact_m2 = (answer(capsys, each)["covariance_m2"] for each in given)
+    np.testing.assert_allclose(np.diag(np.subtract(doubtful_m2, exact_m2)), 9.0, rtol=1e-4)
 
 
 def test_map_info(flight, capsys):
     path = str(flight / "map.tif")
     assert run(["map", "info", path, f"--surface={flight / 'dsm.tif'}"]) == 0
-    printed = capsys.readouterr().out
-    assert re.search(r"^gsd_m_per_px +0\.5\d+$", printed, re.MULTILINE)
-    assert run(["map", "info", path, "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    assert re.search(r"^gsd_m_per_px +0\.5\d+$", capsys.readouterr().out, re.MULTILINE)
+    facts = answer(capsys, ["map", "info", path])
     assert (facts["width_px"], facts["height_px"]) == (900, 1000)
 
 
@@ -225,8 +221,7 @@ def test_doctor(capsys):
     printed = capsys.readouterr()
     facts = json.loads(printed.out)
     assert printed.err == ""
-    assert facts["missing"] == "nothing"
-    assert facts["numba"] == metadata.version("numba")
+    assert (facts["missing"], facts["numba"]) == ("nothing", metadata.version("numba"))
 
 
 def test_doctor_asks_for_what_the_installation_states(monkeypatch, capsys):
@@ -235,8 +230,7 @@ def test_doctor_asks_for_what_the_installation_states(monkeypatch, capsys):
         'no-such-tool; platform_system == "Linux" and extra == "pictures"', 'pytest>=8.3; extra == "test"',
     ]  # fmt: skip
     monkeypatch.setattr(metadata, "requires", lambda _: stated)
-    assert run(["doctor", "--json"]) == 1
-    facts = json.loads(capsys.readouterr().out)
+    facts = answer(capsys, ["doctor"], 1)
     assert facts["missing"] == ["no-such-package"]
     expected = f"pillow {metadata.version('pillow')}, no-such-tool is not installed"
     assert [(name, value) for name, value in facts.items() if "extra" in name] == [("extra [pictures]", expected)]
@@ -324,8 +318,7 @@ def test_telemetry_without_what_the_method_needs(copy, tmp_path, capsys):
     edit(copy / "telemetry.csv", "heading_deg", "course")
     refused(capsys, copy, tmp_path / "out", 1, "heading_deg", "sift")
     edit(copy / "telemetry.csv", "height_agl_m", "height")
-    more = ["--method=sift", "--profile=paper"]
-    refused(capsys, copy, tmp_path / "out", 1, "height_agl_m", more=more)
+    refused(capsys, copy, tmp_path / "out", 1, "height_agl_m", more=["--method=sift", "--profile=paper"])
 
 
 def test_evaluate_of_what_is_no_finished_track(done, tmp_path, capsys):
@@ -345,8 +338,7 @@ def test_an_output_folder_that_cannot_be_made(flight, tmp_path, capsys, monkeypa
         raise PermissionError(13, "Permission denied", str(self))
 
     monkeypatch.setattr(Path, "mkdir", deny)
-    line = refusal(capsys, track(flight, tmp_path / "out"), 1)
-    assert f"{tmp_path / 'out'}: Permission denied" in line
+    assert f"{tmp_path / 'out'}: Permission denied" in refusal(capsys, track(flight, tmp_path / "out"), 1)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from scenematch.cli import console
 from scenematch.cli.app import run
-from tests.support.commands import COMMANDS, LEAVES, file_options
+from tests.support.commands import COMMANDS, LEAVES, answer, file_options
 
 pytestmark = pytest.mark.usefixtures("bare_runs")
 
@@ -58,8 +58,7 @@ def test_others_name_commands_that_exist(flight, capsys):
 
 def test_check_looks_at_one_frame_in_n_and_names_track(flight, capsys):
     given = ["check", *file_options(flight, surface=None), "--settings=input.every=2"]
-    assert run([*given, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["looked_at"] == 3
+    assert answer(capsys, given)["looked_at"] == 3
     assert parsed(next_of(capsys, given)) == "track"
 
 

@@ -18,6 +18,7 @@ from engine.geo import enu_from_body
 from scenematch.cli.app import run
 from scenematch.files import export
 from scenematch.files.track import TrackRow, with_notes, write_notes, write_track
+from tests.support.commands import answer
 from tests.support.commands import refusal as refusal_of
 
 T0 = 1_700_000_000_000_000_000  # 2023-11-14 22:13:20 UTC
@@ -108,8 +109,7 @@ def test_tum_has_whole_poses_and_leaves_out_what_is_none():
     names = ("roll_deg", "pitch_deg", "heading_deg")
     whole = [fix(k, up_m=150.0 + k, **dict(zip(names, angles[k], strict=True))) for k in range(3)]
     flat, level = fix(3, heading_deg=90.0), fix(4, up_m=150.0)
-    rows = [*whole, flat, refusal(9), level]
-    text = export.to_tum(rows)
+    text = export.to_tum([*whole, flat, refusal(9), level])
     assert "not known" not in text
     table = np.loadtxt(io.StringIO(text))
     assert table[:, 3].tolist() == [150.0, 151.0, 152.0]
@@ -132,16 +132,14 @@ def test_notes_complete_the_pose_of_a_fix(tmp_path):
 
 
 def test_times_of_day_are_left_out_without_utc():
-    boot = [fix(0, start_ns=12_000_000_000), fix(0, start_ns=None)]
-    assert "<time>" not in export.to_gpx(boot)
+    assert "<time>" not in export.to_gpx([fix(0, start_ns=12_000_000_000), fix(0, start_ns=None)])
 
 
 @pytest.mark.parametrize("kind", export.WRITERS)
 def test_the_command_writes_each_format_and_replaces_only_when_told(kind, tmp_path, capfd):
     write_track(tmp_path / "track.csv", ROWS)
     arguments, written = ["export", str(tmp_path), "--format", kind], tmp_path / f"track.{kind}"
-    assert run([*arguments, "--json"]) == 0
-    stated = json.loads(capfd.readouterr().out)
+    stated = answer(capfd, arguments)
     assert (stated["fixes"], stated["segments"]) == (6, 3)
     written.write_text("mine")
     assert "exists; choose another file, or add --force" in refusal_of(capfd, arguments)

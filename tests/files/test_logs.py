@@ -11,16 +11,15 @@ import pytest
 
 from bench.inputs import log_files
 from bench.inputs.log_files import ELSE, UTC_NS, S, dataflash_flight, ulog_flight, ulog_message, write_dataflash
-from engine.errors import OptionError
 from scenematch.cli.app import run
 from scenematch.files.flight import open_flight
 from scenematch.files.logs.readers import open_log, open_truth, stamp_frames
 from scenematch.files.resampling import MAX_SAMPLE_GAP_NS, interpolate, make_series, rows_and_sources_at
 from scenematch.files.telemetry import read_telemetry, take_off_sigma_m
 from scenematch.files.truth import interpolate_truth, read_truth
-from tests.support.commands import file_options
+from tests.support.commands import answer, file_options
 from tests.support.photos import write_pictures
-from tests.support.refusals import refusal
+from tests.support.refusals import misuse, refusal
 from tests.support.subtitles import write_subtitles
 from tests.support.videos import write_video
 
@@ -64,14 +63,12 @@ def test_dataflash_in_the_engines_units(tmp_path):
     log = open_log(dataflash_flight(tmp_path / "1.BIN"))
     (first, row, late), heights = at(log, 60.0, 62.5, 68.5)
     assert (first.roll_deg, first.pitch_deg, first.heading_deg) == pytest.approx((10.0, -5.0, 350.0))
-    assert row.heading_deg == pytest.approx(355.0)
-    assert late.heading_deg == pytest.approx(7.0)
+    assert (row.heading_deg, late.heading_deg) == pytest.approx((355.0, 7.0))
     assert (row.east_velocity_mps, row.north_velocity_mps) == pytest.approx((-0.5, 8.0))
     assert (row.lat_deg, row.lon_deg, row.sigma_m) == pytest.approx((32.50025, 35.25, 1.5), abs=1e-9)
     assert row.alt_amsl_m == pytest.approx(702.5)
     lean = math.cos(math.radians(10)) * math.cos(math.radians(5))
-    assert row.height_agl_m == pytest.approx(50.0 * lean)
-    assert late.height_agl_m == pytest.approx(98.5)
+    assert (row.height_agl_m, late.height_agl_m) == pytest.approx((50.0 * lean, 98.5))
     assert heights == {"rangefinder": 2, "terrain": 1}
     assert log.utc_ns == UTC_NS - 60 * S
 
@@ -302,10 +299,9 @@ def test_a_gimbal_of_zeros_in_subtitles_is_none(tmp_path):
 def test_where_nothing_stamps_the_frames_the_message_says_how(pictures, tmp_path):
     log = dataflash_flight(tmp_path / "1.BIN")
     assert "no `frame_stamps` was given" in refusal(open_flight, pictures, log)
-    two = dataflash_flight(tmp_path / "2.BIN", more=cams(61.0, 62.0))
-    message = refusal(open_flight, pictures, two)
+    message = refusal(open_flight, pictures, dataflash_flight(tmp_path / "2.BIN", more=cams(61.0, 62.0)))
     assert "expected a camera message for each of 3 pictures, got 2" in message
-    message = refusal(open_flight, pictures, log, log_offset_s=math.inf, error=OptionError)
+    message = misuse(open_flight, pictures, log, log_offset_s=math.inf)
     assert "log_offset_s: expected finite seconds" in message
 
 
@@ -313,8 +309,7 @@ def test_exif_times_stamp_photographs(monkeypatch, pictures, tmp_path):
     log = open_log(dataflash_flight(tmp_path / "1.BIN"))
     rows = [SimpleNamespace(timestamp_ns=UTC_NS + k * S, frame=f"{k}.png") for k in (1, 2)]
     monkeypatch.setattr("scenematch.files.logs.readers.photo_telemetry", lambda _: (rows, []))
-    source = SimpleNamespace(path=pictures, names=["1.png", "2.png"])
-    stamps_ns, names = stamp_frames(source, log)
+    stamps_ns, names = stamp_frames(SimpleNamespace(path=pictures, names=["1.png", "2.png"]), log)
     assert (stamps_ns, names) == ([UTC_NS + S, UTC_NS + 2 * S], ["1.png", "2.png"])
 
 
@@ -438,6 +433,5 @@ def test_a_flight_is_followed_by_its_log_and_scored_by_it(flight_in, tmp_path, c
     before = [(out / name).read_bytes() for name in ("report.html", "summary.json")]
     assert b"No frames are shown" not in before[0]
     assert all(word in before[0] for word in (str(stamps).encode(), b"<td>log offset (s)</td>", b"map sigma (m)"))
-    assert run(["evaluate", str(out), "--json"]) == 0
-    assert json.loads(capfd.readouterr().out) == summary
+    assert answer(capfd, ["evaluate", out]) == summary
     assert [(out / name).read_bytes() for name in ("report.html", "summary.json")] == before

@@ -1,5 +1,7 @@
-"""Commands of the command line: what there are, options of a flight's files, and the one line of a refusal."""
+"""Commands of the command line: what there are, options of a flight's files, what one answers, how it refuses."""
 
+import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -30,13 +32,17 @@ def file_options(folder: Path, **other: str | Path | None) -> list[str]:
     return [f"--{name}={folder / file}" for name, file in (FILES | other).items() if file is not None]
 
 
+def answer(capture: Any, arguments: list[Any], code: int = 0) -> Any:
+    """What a command answers on standard output with --json."""
+    assert run([*map(str, arguments), "--json"]) == code
+    return json.loads(capture.readouterr().out)
+
+
 def refusal(capsys: Any, arguments: list[Any], code: int = 2) -> str:
-    """The one line that a refused command leaves on standard error, without the program's name."""
-    assert run([str(argument) for argument in arguments]) == code
+    """The one line, without colour, that a refused command leaves on standard error, less the program's name."""
+    assert run([*map(str, arguments)]) == code
     printed = capsys.readouterr()
-    assert (printed.out, printed.err.count("\n")) == ("", 1), printed
-    assert printed.err.endswith("\n")
-    assert "\x1b" not in printed.err
-    name, _, line = printed.err.partition(": ")
-    assert name == "scenematch"
-    return line
+    line = re.fullmatch(r"scenematch: ([^\n\x1b]*\n)", printed.err)
+    assert line, printed
+    assert printed.out == ""
+    return line[1]

@@ -67,17 +67,16 @@ def flown(
 
     Returns:
         SimpleNamespace: ``results`` and their ``ends``, the indices of those ``fixed``, what the navigator said
-        after each (``states``, ``healthy``, ``ages_s``, ``predictions``), ``priors`` that it asked, and itself.
+        after each (``states``, ``healthy``, ``ages_s``), ``priors`` that it asked, and itself.
     """
     navigator = Navigator(matcher, start, options=options)
-    run = SimpleNamespace(results=[], states=[], healthy=[], ages_s=[], predictions=[])
+    run = SimpleNamespace(results=[], states=[], healthy=[], ages_s=[])
     for k, at_s in enumerate(seconds or [every_s * k for k in range(len(matcher.answers))]):
         frame = at(at_s, velocity[k] if isinstance(velocity, list) else velocity)
         run.results.append(navigator.update(frame, given and given[k]))
         run.states.append(navigator.state.name)
         run.healthy.append(navigator.healthy)
         run.ages_s.append(navigator.anchor_age_s)
-        run.predictions.append(navigator.prediction)
     run.ends = ["fix" if isinstance(result, Fix) else result.reason.value for result in run.results]
     run.fixed = [k for k, end in enumerate(run.ends) if end == "fix"]
     run.priors, run.navigator = matcher.priors, navigator

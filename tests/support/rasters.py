@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import rasterio
 from affine import Affine
-from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterWindow
 
 from engine import OrthoMap, Window
@@ -25,9 +24,8 @@ def from_corner(pixel_to_crs: Any) -> Affine:
 
 
 def write_raster(
-    path: Path, data: Any, *, colorinterp: Any = None, colormap: Any = None, tags: Any = None, overviews: Any = (),
-    **profile: Any,
-) -> Path:  # fmt: skip
+    path: Path, data: Any, *, colorinterp: Any = None, colormap: Any = None, tags: Any = None, **profile: Any
+) -> Path:
     """Write (H, W) or (N, H, W), a GeoTIFF unless its profile says otherwise."""
     data = np.asarray(data)
     data = data[None] if data.ndim == 2 else data
@@ -43,8 +41,6 @@ def write_raster(
             if tags:
                 dataset.update_tags(**tags)
             dataset.write(data)
-            if overviews:
-                dataset.build_overviews(list(overviews), Resampling.average)
     return path
 
 

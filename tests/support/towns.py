@@ -18,19 +18,14 @@ kept_in: Path | None = None
 """The folder that the workers of a run share."""
 
 
-def drawn_town(seed: int = 1) -> Town:
-    """The town of a seed, drawn once a process (two seconds): nobody writes into it."""
-    return drawn_once(seed)
-
-
 def drawn_flight(plan: FlightPlan) -> SimpleNamespace:
     """A planned flight with its pictures: town, camera, frames and truth."""
     frames, truth = list(plan.iter_frames()), plan.truth_rows()
     return SimpleNamespace(town=plan.town, camera=plan.camera, frames=frames, truth=truth)
 
 
-def drawn_once(*seed: Any, **options: Any) -> Town:
-    """What ``build_town`` draws of these arguments, whether they are given or the defaults."""
+def drawn_town(*seed: Any, **options: Any) -> Town:
+    """What ``build_town`` draws of these arguments, once a process (two seconds): nobody writes into it."""
     bound = inspect.signature(build_town).bind(*seed, **options)
     bound.apply_defaults()
     return _drawn(tuple(bound.arguments.items()))
@@ -41,8 +36,7 @@ def _drawn(options: tuple[tuple[str, Any], ...]) -> Town:
     """A town, kept in a file where the workers of a run share a folder."""
     if kept_in is None:
         return build_town(**dict(options))
-    name = hashlib.sha256(repr(options).encode()).hexdigest()[:16]
-    path = kept_in / f"town-{name}.pickle"
+    path = kept_in / f"town-{hashlib.sha256(repr(options).encode()).hexdigest()[:16]}.pickle"
     import fcntl  # not on Windows
 
     with path.with_suffix(".lock").open("w") as lock:
