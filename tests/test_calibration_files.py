@@ -131,10 +131,8 @@ def test_fourteen_coefficients_are_eight_where_the_others_are_zero(tmp_path):
     assert read.distortion_model == "rational_polynomial"
     np.testing.assert_array_equal(read.distortion, eight)
     written["distortion_coefficients"][9] = 1e-5
-    with pytest.raises(
-        CalibrationError, match=r"camera\.yml: distortion_coefficients: expected 4, 5 or 8 numbers"
-    ):
-        Camera.load(opencvs(tmp_path / "camera.yml", **written))
+    line = refusal(Camera.load, opencvs(tmp_path / "camera.yml", **written), error=CalibrationError)
+    assert "camera.yml: distortion_coefficients: expected 4, 5 or 8 numbers" in line
 
 
 @pytest.mark.parametrize(("kalibrs", "ros"), [("equidistant", "equidistant"), ("radtan", "plumb_bob")])

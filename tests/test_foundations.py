@@ -13,12 +13,12 @@ import torch
 import engine.errors
 from engine import NavigatorOptions, set_threads
 from engine.budget import Budget, Deadline
-from engine.errors import DeviceError, DtypeError, EngineError, OptionError, ShapeError, TelemetryError
+from engine.errors import DeviceError, DtypeError, EngineError, OptionError, ShapeError
 from engine.runtime.device import resolve
 from engine.values import Attitude, Fix, Frame, NoFix, Peak, Prior, Timings, Window
 from tests.support.fixes import a_fix
 from tests.support.interpreters import done_by
-from tests.support.refusals import refusal
+from tests.support.refusals import misuse, refusal
 
 IMAGE = np.zeros((4, 6), np.uint8)
 
@@ -37,8 +37,7 @@ def test_a_frame_takes_pictures_of_opencv():
 
 @pytest.mark.parametrize("total_ms", [0.0, -1.0, float("nan"), float("-inf")])
 def test_a_budget_is_above_zero(total_ms):
-    with pytest.raises(OptionError, match=r"^total_ms: expected more than 0 ms, got "):
-        Budget(total_ms=total_ms)
+    assert misuse(Budget, total_ms=total_ms).startswith("total_ms: expected more than 0 ms, got ")
 
 
 def test_a_budget_is_endless_unless_stated_and_stated_by_name():
@@ -80,7 +79,7 @@ def test_a_device_is_resolved_by_name():
 
 @pytest.mark.parametrize("name", ["gpu", "", "cpuu", "tpu:0", "mps", "meta", "cuda:x"])
 def test_a_name_that_is_no_device_is_an_option_error(name):
-    assert refusal(resolve, name, error=OptionError).startswith("device: expected cpu, cuda or auto, got ")
+    assert misuse(resolve, name).startswith("device: expected cpu, cuda or auto, got ")
 
 
 @pytest.mark.parametrize("name", ["cuda", "cuda:0", "cuda:7"])
@@ -98,7 +97,7 @@ def test_threads_are_set_for_torch_and_opencv():
     finally:
         set_threads(1)
     assert (torch.get_num_threads(), cv2.getNumThreads()) == (1, 1)
-    assert refusal(set_threads, 0, error=OptionError).startswith("threads: expected 1 or more, got 0")
+    assert misuse(set_threads, 0).startswith("threads: expected 1 or more, got 0")
 
 
 # Frames
@@ -125,8 +124,7 @@ def test_a_frame_is_uint8(image):
 )
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_numbers_of_a_frame_are_finite_or_unknown(name, value):
-    with pytest.raises(TelemetryError, match=rf"^{name}: expected a finite number or None, got "):
-        Frame(IMAGE, **{name: value})
+    assert refusal(Frame, IMAGE, **{name: value}).startswith(f"{name}: expected a finite number or None, got ")
     assert getattr(Frame(IMAGE, **{name: None}), name) is None
 
 
@@ -197,7 +195,6 @@ def test_the_sigma_of_a_fix_is_the_longer_axis_of_its_ellipse():
     covariance = turn @ np.diag([9.0, 4.0, 100.0]) @ turn.T
     fix = a_fix(timestamp_ns=1, covariance_m2=covariance, score=1.0, window=Window(2, 3, 4, 5))
     assert fix.sigma_m == pytest.approx(3.0)
-    assert fix.window.area_px == 20
 
 
 @pytest.mark.parametrize("risk", [1e-1, 1e-2, 1e-4])

@@ -49,9 +49,8 @@ def test_a_simulators_flight_is_scored_by_its_log():
     times_s = np.arange(100.0, 161.0)
     truth = np.column_stack([times_s, 4.0 * times_s, 0.0 * times_s])
     ekf = truth + np.array([0.0, 0.0, 2.0])
-    fixes = np.column_stack([truth + np.array([0.0, 0.5, 0.0]), times_s + 0.1])[
-        (times_s < 110.5) | (times_s > 132.5)
-    ]
+    is_fixed = (times_s < 110.5) | (times_s > 132.5)
+    fixes = np.column_stack([truth + np.array([0.0, 0.5, 0.0]), times_s + 0.1])[is_fixed]
     fixes[3, 2] = 6.0
     covered = Fault("camera covered", 10.0, 20.0, 4.0)
     lines = arducopter.report([truth, ekf, fixes], 99.5, 61.0, (covered,)).splitlines()
@@ -64,8 +63,7 @@ def test_a_simulators_flight_is_scored_by_its_log():
 def test_a_global_position_is_stamped_when_it_is_sent_and_says_how_long_it_took():
     sensor = message("GLOBAL_POSITION_SENSOR", time_usec=5_300_000, processing_time=300_000)
     assert captured_s(sensor) == pytest.approx(5.0)
-    estimate = message("VISION_POSITION_ESTIMATE", usec=5_000_000)
-    assert captured_s(estimate) == pytest.approx(5.0)
+    assert captured_s(message("VISION_POSITION_ESTIMATE", usec=5_000_000)) == pytest.approx(5.0)
 
 
 def test_a_fix_is_scored_about_the_origin_that_the_autopilot_has():
@@ -175,9 +173,8 @@ def test_it_flies_the_positions_and_the_velocity_of_the_subtitles(tmp_path):
 
 
 def test_subtitles_without_a_heading_are_refused(tmp_path):
-    assert "expected subtitles beside it with position, rel_alt and gimbal" in refusal(
-        recorded, video(tmp_path, "")
-    )
+    line = refusal(recorded, video(tmp_path, ""))
+    assert "expected subtitles beside it with position, rel_alt and gimbal" in line
 
 
 # --------------------------------------------------------------------------------------- the camera that shows one
@@ -218,6 +215,5 @@ def test_the_picture_is_of_the_frame_that_was_taken_nearest(tmp_path):
     path = video(tmp_path, "[gb_yaw: 0.0 gb_pitch: -90.0 gb_roll: 0.0]", FRAME, shade=3)
     footage = Footage(path, 64.1, every=5)
     for index in (0, 7, 14):
-        shade = footage.picture(footage.states[index]).mean()
-        assert shade == pytest.approx(15 * index, abs=4)
+        assert footage.picture(footage.states[index]).mean() == pytest.approx(15 * index, abs=4)
     assert footage.hfov_deg == pytest.approx(50.4, abs=0.1)

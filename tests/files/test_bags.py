@@ -192,8 +192,7 @@ def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, ro
     path = a_bag_with_odometry(tmp_path / name, maker_of(ros), variances=variances)
     for item in open_flight(path):
         assert (item.frame.east_velocity_mps, item.frame.velocity_sigma_mps) == (50.0, None)
-    flight = open_flight(path, odometry_topic="/vio/odometry")
-    for k, item in zip((1, 6, 11), flight, strict=True):
+    for k, item in zip((1, 6, 11), open_flight(path, odometry_topic="/vio/odometry"), strict=True):
         velocity = item.frame.east_velocity_mps, item.frame.north_velocity_mps
         assert velocity == pytest.approx((0.5 * k, -3.0), abs=1e-9)
         turned_mps = np.radians(1.0) * np.linalg.norm((0.5 * k, -3.0, 0.25))
@@ -215,8 +214,7 @@ def test_the_velocity_of_another_odometry_is_used_where_it_is_named(tmp_path, ro
 )  # fmt: skip
 def test_an_odometry_that_cannot_be_used_is_named(tmp_path, maker, options, topic, said):
     path = a_bag_with_odometry(tmp_path / "x.bag", maker, **options)
-    with pytest.raises(TelemetryError, match=said):
-        read_bag(path, odometry_topic=topic)
+    assert said in refusal(read_bag, path, odometry_topic=topic)
 
 
 def test_a_bag_without_telemetry_or_calibration_says_so(tmp_path, maker):
@@ -250,10 +248,9 @@ def test_a_folder_whose_description_is_damaged_is_one_line(tmp_path):
 
 def test_topics_of_the_calibration(tmp_path, maker):
     """The camera_info beside the pictures counts, not the first."""
-    other = Camera.from_fov(31, 23, 30.0)
     topics = {
         IMAGE: [(10**9, maker.image(10**9, "", np.zeros((23, 31), np.uint8)))],
-        "/aaa/camera_info": [(10**9, maker.camera_info(10**9, "", other))],
+        "/aaa/camera_info": [(10**9, maker.camera_info(10**9, "", Camera.from_fov(31, 23, 30.0)))],
         CAMERA_INFO: [(10**9, maker.camera_info(10**9, "", CAMERA))],
     }
     assert np.array_equal(read_bag_camera(written(tmp_path / "x.bag", topics)).matrix, CAMERA.matrix)

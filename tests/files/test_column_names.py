@@ -7,7 +7,7 @@ from scenematch import MapInput, TrackSettings
 from scenematch.files.telemetry import open_telemetry
 from scenematch.runs.inputs import FlightFiles, open_inputs
 from tests.support.photos import write_pictures
-from tests.support.refusals import refusal
+from tests.support.refusals import misuse, refusal
 
 OTHERS = "time_us,Image Name,altitude_agl [m],Yaw,Latitude,Longitude,battery\n0,0.png,120.5,-90,48.5,16.5,99\n"
 MORE = "500000,1.png,121.5,-91,48.5,16.5,98\n"
@@ -55,5 +55,4 @@ def test_runs_of_one_flight_name_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr(MapInput, "open", lambda self, progress: None)
     files = FlightFiles.from_flat(map="none.tif", frames=tmp_path, hfov_deg=60.0)
     runs = [TrackSettings(), TrackSettings(telemetry_columns={"frame": "image"})]
-    with pytest.raises(OptionError, match="telemetry_columns: expected the same of all runs"):
-        open_inputs(files, runs)
+    assert "telemetry_columns: expected the same of all runs" in misuse(open_inputs, files, runs)

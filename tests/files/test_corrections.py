@@ -8,6 +8,7 @@ import pytest
 from engine.errors import OptionError, TelemetryError
 from scenematch.files.corrections import Corrections
 from scenematch.files.telemetry import TelemetryRow
+from tests.support.refusals import misuse, refusal
 
 ROW = TelemetryRow(
     timestamp_ns=1_000_000_000, frame="a.jpg", height_agl_m=100.0, roll_deg=3.0, pitch_deg=-4.0, heading_deg=350.0,
@@ -45,9 +46,7 @@ def test_offsets_are_added_a_heading_wraps_and_a_height_below_the_ground_becomes
 
 
 def test_a_late_telemetry_is_moved_to_its_pictures():
-    rows = [
-        replace(ROW, timestamp_ns=k * 10**9, roll_deg=float(k), heading_deg=(358.0 + k) % 360.0) for k in range(6)
-    ]
+    rows = [replace(ROW, timestamp_ns=k * 10**9, roll_deg=k, heading_deg=(358 + k) % 360) for k in range(6)]
     moved = Corrections(offset_s=-0.5).applied(rows)  # stamps that are 0.5 s too late
     assert [row.roll_deg for row in moved] == pytest.approx([0.5, 1.5, 2.5, 3.5, 4.5, 5.0])
     assert [row.heading_deg for row in moved] == pytest.approx([358.5, 359.5, 0.5, 1.5, 2.5, 3.0])
@@ -71,12 +70,10 @@ def test_what_cannot_be_is_refused_by_name(given, says):
 
 
 def test_what_a_correction_makes_impossible_is_refused_by_frame():
-    with pytest.raises(TelemetryError, match=r"frame a\.jpg: expected pitch_deg of -90 to 90, got -229"):
-        corrected(angles="radians")
+    assert "frame a.jpg: expected pitch_deg of -90 to 90, got -229" in refusal(corrected, angles="radians")
     with pytest.raises(TelemetryError, match=r"frame a\.jpg: expected timestamp_ns of .* got 1e\+209"):
         corrected(columns=("timestamp_ns=1e200*timestamp_ns",))
-    with pytest.raises(OptionError, match="columns: expected timestamp_ns of itself only"):
-        corrected(columns=("timestamp_ns=roll_deg",))
+    assert "columns: expected timestamp_ns of itself only" in misuse(corrected, columns=("timestamp_ns=roll_deg",))
 
 
 @pytest.mark.parametrize("yaw_rad", [-math.pi / 2, -0.1, 0.5, 3.0, 6.2])

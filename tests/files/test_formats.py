@@ -187,8 +187,7 @@ def test_a_folder_reads_in_natural_order(folder):
     assert "2.png" in source
     assert "notes.txt" not in source
     np.testing.assert_array_equal(source.read("10.png"), picture(100))
-    message = refusal(source.read, "3.png")
-    assert "expected one of 3 pictures, 1.png to 10.png, got '3.png'" in message
+    assert "expected one of 3 pictures, 1.png to 10.png, got '3.png'" in refusal(source.read, "3.png")
 
 
 @pytest.mark.parametrize(
@@ -306,8 +305,7 @@ def test_a_video_that_does_not_say_how_long_it_is_is_counted(video, monkeypatch)
 
 
 def test_a_flight_joins_rows_and_pictures_and_counts_the_rest(folder, save):
-    telemetry = save(HEADER + "5000000,10.png,150,90,32,35\n9000000,1.png,,,,\n")
-    flight = open_flight(folder, telemetry)
+    flight = open_flight(folder, save(HEADER + "5000000,10.png,150,90,32,35\n9000000,1.png,,,,\n"))
     assert (len(flight), flight.unused, flight.names) == (2, 1, ["10.png", "1.png"])
     first, second = flight
     np.testing.assert_array_equal(first.frame.image, picture(100))

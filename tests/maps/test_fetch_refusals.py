@@ -13,7 +13,7 @@ from scenematch.fetch.heights import files_for
 from scenematch.fetch.urls import shown
 from scenematch.fetch.wmts import _extra_query
 from scenematch.runs.map_fetch import FetchSettings, fetch_map
-from tests.support.refusals import refusal
+from tests.support.refusals import misuse
 
 TILES = "http://127.0.0.1:9/{z}/{x}/{y}.png"  # nobody listens there
 
@@ -86,7 +86,7 @@ def test_refusals_name_the_source_and_do_not_repeat_keys(tmp_path, source, words
     ["http://h/{lat}_{lon}}.tif", "d/{{lat}_{lon}.tif", "d/{lat}{lon}{.tif", "https://h/{lat}.tif?key=S3CRET"],
 )
 def test_nor_do_those_of_heights_with_stray_braces(surface):
-    message = refusal(files_for, surface, (0.0, 0.0, 1.0, 1.0), error=OptionError)
+    message = misuse(files_for, surface, (0.0, 0.0, 1.0, 1.0))
     assert message.startswith("surface: expected {lat} and {lon} as placeholders, or none")
     assert "S3CRET" not in message
 
@@ -101,8 +101,7 @@ def test_a_square_across_the_antimeridian_is_refused(tmp_path, around):
 
 
 def test_a_square_beside_it_is_not(tmp_path):
-    facts = fetch_map(settings(around="0,179.99", dry_run=True), tmp_path / "map.tif")
-    assert facts["tiles"] < 10
+    assert fetch_map(settings(around="0,179.99", dry_run=True), tmp_path / "map.tif")["tiles"] < 10
     assert Place(0.0, 179.99, 50.0).bounds(CRS.from_epsg(4326))[2] < 180.0
 
 

@@ -15,6 +15,7 @@ from engine.errors import BackendError, CalibrationError, OptionError
 from engine.runtime import workers as processes
 from engine.runtime.step_costs import Costs
 from tests.support.fixes import values_of
+from tests.support.refusals import misuse, refusal
 from tests.support.threads import called_at_once
 from tests.support.waiting import is_running, wait_until
 
@@ -95,8 +96,7 @@ def test_every_frame_has_the_budget(matchers, questions):
 
 def test_frames_and_priors_of_different_number_are_refused(matchers, questions):
     frames, priors = questions
-    with pytest.raises(OptionError, match=r"^priors: expected one per frame, 10, got 9$"):
-        matchers["ncc"].locate_many(frames, priors[1:])
+    assert misuse(matchers["ncc"].locate_many, frames, priors[1:]) == "priors: expected one per frame, 10, got 9"
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -154,8 +154,7 @@ def test_a_worker_that_ends_is_an_error_and_leaves_no_process():
             os._exit(7)
         return task
 
-    with pytest.raises(BackendError, match=r"^workers: a process ended$"):
-        list(processes.in_order(ends, 20, 2))
+    assert refusal(list, processes.in_order(ends, 20, 2), error=BackendError) == "workers: a process ended"
 
 
 def test_workers_end_with_who_no_longer_asks():

@@ -1,13 +1,12 @@
 """Runs as a library: a flight tracked in three lines of Python, what it reports, and errors by argument."""
 
 import sys
-from functools import partial
 
 import pytest
 
 import scenematch
 from bench.inputs.log_files import ulog_flight
-from engine import BackendError, MissingExtraError, OptionError, TelemetryError
+from engine import BackendError, MissingExtraError, TelemetryError
 from scenematch import FlightFiles, Progress, TrackSettings, track
 from scenematch.bridges.links import parse_connection
 from scenematch.check import Diagnosis, Finding
@@ -19,10 +18,9 @@ from scenematch.files.truth import read_truth
 from scenematch.runs.inputs import FOLDER_LAYOUT
 from tests.support.dark_flight import dark_flight
 from tests.support.interpreters import done_by
-from tests.support.refusals import refusal
+from tests.support.refusals import misuse
 
 FRAMES = 3
-refused = partial(refusal, error=OptionError)
 pytestmark = pytest.mark.usefixtures("bare_runs")
 
 
@@ -52,8 +50,7 @@ def flight(tmp_path_factory):
 
 def test_a_flight_is_tracked_in_three_lines_and_nothing_is_printed(flight, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    files = FlightFiles.in_folder(str(flight))
-    summary = track(files, "out", TrackSettings(method="sift"))
+    summary = track(FlightFiles.in_folder(str(flight)), "out", TrackSettings(method="sift"))
     assert (summary["frames"], summary["fixes"]) == (FRAMES, FRAMES)
     assert summary["rms_m"] < 2.0
     assert {"track.csv", "summary.json", "report.html"} <= {path.name for path in (tmp_path / "out").iterdir()}
@@ -63,8 +60,7 @@ def test_a_flight_is_tracked_in_three_lines_and_nothing_is_printed(flight, tmp_p
 def test_one_frame_in_two_is_tracked_and_scored_again(flight, tmp_path):
     progress, names = Recorded(), ["000000.jpg", "000002.jpg"]
     paths = {name: flight / file for name, file in FOLDER_LAYOUT.items()}
-    files = FlightFiles.from_flat(**paths, every=2)
-    track(files, tmp_path / "out", progress=progress)
+    track(FlightFiles.from_flat(**paths, every=2), tmp_path / "out", progress=progress)
     assert [row.frame for row in read_track(tmp_path / "out" / "track.csv")] == names
     assert progress.messages == ["using one frame in 2, 2 in all"]
     page = (tmp_path / "out" / "report.html").read_bytes()
@@ -104,17 +100,16 @@ def test_a_folder_gives_what_it_has(flight, tmp_path):
 
 def test_errors_name_arguments(flight, tmp_path):
     files = FlightFiles.in_folder(flight)
-    assert refused(TrackSettings, budget_ms=-1.0) == "budget_ms: expected milliseconds above 0, got -1"
+    assert misuse(TrackSettings, budget_ms=-1.0) == "budget_ms: expected milliseconds above 0, got -1"
     exists = "exists; choose another folder, or add `force` to replace its results"
-    assert refused(track, files, flight) == f"out: {flight} {exists}"
-    far = TrackSettings(start="0,0")
-    off_it = refused(track, files, tmp_path / "out", far)
+    assert misuse(track, files, flight) == f"out: {flight} {exists}"
+    off_it = misuse(track, files, tmp_path / "out", TrackSettings(start="0,0"))
     assert off_it.startswith("start: expected a place on the map")
     assert "swapped" not in off_it
     place = next(iter(read_truth(flight / "truth.csv")))
     swapped = TrackSettings(start=f"{place.lon_deg},{place.lat_deg}")
-    assert refused(track, files, tmp_path / "out", swapped).endswith("; are latitude and longitude swapped?")
-    assert refused(scenematch.export_track, tmp_path, "shp").startswith("kind: expected one of gpx")
+    assert misuse(track, files, tmp_path / "out", swapped).endswith("; are latitude and longitude swapped?")
+    assert misuse(scenematch.export_track, tmp_path, "shp").startswith("kind: expected one of gpx")
     assert not (tmp_path / "out").exists()
 
 

@@ -12,7 +12,7 @@ from engine.runtime import realtime as module
 from engine.runtime.realtime import Realtime, check_realtime, set_realtime, start_thread
 from scenematch.runs.mavlink_bridge import BridgeSettings
 from tests.support.interpreters import done_by
-from tests.support.refusals import refusal
+from tests.support.refusals import misuse
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="real time is Linux's")
 PLAIN = Realtime(lock_memory=False)
@@ -111,12 +111,12 @@ def test_memory_that_could_run_out_in_flight_is_not_locked(monkeypatch):
 
 def test_another_system_is_refused(monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert "realtime: expected Linux, got darwin" in refusal(set_realtime, error=OptionError)
+    assert "realtime: expected Linux, got darwin" in misuse(set_realtime)
 
 
 @pytest.mark.parametrize("priority", [0, 99])
 def test_priorities_out_of_range_are_refused(priority):
-    assert refusal(Realtime, priority=priority, error=OptionError).startswith("priority: expected")
+    assert misuse(Realtime, priority=priority).startswith("priority: expected")
 
 
 def test_a_bridge_is_scheduled_as_usual_unless_told():
