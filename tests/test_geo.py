@@ -75,8 +75,7 @@ def test_attitude_round_trip(roll_deg, pitch_deg, heading_deg):
     assert np.linalg.det(rotation) == pytest.approx(1.0)
     roll, pitch, heading = attitude_from_rotation(rotation)
     assert 0.0 <= heading < 360.0
-    assert roll == pytest.approx(roll_deg, abs=1e-7)
-    assert pitch == pytest.approx(pitch_deg, abs=1e-7)
+    assert (roll, pitch) == pytest.approx((roll_deg, pitch_deg), abs=1e-7)
     assert abs((heading - heading_deg + 180.0) % 360.0 - 180.0) < 1e-7
 
 

@@ -59,8 +59,7 @@ def test_whole_numbers_are_not_rounded_to_float32():
 def test_a_dark_window_in_a_batch_does_not_disturb_a_bright_one():
     rng = torch.Generator().manual_seed(4)
     search = torch.rand(2, 60, 60, generator=rng) * torch.tensor([1e-3, 1e4])[:, None, None]
-    templates = search[:, None, 20:40, 10:30]
-    for scores in ncc(search, templates):
+    for scores in ncc(search, search[:, None, 20:40, 10:30]):
         assert float(scores[0, 20, 10]) == pytest.approx(1.0, abs=1e-6)
 
 
@@ -101,9 +100,7 @@ def test_a_window_or_template_of_one_grey_level_scores_zero(level, dtype):
     """0.1 and 1/3 have no exact sum: what rounding leaves must not be taken for texture."""
     search = torch.rand(1, 41, 37, generator=torch.Generator().manual_seed(0), dtype=dtype)
     assert not ncc(torch.full_like(search, level), search[:, None, :7, :9]).any()
-    scores = ncc(search, torch.full((1, 1, 7, 9), level, dtype=dtype))
-    assert torch.isfinite(scores).all()
-    assert float(scores.abs().max()) < 1e-6
+    assert float(ncc(search, torch.full((1, 1, 7, 9), level, dtype=dtype)).abs().max()) < 1e-6
 
 
 @given(seed=st.integers(0, 2**32 - 1), bright=st.floats(1.0, 1e6), flat=st.booleans(), zero_mean=st.booleans())
@@ -115,9 +112,7 @@ def test_scores_stay_within_minus_one_and_one(seed, bright, flat, zero_mean):
         search[0, 18:, 18:] = 3.0
     template = search[:, None, 12:20, 12:20] if seed % 2 else rng.normal(size=(1, 1, 8, 8)).astype(np.float32)
     scores = ncc(torch.from_numpy(search), torch.from_numpy(np.ascontiguousarray(template)), zero_mean=zero_mean)
-    assert torch.isfinite(scores).all()
-    assert float(scores.min()) >= -1.0
-    assert float(scores.max()) <= 1.0
+    assert -1.0 <= float(scores.min()) <= float(scores.max()) <= 1.0
 
 
 @pytest.mark.parametrize(
@@ -169,8 +164,7 @@ def test_the_rival_is_the_best_score_outside_the_disc(seed, size, radius):
     expected = surface[outside].max() if outside.any() else -1.0
     assert peak.score == surface[y, x]
     assert peak.second_score == pytest.approx(float(expected), abs=0)
-    assert abs(peak.x - x) <= 0.5
-    assert abs(peak.y - y) <= 0.5
+    assert max(abs(peak.x - x), abs(peak.y - y)) <= 0.5
 
 
 @pytest.mark.parametrize("place", [(0, 0), (0, 9), (6, 0), (6, 9), (0, 4), (3, 0), (6, 5), (2, 9)])

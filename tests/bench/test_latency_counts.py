@@ -27,8 +27,7 @@ def test_an_endless_course_moves_as_its_velocities_say_also_on_the_way_back(monk
     monkeypatch.setattr(endless, "plan_flight", partial(plan_flight, town=drawn_town()))
     course = draw(4)
     frames = [course.frame(number) for number in range(7)]
-    stamps = [frame.timestamp_ns for frame in frames]
-    assert (np.diff(stamps) == course.step_ns).all()
+    assert (np.diff([frame.timestamp_ns for frame in frames]) == course.step_ns).all()
     there, back = frames[2], frames[4]
     assert there.image is back.image
     assert there.east_velocity_mps == -back.east_velocity_mps
@@ -59,8 +58,7 @@ def test_shares_are_of_all_frames_and_only_false_fixes_are_wrong():
     row = summary(flown([1.0, 10.0, 10.1, 50.0], [3.0, 12.0, 12.0, nan], [9.0, 2.9, 3.1, nan]), "x", stop_ms=1.0)
     assert row["within"] == 0.5  # 5 ms and the grace of 5 ms
     assert row["within_but_a_stop"] == row["within_on_core"] == 0.75
-    assert row["availability"] == 0.75
-    assert row["wrong"] == 1
+    assert (row["availability"], row["wrong"]) == (0.75, 1)
     assert row["rms_m"] == pytest.approx(np.sqrt((9 + 144 + 144) / 3))
 
 

@@ -71,9 +71,8 @@ def assert_is_off(found, forward_m, right_m):
     """By focal length over height it is so many pixels of the picture."""
     assert found.cause == "mount"
     assert found.value == pytest.approx(np.degrees(np.arctan2(np.hypot(forward_m, right_m), 120.0)), abs=1.0)
-    column, row = (int(word) for word in found.cure.split() if word[0] in "+-")
-    assert column == pytest.approx(-right_m * 260.0 / 120.0, abs=4.0)
-    assert row == pytest.approx(forward_m * 260.0 / 120.0, abs=4.0)
+    column_row_px = [int(word) for word in found.cure.split() if word[0] in "+-"]
+    assert column_row_px == pytest.approx([-right_m * 260.0 / 120.0, forward_m * 260.0 / 120.0], abs=4.0)
 
 
 def test_what_fits_is_not_doubted():
@@ -172,15 +171,13 @@ def test_a_height_that_is_scaled_is_told_from_one_that_is_shifted():
 def test_a_clock_that_is_off_is_named(shift_s):
     late = np.stack([np.interp(TIME_S - shift_s, TIME_S, column) for column in ANGLES.T], axis=1)
     (found,) = findings(series(angles_deg=late), seen(), 1.0)
-    assert found.cause == "clock"
-    assert found.value == pytest.approx(shift_s, abs=0.15)
+    assert (found.cause, found.value) == ("clock", pytest.approx(shift_s, abs=0.15))
 
 
 def test_a_map_that_other_positions_contradict_is_named():
     reference = {"reference_m": PLACES + np.array([8.0, 0.0]), "reference_sigma_m": np.full(N, 1.0)}
     (found,) = findings(series(**reference), seen(), 1.0)
-    assert found.cause == "map"
-    assert found.value == pytest.approx(8.0, abs=0.5)
+    assert (found.cause, found.value) == ("map", pytest.approx(8.0, abs=0.5))
     assert findings(series(**reference), seen(), 5.0) == []  # within what the map states
 
 
@@ -223,8 +220,7 @@ def test_pictures_say_it_by_themselves(over_a_town):
     assert found_in(frames) == []
     off = [replace(frame, heading_deg=(frame.heading_deg + 9.0) % 360.0) for frame in frames]
     (found,) = found_in(off)
-    assert found.cause == "heading"
-    assert found.value == pytest.approx(-9.0, abs=1.0)
+    assert (found.cause, found.value) == ("heading", pytest.approx(-9.0, abs=1.0))
 
 
 @pytest.mark.slow
@@ -260,9 +256,8 @@ def test_headings_in_radians_are_named_where_most_of_them_are_near_north(turning
 
 def in_words(telemetry, poses):
     """What is said of the pictures."""
-    found = findings(telemetry, poses, 1.0)
     known, off = is_known(telemetry, poses), contradictions(telemetry, poses)
-    return as_rows(Diagnosis(found, 16, 16, known, off))[-1][1]
+    return as_rows(Diagnosis(findings(telemetry, poses, 1.0), 16, 16, known, off))[-1][1]
 
 
 def test_the_share_that_contradicts_and_the_field_are_said():

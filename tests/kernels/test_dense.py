@@ -1,7 +1,7 @@
 """Dense refinement: the pose that a picture was made with is found again, and what cannot be known is said."""
 
 import math
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import cv2
 import numpy as np
@@ -147,10 +147,8 @@ def test_samples_share_a_cell_within_an_eighth_of_the_picture(scene, camera):
 
 def test_the_map_s_gradients_are_how_its_values_change_on_the_ground(ground):
     site = ground.flat_site
-    prepared = PreparedMap(site, torch.device("cpu"))
-    window = Window(100, 120, 200, 160)
-    found = SampleMap(site).find(window, 0)
-    picture = prepared.cut(whole(site), 0).search.image
+    found = SampleMap(site).find(Window(100, 120, 200, 160), 0)
+    picture = PreparedMap(site, torch.device("cpu")).cut(whole(site), 0).search.image
     for axis, step in enumerate(np.eye(2) * site.gsd_m_per_px):
         at = [site.pixel_from_enu(found.points_m[:, :2] + sign * step) for sign in (1, -1)]
         ahead, behind = (cv2.remap(picture, *px.T.astype(np.float32)[:, None], cv2.INTER_LINEAR)[0] for px in at)
@@ -163,8 +161,7 @@ def test_no_pose_from_samples_that_are_not_seen(scene, camera):
     assert fitted(camera, scene, believed(pose, moved_m=(1000.0, 0.0, 0.0))) is None
     nothing = np.zeros(len(samples.weights))
     assert fitted(camera, scene, believed(pose), weights=nothing) is None
-    picture = EnhancedFrame(levels, camera.matrix)
-    assert correlation_at(picture, replace(samples, weights=nothing), pose) == 0.0
+    assert correlation_at(EnhancedFrame(levels, camera.matrix), replace(samples, weights=nothing), pose) == 0.0
 
 
 # ------------------------------------------------------------------------------------------------ as part of NCC
@@ -185,16 +182,13 @@ def test_telemetry_that_is_wrong_is_corrected(ground, camera):
     assert np.hypot(*ground.off_m(peak, NADIR)) > 1.0
     assert np.hypot(*ground.off_m(fix, NADIR)) < 0.15
     assert fix.up_m == pytest.approx(HEIGHT_M, abs=0.3)
-    assert fix.attitude.roll_deg == pytest.approx(3.0, abs=0.06)
-    assert fix.attitude.pitch_deg == pytest.approx(-2.0, abs=0.06)
-    assert fix.attitude.heading_deg == pytest.approx(25.0, abs=0.06)
+    assert astuple(fix.attitude) == pytest.approx((3.0, -2.0, 25.0), abs=0.06)
     assert fix.sigma_m < peak.sigma_m
 
 
 def test_without_a_surface_model_the_covariance_stays_as_wide_as_the_tilt_is_doubtful(ground, camera):
     true = ground.frame(camera, NADIR, heading_deg=25.0, roll_deg=3.0, pitch_deg=-2.0)
-    stated = replace(true, roll_deg=3.4, pitch_deg=-2.3)
-    fix = located(ground.site, camera, stated, ground.prior(NADIR))
+    fix = located(ground.site, camera, replace(true, roll_deg=3.4, pitch_deg=-2.3), ground.prior(NADIR))
     assert fix.sigma_m > 0.7 * HEIGHT_M * np.tan(np.radians(0.5))
     assert ground.chi_square(fix, NADIR) < 9.0
 
@@ -254,8 +248,7 @@ def with_noise(frame, part):
 def test_a_picture_of_another_place_keeps_its_fix_or_none(ground, camera):
     """Refinement never makes a fix of what is no fix: the other half of the picture is noise."""
     frame = with_noise(ground.frame(camera, NADIR, heading_deg=25.0), np.s_[:, 150:])
-    fix = located(ground.flat_site, camera, frame, ground.prior(NADIR))
-    assert ground.chi_square(fix, NADIR) < 9.0
+    assert ground.chi_square(located(ground.flat_site, camera, frame, ground.prior(NADIR)), NADIR) < 9.0
 
 
 def test_a_tilt_that_nobody_tells_is_refused_and_not_guessed(ground, camera):

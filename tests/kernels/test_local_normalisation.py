@@ -36,8 +36,7 @@ def test_it_is_the_definition(height, width, radius_px, seed, spread):
     low = rng.integers(0, 256 - spread)
     picture = rng.integers(low, low + spread + 1, (height, width)).astype(np.uint8)
     found = normalised(picture, radius_px, 4.0)
-    assert found.shape == picture.shape
-    assert found.dtype == np.float32
+    assert (found.shape, found.dtype) == (picture.shape, np.float32)
     padded = np.pad(picture, radius_px, mode="reflect")  # as often as necessary, of one pixel too
     inner = by_definition(padded, radius_px, 4.0)[radius_px:-radius_px, radius_px:-radius_px]
     assert np.abs(found - inner).max() < 3e-4

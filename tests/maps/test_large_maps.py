@@ -11,11 +11,12 @@ from affine import Affine
 from rasterio.enums import Resampling
 from rich.console import Console
 
-from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, SceneMatcher, Window
+from engine import OptionError, OrthoMap, Prior, Reason, SceneMatcher, Window
 from engine.maps import metric_copy
 from scenematch.cli import console
 from scenematch.cli.app import run
 from scenematch.runs.inputs import check_start
+from tests.support.fixes import px_off
 from tests.support.rasters import from_corner, whole, write_raster, write_sparse
 
 SIDE = 17_000
@@ -59,12 +60,9 @@ def test_a_frame_is_found_where_the_small_map_has_it_in_part_of_the_memory(large
     frame, prior, camera = sim_flight.frames[5], prior_of(sim_flight), sim_flight.camera
     at_home = SceneMatcher(small, camera, method, "cpu").locate(frame, prior)
     tracemalloc.start()
-    matcher = SceneMatcher(OrthoMap.open(large_path), camera, method, "cpu")
-    abroad = matcher.locate(frame, prior)
+    abroad = SceneMatcher(OrthoMap.open(large_path), camera, method, "cpu").locate(frame, prior)
     peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert isinstance(at_home, Fix)
-    assert isinstance(abroad, Fix)
     # A refined pose rests on other samples, which are taken part by part of a large map.
     apart_px = np.subtract(abroad.map_xy_px, at_home.map_xy_px) - CORNER
     assert np.abs(apart_px).max() < (0.05 * at_home.sigma_m / small.gsd_m_per_px if method == "ncc" else 0.1)
@@ -99,7 +97,6 @@ def test_without_a_place_to_begin_only_a_map_that_is_too_large_is_refused(large,
     monkeypatch.setattr("engine.orthomap.SEARCH_LIMIT_PX", 1_000_000)
     for method in ("ncc", "sift", "auto"):
         refused = SceneMatcher(large, sim_flight.camera, method, "cpu").locate(sim_flight.frames[5])
-        assert isinstance(refused, NoFix)
         assert refused.reason is Reason.MAP_TOO_LARGE
         assert "9.01 x 9.01 km" in refused.detail
     with pytest.raises(OptionError, match=r"^start: expected LAT,LON.*the map of 9.01 x 9.01 km"):
@@ -112,13 +109,10 @@ def test_a_vague_place_is_searched_coarse_to_fine_and_too_vague_a_one_refused(la
     matcher = SceneMatcher(large, sim_flight.camera, "ncc", "cpu")
     truth = large.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
     found = matcher.locate(frame, prior)
-    assert isinstance(found, Fix)
-    assert np.hypot(*(np.array(found.map_xy_px) - truth)) < 4.0
+    assert px_off(found, truth) < 4.0
     assert found.window.area_px > 16e6
     monkeypatch.setattr("engine.matching.ncc.MAX_WINDOW_PX", 100_000)
-    refused = matcher.locate(frame, prior)
-    assert isinstance(refused, NoFix)
-    assert refused.reason is Reason.MAP_TOO_LARGE
+    assert matcher.locate(frame, prior).reason is Reason.MAP_TOO_LARGE
 
 
 # -------------------------------------------------------------------------------------------- surface models
@@ -146,8 +140,7 @@ def test_a_surface_read_by_tiles_is_the_surface_in_memory(tmp_path, gray, sim_to
 
 def test_a_surface_of_a_small_part_of_the_map_gives_its_ground(large_path, tmp_path, sim_town):
     corner = from_corner(sim_town.pixel_to_crs) @ Affine.translation(200, 300)
-    heights = np.full((40, 40), 77.0, np.float32)
-    dsm = write_raster(tmp_path / "dsm.tif", heights, crs=UTM, transform=corner)
+    dsm = write_raster(tmp_path / "dsm.tif", np.full((40, 40), 77.0, np.float32), crs=UTM, transform=corner)
     assert OrthoMap.open(large_path, dsm).ground_m == 77.0
 
 

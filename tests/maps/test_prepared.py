@@ -52,7 +52,6 @@ def levels_of(search):
 
 # A cell without nodata is smoothed in whole grey levels, which moves an enhanced pixel by some hundredths of its
 # neighbourhood's deviation.
-ROUNDED = 0.05
 
 
 @pytest.mark.parametrize("masked", [False, True], ids=["whole", "nodata"])
@@ -63,7 +62,7 @@ def test_cells_join_without_a_seam(gray, holes, window, masked, monkeypatch, by_
     monkeypatch.setattr(tiles, "WHOLE_LEVEL_PX", 1 << 23)
     whole = PreparedMap(site, CPU).cut(window, 0)
     assert pieces.window == whole.window
-    tolerance = ROUNDED if masked else 2e-5  # running sums in float32 begin elsewhere
+    tolerance = 0.05 if masked else 2e-5  # running sums in float32 begin elsewhere
     for part, full in zip(levels_of(pieces.search), levels_of(whole.search), strict=False):
         np.testing.assert_allclose(part.image, full.image, rtol=0, atol=tolerance)
     np.testing.assert_array_equal(pieces.valid, whole.valid)
@@ -86,8 +85,7 @@ def test_a_cut_is_the_enhanced_level_from_the_multiple_of_eight_before_it(gray, 
 
 def test_masks_are_cut_with_the_picture_and_left_out_where_all_is_map(gray, holes):
     maps = PreparedMap(site_of(gray, holes), CPU)
-    clear = maps.cut(Window(40, 240, 150, 100), 0)
-    assert clear.valid is None
+    assert maps.cut(Window(40, 240, 150, 100), 0).valid is None
     across = maps.cut(Window(203, 101, 160, 160), 0)
     x0, y0 = across.window.x0, across.window.y0
     expected = holes[y0 : y0 + across.window.height_px, x0 : x0 + across.window.width_px]
@@ -109,11 +107,9 @@ def test_memory_stays_within_its_bound_and_what_was_given_up_comes_back_the_same
     first = maps.cut(Window(10, 10, 60, 60), 0)
     for y in range(0, 300, 50):
         for x in range(0, 450, 50):
-            window = Window(x, y, 64, 64)
-            assert maps.cut(window, 0).window.width_px >= 64
+            assert maps.cut(Window(x, y, 64, 64), 0).window.width_px >= 64
             kept = [part for part, _ in maps.regions]
-            newest = kept[-1].area_px
-            assert sum(part.area_px for part in kept) <= max(3 * 128 * 128, newest)
+            assert sum(part.area_px for part in kept) <= max(3 * 128 * 128, kept[-1].area_px)
     assert (Window(0, 0, 128, 128), 0) not in maps.regions
     np.testing.assert_array_equal(maps.cut(Window(10, 10, 60, 60), 0).search.image, first.search.image)
 

@@ -63,8 +63,7 @@ def test_a_frame_of_any_heading_height_and_tilt_is_found_where_it_was_taken(grou
 def test_scale_of_frames_much_finer_than_the_map_keeps_their_place(ground, size):
     """Every map pixel is the average of a dozen frame pixels, and none of the two rasters' half pixels is lost."""
     camera = Camera.from_fov(4 * size[0], 4 * size[1], 60.0)
-    result = locate(ground, camera, ground.frame(camera, NADIR, 140.0, heading_deg=77.0))
-    assert px_off(result, NADIR) < 0.15
+    assert px_off(locate(ground, camera, ground.frame(camera, NADIR, 140.0, heading_deg=77.0)), NADIR) < 0.15
 
 
 # Tilt
@@ -80,8 +79,7 @@ def test_a_camera_that_is_mounted_the_other_way_round_finds_the_same_place(groun
 
 @pytest.mark.parametrize("method", METHODS)
 def test_an_off_centre_principal_point_is_honoured(ground, method):
-    matrix = np.array([[250.0, 0.0, 170.0], [0.0, 255.0, 110.0], [0.0, 0.0, 1.0]])
-    camera = Camera(320, 240, matrix)
+    camera = Camera(320, 240, np.array([[250.0, 0.0, 170.0], [0.0, 255.0, 110.0], [0.0, 0.0, 1.0]]))
     frame = ground.frame(camera, NADIR, heading_deg=160.0, pitch_deg=3.0)
     assert px_off(locate(ground, camera, frame, method), NADIR) < PIXELS
 
@@ -122,8 +120,7 @@ def test_there_is_no_view_where_a_corner_looks_at_the_horizon(axis, angle):
     steepest = MAX_RAY_DEG - 30.0
     for tilt, sees in ((steepest - 5.0, True), (steepest, False), (90.0, False), (180.0, False)):
         roll, pitch = (angle * tilt, 0.0) if axis == "roll" else (0.0, angle * tilt)
-        view = view_of(CAMERA, Attitude(roll, pitch, 30.0), 150.0, UPRIGHT)
-        assert (view is not None) == sees, tilt
+        assert (view_of(CAMERA, Attitude(roll, pitch, 30.0), 150.0, UPRIGHT) is not None) == sees, tilt
 
 
 @given(roll=st.floats(-25.0, 25.0), pitch=st.floats(-25.0, 25.0), heading=st.floats(0.0, 360.0))

@@ -26,7 +26,6 @@ from tests.support.towns import drawn_town
 
 KINDS = ("fine", "broad", "mixed", "town", "tiles", "flat")
 DETAIL_PX = {"fine": (0.8, 2.5), "broad": (4.0, 12.0)}
-CASES_A_KIND = 30
 EXCLUSION_PX = (12.0, 5.0)
 
 
@@ -86,7 +85,7 @@ def assert_same_peak(quick, full, search, template):
 
 @pytest.mark.parametrize(
     ("kind", "cases"),
-    [("town", 10), ("flat", 10), *(pytest.param(kind, CASES_A_KIND, marks=pytest.mark.slow) for kind in KINDS)],
+    [("town", 10), ("flat", 10), *(pytest.param(kind, 30, marks=pytest.mark.slow) for kind in KINDS)],
 )
 def test_coarse_to_fine_finds_what_an_exhaustive_search_finds(kind, cases, town):
     quicker = 0
@@ -110,16 +109,14 @@ def test_coarse_to_fine_finds_what_an_exhaustive_search_finds(kind, cases, town)
 @pytest.mark.parametrize("offset", [0, 1, 2, 3, 5, 7])
 def test_a_double_between_the_pixels_of_a_coarse_level_is_an_equal_rival(offset):
     """The true place lies on whole coarse pixels, its exact double between them, where coarse scores are lower."""
-    rng = np.random.default_rng(offset)
-    picture = texture(rng, (300, 500), 1.2)
+    picture = texture(np.random.default_rng(offset), (300, 500), 1.2)
     picture[101 + offset : 221 + offset, 301:441] = picture[40:160, 48:188]
     enhanced = torch.from_numpy(enhance(picture))
     template = enhanced[50:150, 58:178]
     search = prepare(enhanced)
     for exhaustive in (False, True):
         peak = match_template(search, template, exclusion_px=10.0, exhaustive=exhaustive)
-        assert peak.score == pytest.approx(1.0, abs=1e-5)
-        assert peak.second_score == pytest.approx(1.0, abs=1e-5)
+        assert (peak.score, peak.second_score) == pytest.approx((1.0, 1.0), abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -128,8 +125,7 @@ def test_a_double_between_the_pixels_of_a_coarse_level_is_an_equal_rival(offset)
      ((1, 300), (1, 120)), ((300, 1), (120, 1)), ((199, 400), (198, 111)), ((129, 129), (97, 113))],
 )  # fmt: skip
 def test_odd_sizes_and_windows_with_no_room_fall_back(size, model):
-    rng = np.random.default_rng(4)
-    picture = torch.from_numpy(rng.normal(size=size).astype(np.float32))
+    picture = torch.from_numpy(np.random.default_rng(4).normal(size=size).astype(np.float32))
     y, x = (size[0] - model[0]) // 2, (size[1] - model[1]) // 2
     template = picture[y : y + model[0], x : x + model[1]]
     quick = match_template(prepare(picture), template, exclusion_px=3.0)
@@ -141,8 +137,7 @@ def test_odd_sizes_and_windows_with_no_room_fall_back(size, model):
 
 @pytest.mark.parametrize("level", [0.0, 3.3, -0.1])
 def test_flat_pictures_and_templates_never_match(level):
-    rng = np.random.default_rng(5)
-    noise = torch.from_numpy(rng.normal(size=(300, 320)).astype(np.float32))
+    noise = torch.from_numpy(np.random.default_rng(5).normal(size=(300, 320)).astype(np.float32))
     flat = torch.full((300, 320), level)
     half = noise.clone()
     half[:, 40:] = level
@@ -152,8 +147,7 @@ def test_flat_pictures_and_templates_never_match(level):
     ):  # fmt: skip
         for exhaustive in (False, True):
             peak = match_template(prepare(picture), template, exclusion_px=5.0, exhaustive=exhaustive)
-            assert math.isfinite(peak.score)
-            assert peak.score < 0.2
+            assert -1.0 <= peak.score < 0.2
 
 
 @pytest.mark.parametrize("model", [(4,), (0, 4), (1, 4, 4), (33, 8), (8, 41)])
@@ -210,9 +204,8 @@ def without_nodata(image, valid, template):
     total, square = correlated(window, ones), correlated(window**2, ones)
     of_model, of_squares = correlated(mask, model), correlated(mask, model**2)
     spread, model_spread = square - total**2 / count, of_squares - of_model**2 / count
-    scores = (correlated(window, model) - total * of_model / count) / np.sqrt(
-        np.maximum(spread * model_spread, 1e-9)
-    )
+    both = np.sqrt(np.maximum(spread * model_spread, 1e-9))
+    scores = (correlated(window, model) - total * of_model / count) / both
     return np.where(count >= MIN_OVERLAP * model.size - 0.5, scores, -1.0)
 
 
@@ -285,8 +278,7 @@ def test_a_quick_look_allows_for_a_twin_between_coarse_pixels(detail_px, phase):
         return peak.second_score < 0.5
 
     shown = enhance(np.clip(gray[40:350, 40:350] + rng.normal(0.0, 15.0, (310, 310)), 0, 255).astype(np.uint8))
-    quick = EarlyStop(is_clear, lambda _: False)
-    found = coarse_to_fine.peak(prepare(image), shown, 9.0, stop=quick)
+    found = coarse_to_fine.peak(prepare(image), shown, 9.0, stop=EarlyStop(is_clear, lambda _: False))
     assert found is None or found.second_score > 0.5
     assert all(second > 0.5 for second in seconds)
 
@@ -298,8 +290,7 @@ GROUND = Ground(size=(900, 960))
 
 def site_with(share, seed):
     valid = mask_of(np.random.default_rng(seed), GROUND.size, share)
-    gray = np.where(valid, GROUND.gray, 0).astype(np.uint8)
-    return GROUND.map_of(gray, valid=valid), valid
+    return GROUND.map_of(np.where(valid, GROUND.gray, 0).astype(np.uint8), valid=valid), valid
 
 
 @pytest.fixture

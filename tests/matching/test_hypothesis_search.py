@@ -125,8 +125,7 @@ def test_a_place_beyond_doubt_is_that_of_a_thorough_search(matcher, site, flight
     thorough = matcher().locate(unknown)
     assert len(levels) == 1
     assert looked_on == [*levels, *levels, levels[0] - 1]
-    assert abs(quick.east_m - thorough.east_m) < 0.1
-    assert abs(quick.north_m - thorough.north_m) < 0.1
+    assert (quick.east_m, quick.north_m) == pytest.approx((thorough.east_m, thorough.north_m), abs=0.1)
     assert turn_between(quick.attitude.heading_deg, thorough.attitude.heading_deg) < 0.1
 
 

@@ -31,8 +31,7 @@ def upright_sift(picture, count):
     """Stands for DISK."""
     found = sift(picture, max_keypoints=count, upright=True, spread=1)
     kept = found.valid[0]
-    xy = found.xy_px[0, kept]
-    return Keypoints(xy, found.descriptors[0, kept])
+    return Keypoints(found.xy_px[0, kept], found.descriptors[0, kept])
 
 
 class Nearest(nn.Module):
@@ -44,9 +43,8 @@ class Nearest(nn.Module):
 
     def forward(self, data):
         for name in ("image0", "image1"):
-            limit = data[name]["image_size"]
             assert (data[name]["keypoints"] >= 0).all()
-            assert (data[name]["keypoints"] <= limit).all()
+            assert (data[name]["keypoints"] <= data[name]["image_size"]).all()
         alike = data["image0"]["descriptors"][0] @ data["image1"]["descriptors"][0].T
         best, back = alike.argmax(dim=1), alike.argmax(dim=0)
         mutual = (back[best] == torch.arange(len(best))) & (alike.amax(dim=1) > 0.8)
@@ -106,8 +104,7 @@ def test_the_map_is_described_once(matcher, ground, frame):
 
 def test_an_explanation_shows_the_matches_of_the_fix(matcher, frame, prior):
     fix = matcher.locate(frame, prior)
-    shown = matcher.explain(frame, fix.window).matches
-    assert shown.agree.mean() == pytest.approx(fix.score, abs=0.1)
+    assert matcher.explain(frame, fix.window).matches.agree.mean() == pytest.approx(fix.score, abs=0.1)
 
 
 def test_keypoints_of_a_window_are_the_level_s_own_in_the_windows_pixels(ground, monkeypatch):
@@ -133,8 +130,7 @@ def test_keypoints_of_a_window_are_the_level_s_own_in_the_windows_pixels(ground,
     assert set(map(tuple, found.xy_px.tolist())) == set(map(tuple, xy[inside].tolist()))
     x, y = found.xy_px.long().T + torch.tensor([[50], [70]])
     assert torch.equal(gray[y, x], found.descriptors[:, 0])
-    few = known.find(window, 0, 50)
-    assert 20 <= len(few) <= 50
+    assert 20 <= len(known.find(window, 0, 50)) <= 50
 
 
 # Without weights, and with those of nothing.

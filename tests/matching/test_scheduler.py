@@ -1,6 +1,5 @@
 """The scheduler: what is done of each method within a budget, and what is refused before it is begun."""
 
-import math
 from dataclasses import replace
 from functools import cache
 
@@ -96,7 +95,7 @@ def test_a_pose_is_refined_from_a_coarse_peak_as_from_a_fine_one(make, frame, pr
     for fix in (hurried, by_coarse, by_fine):
         assert px_off(fix, NADIR) < 0.6
         assert fix.stage == "refined"
-    apart_m = math.hypot(by_coarse.east_m - by_fine.east_m, by_coarse.north_m - by_fine.north_m)
+    apart_m = np.hypot(by_coarse.east_m - by_fine.east_m, by_coarse.north_m - by_fine.north_m)
     assert apart_m < by_fine.relative_sigma_m
 
 
@@ -135,9 +134,8 @@ def test_a_coarse_fix_stands_unless_the_finer_peak_contradicts(make, frame, prio
             return coarse[0]
         if isinstance(off_m, Reason):
             return query.refuse(off_m, "of the finer peak", "ncc")
-        east_m = coarse[0].fix.east_m + off_m
         weak = coarse[0].weighed(replace(coarse[0].evidence, surprise=60.0, rival=60.0))
-        return replace(weak, fix=replace(weak.fix, east_m=east_m))
+        return replace(weak, fix=replace(weak.fix, east_m=coarse[0].fix.east_m + off_m))
 
     monkeypatch.setattr(Ncc, "find", refused)
     result = make("ncc").locate(frame, prior, HURRY)
@@ -228,10 +226,8 @@ def test_with_time_for_one_method_there_is_one(make, frame, prior, costs, method
 
 def test_a_search_of_the_whole_map_has_a_budget_of_its_own(make, frame):
     dear = {"ncc_search": 1.0}
-    result = make("ncc", **dear).locate(frame, None, Budget(total_ms=1e4))
-    assert result.reason is Reason.LATE
-    fix = make("ncc", **dear).locate(frame, None, Budget(total_ms=1e4, search_ms=math.inf))
-    assert px_off(fix, NADIR) < 3
+    assert make("ncc", **dear).locate(frame, None, Budget(total_ms=1e4)).reason is Reason.LATE
+    assert px_off(make("ncc", **dear).locate(frame, None, Budget(total_ms=1e4, search_ms=np.inf)), NADIR) < 3
 
 
 @pytest.fixture(scope="module")
@@ -277,16 +273,13 @@ def test_a_vague_prior_does_not_raise_the_cost_of_a_sharp_one(site, camera, fram
     assert isinstance(matcher.locate(frame, prior, Budget(total_ms=3_600_000.0)), Fix)
 
 
-NOISE = np.random.default_rng(0).integers(0, 255, (300, 300), np.uint8)
-
-
 @pytest.mark.parametrize(
     ("method", "changed"),
     [
         ("auto", {}),
         ("sift", {"heading_deg": 6.0}),  # refinement has to begin on a coarser level
         ("ncc", {"roll_deg": None, "pitch_deg": None}),
-        ("ncc", {"image": NOISE}),
+        ("ncc", {"image": np.random.default_rng(0).integers(0, 255, (300, 300), np.uint8)}),
     ],
     ids=["usual", "another heading", "no tilt", "refused"],
 )

@@ -1,7 +1,6 @@
 """Enhanced grey levels and structure: each is what its line says, respects nodata, finds its place."""
 
 import itertools
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -36,11 +35,10 @@ def test_a_pixel_is_normalised_by_its_neighbourhood(masked):
     """Of the smoothed picture."""
     gray = noise()
     smooth = binomial(gray)
-    valid = np.ones(gray.shape, bool) if masked else None
-    enhanced = enhance(gray, radius_px=3, valid=valid)
+    enhanced = enhance(gray, radius_px=3, valid=np.ones(gray.shape, bool) if masked else None)
     for y, x in ((10, 10), (20, 33), (50, 44)):
         box = smooth[y - 3 : y + 4, x - 3 : x + 4]
-        expected = (smooth[y, x] - box.mean()) / math.sqrt(box.var() + 4.0)
+        expected = (smooth[y, x] - box.mean()) / np.sqrt(box.var() + 4.0)
         assert enhanced[y, x] == pytest.approx(expected, abs=0.05)  # smoothed to whole grey levels
 
 
@@ -139,8 +137,7 @@ def test_a_block_may_lie_off_its_place_and_the_frame_scores_as_if_it_did_not():
         place = np.s_[:, y + top + down :, x + left + right :]
         template[:, 0, top : top + block[0], left : left + block[1]] = search[place][:, : block[0], : block[1]]
     rigid, giving = by_blocks(search, template, CPU, 3)[:, 0]
-    assert giving[y, x] == pytest.approx(1.0, abs=1e-5)
-    assert giving[y, x] == giving.max()
+    assert giving[y, x] == giving.max() == pytest.approx(1.0, abs=1e-5)
     assert rigid[y, x] < 0.9
     assert (giving >= rigid - 1e-6).all()
 

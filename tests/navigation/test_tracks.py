@@ -51,8 +51,7 @@ def test_a_measured_step_carries_position_and_velocity_with_the_error_that_match
     """Told 4 to 6 m/s east, found to be 1 m/s less: 5 m/s over 2 s, less 2 m."""
     step = Step(np.array([10.0, 0.0]), np.array([4.0, 0.0]), np.array([6.0, 0.0]), sigma_mps=0.5, noise_m2=0.3)
     track = a_track(velocity=(3.0, 0.0)).carried(Ways(2.0, stated=step), OPTIONS)
-    assert track.en_m == pytest.approx([8.0, 0.0])
-    assert track.velocity_mps == pytest.approx([5.0, 0.0])
+    assert (*track.en_m, *track.velocity_mps) == pytest.approx((8.0, 0.0, 5.0, 0.0))
     expected = np.array([[4.0 + 2 * 2.0 + 4 * 2.0 + 0.3, 5.0], [5.0, 2.0]])
     assert position_and_velocity(track) == pytest.approx(expected)
 
@@ -139,10 +138,8 @@ def test_a_way_in_two_parts_is_the_whole_way():
     parts = a_track(velocity=(3.0, 1.0))
     parts = parts.carried(Ways(0.6, stated=Step(np.array([3.0, 0.0]), begin, between, 0.5, 0.09)), OPTIONS)
     parts = parts.carried(Ways(1.4, stated=Step(np.array([7.0, 0.0]), between, end, 0.5, 0.21)), OPTIONS)
-    assert parts.en_m == pytest.approx(whole.en_m)
-    assert parts.velocity_mps == pytest.approx(whole.velocity_mps)
-    assert parts.covariance == pytest.approx(whole.covariance)
-    assert parts.support == pytest.approx(whole.support)
+    for name in ("en_m", "velocity_mps", "covariance", "support"):
+        assert getattr(parts, name) == pytest.approx(getattr(whole, name)), name
 
 
 # Bayes' rule
@@ -154,8 +151,7 @@ def tracks_of(*known, options=LONG_AGO):
 
 def test_a_match_where_a_track_predicts_it_is_right_by_both():
     """The track: 20 nats. The match: 9.2 of its own, that it lies here, and that every second frame is empty."""
-    track = a_track(covariance=((3.0, 0.0), (0.0, 1.0)))
-    weighed = tracks_of(track).weighed(match(fix_at(0.0)))
+    weighed = tracks_of(a_track(covariance=((3.0, 0.0), (0.0, 1.0)))).weighed(match(fix_at(0.0)))
     own = CERTAIN + math.log(AREA_M2 / (2.0 * math.pi * 4.0)) + MISS
     grown = 20.0 + 0.5 * CERTAIN  # of the same ground
     right, wrong = grown - np.logaddexp(0.0, -own), np.logaddexp(grown - np.logaddexp(0.0, own), 0.0)
@@ -180,12 +176,9 @@ def test_a_match_of_the_same_ground_counts_half_and_its_agreement_nothing(moved_
 
 
 def test_of_two_motions_the_better_one_gains_whatever_the_ground():
-    near, far = (
-        a_track(trusts_velocity=stated, covariance=((v, 0.0), (0.0, 1.0)))
-        for stated, v in ((True, 3.0), (False, 15.0))
-    )
-    weighed = tracks_of(near, far).weighed(match(fix_at(0.0)))
-    first, second = weighed.tracks.known
+    near = a_track(trusts_velocity=True, covariance=((3.0, 0.0), (0.0, 1.0)))
+    far = a_track(trusts_velocity=False, covariance=((15.0, 0.0), (0.0, 1.0)))
+    first, second = tracks_of(near, far).weighed(match(fix_at(0.0))).tracks.known
     assert first.trusts_velocity
     assert first.log_odds - second.log_odds == pytest.approx(math.log(16.0 / 4.0))
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import Fix, Window
+from engine import Window
 from scenematch.runs.settings import TrackSettings
+from tests.support.fixes import px_off
 from tests.support.ground import Ground
 
-HEIGHT_M = 80.0
 PLANE_DEG = 25.0  # the heading in the plane's axes, by which the pictures are drawn
 NADIR = np.array([500.0, 300.0])
 
@@ -33,7 +33,7 @@ def north_deg(polar):
 
 @pytest.fixture(scope="module")
 def frame(polar, camera, north_deg):
-    drawn = polar.frame(camera, NADIR, HEIGHT_M, heading_deg=PLANE_DEG)
+    drawn = polar.frame(camera, NADIR, 80.0, heading_deg=PLANE_DEG)
     return replace(drawn, heading_deg=PLANE_DEG - north_deg)
 
 
@@ -55,9 +55,8 @@ def heading_off(fix, heading_deg):
 )
 def test_a_frame_with_its_true_heading_lies_on_the_map(make, polar, frame, method, profile):
     fix = make(method, profile).locate(frame, polar.prior(NADIR))
-    assert isinstance(fix, Fix)
     assert fix.score > 0.97
-    assert np.hypot(*(np.array(fix.map_xy_px) - NADIR)) < (1.0 if profile == "paper" else 0.2)
+    assert px_off(fix, NADIR) < (1.0 if profile == "paper" else 0.2)
     if fix.attitude is not None:
         assert heading_off(fix, frame.heading_deg) < 0.05
 
@@ -67,7 +66,6 @@ def test_a_heading_that_was_searched_for_is_the_true_one(make, polar, frame, kno
     """Without a prior the search begins with north as in the map's middle."""
     turned = replace(frame, heading_deg=frame.heading_deg + 20.0, heading_sigma_deg=8.0)
     fix = make("ncc").locate(turned, polar.prior(NADIR) if known else None)
-    assert isinstance(fix, Fix)
     assert heading_off(fix, frame.heading_deg) < 0.2
 
 

@@ -22,8 +22,7 @@ def written(path, data, crs="EPSG:32643", step=(0.5, 0.5), corner=(500_000.0, 3_
 
 def test_a_window_is_that_of_the_file(tmp_path):
     data = picture()
-    site = written(tmp_path / "m.tif", data)
-    found = map_colours(site, Window(20, 30, 64, 48), (48, 64))
+    found = map_colours(written(tmp_path / "m.tif", data), Window(20, 30, 64, 48), (48, 64))
     off = found.astype(int) - np.moveaxis(data[:, 30:78, 20:84], 0, -1)
     assert np.abs(off).max() <= 1  # of 256 levels, where the interpolation rounds
     assert (off != 0).mean() < 0.02
@@ -37,9 +36,8 @@ def test_half_the_size_is_the_mean_of_four(tmp_path):
 
 
 def test_a_map_in_degrees_is_shown_on_its_metric_grid(tmp_path):
-    data = picture()
     step = (0.5 / 94_000.0, 0.5 / 110_900.0)
-    site = written(tmp_path / "m.tif", data, "EPSG:4326", step, (75.0, 33.0))
+    site = written(tmp_path / "m.tif", picture(), "EPSG:4326", step, (75.0, 33.0))
     window = Window(10, 10, site.width_px - 20, site.height_px - 20)
     found = map_colours(site, window, (window.height_px, window.width_px)).astype(float)
     # Where a place lies in the file by its latitude and longitude is what red and green say.
@@ -62,7 +60,5 @@ def test_a_colour_table_is_shown_and_grey_has_no_colours(tmp_path):
 def test_sixteen_bits_are_stretched(tmp_path):
     data = (picture().astype(np.uint16) + 300) * 20
     found = map_colours(written(tmp_path / "deep.tif", data), Window(0, 0, 160, 120), (120, 160))
-    assert found.dtype == np.uint8
-    assert found.min() == 0
-    assert found.max() == 255
+    assert (found.dtype, found.min(), found.max()) == (np.uint8, 0, 255)
     assert (np.diff(found[60, :, 0].astype(int)) >= 0).all()

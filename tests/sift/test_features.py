@@ -16,7 +16,6 @@ from tests.support.matches import pairs_of
 from tests.support.tensors import assert_close
 
 NAMES = {"compiled": "scenematch", "kornia": "kornia SIFT"}  # among the detectors of the benchmarks
-LEVEL_RATIO = 2 ** (1 / 3)
 
 
 @pytest.fixture(params=["compiled", "kornia"])
@@ -64,15 +63,13 @@ def test_a_blob_lies_at_its_centre_and_has_its_scale(upsample, tolerance_px, sig
     found = sift(blob(*centre, sigma), upsample=upsample, backend=backend)
     best = 0  # slots are ordered by contrast
     assert found.valid[0, best]
-    error = found.xy_px[0, best].numpy() - centre
-    assert np.abs(error).max() < tolerance_px
+    assert np.abs(found.xy_px[0, best].numpy() - centre).max() < tolerance_px
     scene = math.sqrt(sigma**2 - 0.5**2)  # the camera's blur is taken out
-    assert found.scale_px[0, best] == pytest.approx(scene / math.sqrt(LEVEL_RATIO), rel=0.05)
+    assert found.scale_px[0, best] == pytest.approx(scene / math.sqrt(2 ** (1 / 3)), rel=0.05)
 
 
 def test_positions_have_no_bias(backend):
-    rng = np.random.default_rng(5)
-    centres = rng.uniform(28, 36, (60, 2))
+    centres = np.random.default_rng(5).uniform(28, 36, (60, 2))
     images = torch.cat([blob(x, y, 3.0) for x, y in centres])
     errors = sift(images, max_keypoints=1, backend=backend).xy_px[:, 0].numpy() - centres
     assert np.abs(errors.mean(0)).max() < 0.004  # OpenCV's is 0.25
@@ -151,8 +148,7 @@ def test_the_mask_holds_keypoints_back(backend):
     image = tensor(texture(120, 120))
     mask = torch.zeros_like(image, dtype=torch.bool)
     mask[..., 30:70, 50:100] = True
-    found = sift(image, mask=mask, backend=backend)
-    xy = valid_xy(found)
+    xy = valid_xy(sift(image, mask=mask, backend=backend))
     assert 5 < len(xy) < sift(image, backend=backend).valid.sum()
     assert (np.abs(xy - (74.5, 49.5)) <= (25, 20)).all()
 
