@@ -184,13 +184,11 @@ def command_options():
 def test_every_option_is_in_the_lines_of_its_command(command, options):
     section = read("docs/command-line.md").split(f"## {command}\n", 1)[1].split("\n## ", 1)[0]
     lines = next(iter(re.findall(r"^```\n(.*?)^```", section, re.MULTILINE | re.DOTALL)), "")
-    stated = set(re.findall(r"--[a-z][a-z-]*", lines)) - {"--force"}
-    assert stated == set(options)
+    assert set(re.findall(r"--[a-z][a-z-]*", lines)) - {"--force"} == set(options)
 
 
 def test_the_site_shows_the_help_of_every_option():
-    page = read("docs/command-line.md")
-    shown = with_options(page)
+    shown = with_options(read("docs/command-line.md"))
     for command, options in command_options():
         section = shown.split(f"## {command}\n", 1)[1].split("\n## ", 1)[0]
         rows = re.findall(r"^\| `(--[a-z-]+)[^|]*\| .* \| .+ \|$", section, re.MULTILINE)

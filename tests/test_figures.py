@@ -138,8 +138,7 @@ def without_claims(name, text):
 
 @pytest.mark.parametrize("name", sorted(UNMEASURED))
 def test_every_figure_of_the_front_pages_is_traced(name):
-    prose = re.sub(r"```.*?```", "", page(name))
-    assert FIGURE.findall(without_claims(name, prose)) == []
+    assert FIGURE.findall(without_claims(name, re.sub(r"```.*?```", "", page(name)))) == []
 
 
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*.md"))

@@ -59,8 +59,7 @@ def test_the_turn_and_the_scale_of_a_pair_are_those_of_its_map():
 
 @pytest.mark.parametrize(("off_px", "repeated", "right"), [(1.4, 1.0, 1.0), (2.0, 0.0, 1.0), (3.1, 0.0, 0.0)])
 def test_a_shifted_keypoint_counts_up_to_the_tolerances(places, off_px, repeated, right):
-    pair = pair_by(np.eye(3))
-    figures = judge(keypoints(places), keypoints(places + np.array([off_px, 0.0])), pair)
+    figures = judge(keypoints(places), keypoints(places + np.array([off_px, 0.0])), pair_by(np.eye(3)))
     assert (figures.repeatability, figures.inlier_ratio) == (repeated, right)
 
 

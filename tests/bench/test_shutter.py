@@ -46,8 +46,7 @@ def test_each_row_of_a_rolling_shutter_is_seen_from_where_the_camera_then_is(row
     after_s = (seen[1] / 299.0 - 0.5) * 0.06
     way = TO_GRID @ velocity[:2] * after_s  # of the camera until that moment
     then = Attitude(2.0 + 20.0 * after_s, -1.0 - 10.0 * after_s, 5.0 + 40.0 * after_s)
-    grid = TO_CRS @ (600, row, 1.0)
-    expected = project(CAMERA, grid, 0.0, position + way, 150.0 + 4.0 * after_s, then)
+    expected = project(CAMERA, TO_CRS @ (600, row, 1.0), 0.0, position + way, 150.0 + 4.0 * after_s, then)
     np.testing.assert_allclose(seen, expected, atol=0.25)
     still = centre_of_bright(swayed(world, Shutter(), velocity, turn, attitude, tuple(position)))
     assert np.abs(still - expected).max() > 0.8

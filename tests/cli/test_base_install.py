@@ -26,8 +26,7 @@ print("CODES", json.dumps([run(line) for line in {lines}]))
 
 def run_without(lines):
     """Exit codes of commands in a new interpreter that has none of these packages, and what they said."""
-    program = PROGRAM.format(absent=OF_DESKS, lines=[[str(word) for word in line] for line in lines])
-    done = done_by(program)
+    done = done_by(PROGRAM.format(absent=OF_DESKS, lines=[[str(word) for word in line] for line in lines]))
     return json.loads(done.stdout.rpartition("CODES ")[2]), done.stderr
 
 

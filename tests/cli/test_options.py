@@ -38,8 +38,7 @@ def test_help_has_panels(capsys):
 
 def test_later_settings_count_more_and_options_most(save):
     text = 'method = "sift"\nbudget_ms = 40\n[input]\nevery = 2\n[bridge]\nnice = -5\nrealtime = true\n'
-    file = save(text, "mine.toml")
-    settings = Settings.read([file, "input.every=3", "navigator.odometry=true"])
+    settings = Settings.read([save(text, "mine.toml"), "input.every=3", "navigator.odometry=true"])
     assert settings.table("input").every == 3
     track = settings.track(method="ncc", device=None)
     assert (track.method, track.budget_ms, track.navigator.odometry, track.device) == ("ncc", 40.0, True, "auto")

@@ -46,8 +46,7 @@ def test_the_unit_is_recognised_and_said_in_one_line(tmp_path, truth_ns, per_s, 
     ("column", "per_s"), [("timestamp_us", 10**6), ("timestamp_ms", 10**3), ("timestamp_s", 1)]
 )
 def test_a_name_that_states_the_unit_needs_no_words(tmp_path, column, per_s):
-    path = table(tmp_path / "t.csv", [k * 10 * per_s for k in range(5)], column)
-    rows, remarks = open_telemetry(path)
+    rows, remarks = open_telemetry(table(tmp_path / "t.csv", [k * 10 * per_s for k in range(5)], column))
     assert remarks == []
     assert [row.timestamp_ns for row in rows] == [k * 10**10 for k in range(5)]
 

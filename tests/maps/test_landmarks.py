@@ -21,8 +21,7 @@ from tests.support.rasters import from_corner, whole, write_raster
 def site():
     """More than two tiles a side, with ground that rises to the east."""
     ground = Ground(size=(560, 600))
-    rising = np.tile(np.linspace(10.0, 40.0, 600, dtype=np.float32), (560, 1))
-    return ground.map_of(surface_m=rising)
+    return ground.map_of(surface_m=np.tile(np.linspace(10.0, 40.0, 600, dtype=np.float32), (560, 1)))
 
 
 @pytest.fixture(scope="module")
@@ -146,15 +145,11 @@ def prepared(path, upright=True, backend="auto"):
     return table(marks.find(whole(site), 0, upright=upright))
 
 
-def refuse(*_, **__):
-    raise AssertionError("described anew")
-
-
 @pytest.mark.parametrize("upright", [True, False])
 def test_a_prepared_map_is_read_back_as_it_was_found(stored, monkeypatch, upright):
     first = prepared(stored[0], upright)
     assert len(first) > 100
-    monkeypatch.setattr(landmarks, "sift", refuse)
+    monkeypatch.setattr(landmarks, "sift", lambda *_, **__: pytest.fail("described anew"))
     np.testing.assert_array_equal(prepared(stored[0], upright), first)
 
 

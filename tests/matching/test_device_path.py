@@ -23,8 +23,7 @@ SIZES = pytest.mark.parametrize(
 
 
 def picture(height, width, seed):
-    rng = torch.Generator().manual_seed(seed)
-    rough = torch.randn(1, 1, height, width, generator=rng)
+    rough = torch.randn(1, 1, height, width, generator=torch.Generator().manual_seed(seed))
     return torch.nn.functional.avg_pool2d(rough, 5, stride=1, padding=2)[0, 0] * 4.0
 
 

@@ -117,14 +117,12 @@ def test_look_alikes_make_a_surprise_worth_as_much_less():
 @given(st.floats(7.0, 1e6), st.booleans())
 def test_a_rival_that_is_as_good_leaves_no_evidence_but_the_priors(surprise, mirrored):
     rival = {"null" if mirrored else "rival": surprise}
-    alike = replace(Evidence(surprise, 0.0, 1000.0, 1000.0, None), **rival)
-    assert alike.nats <= 1e-9
+    assert replace(Evidence(surprise, 0.0, 1000.0, 1000.0, None), **rival).nats <= 1e-9
 
 
 def test_the_rate_of_alarms_is_what_the_evidence_allows():
     """Peaks of 20,000 surfaces of chance: evidence e comes no more often than exp(-e)."""
-    rng = np.random.default_rng(1)
-    scores = np.sort(rng.normal(size=(20_000, 500)), axis=1)[:, -2:] ** 2 / 2.0
+    scores = np.sort(np.random.default_rng(1).normal(size=(20_000, 500)), axis=1)[:, -2:] ** 2 / 2.0
     nats = np.array([Evidence(high, rival, 500.0, 500.0, None).nats for rival, high in scores])
     for e in (1.0, 2.0, 4.0, 6.0):
         assert np.mean(nats > e) <= math.exp(-e)
@@ -184,5 +182,4 @@ def test_of_a_peak_and_its_refined_pose_the_greater_evidence_counts():
 
 @given(st.floats(7.0, 1e3))
 def test_a_refined_pose_is_no_evidence_against_a_rival_as_good_as_its_peak(surprise):
-    alike = Evidence(surprise, surprise, 1000.0, 1000.0, None, refined=1e4)
-    assert alike.nats <= 1e-9
+    assert Evidence(surprise, surprise, 1000.0, 1000.0, None, refined=1e4).nats <= 1e-9

@@ -2,7 +2,6 @@
 
 import importlib.machinery
 import importlib.util
-import math
 import re
 import sys
 from types import ModuleType, SimpleNamespace
@@ -63,7 +62,7 @@ def test_files_that_the_package_of_ros_2_names_are_there():
 
 def quarter_turns(pose):
     """Yaw of an SDF pose in quarter turns."""
-    return round(float(pose.split()[5]) / (math.pi / 2.0), 6)
+    return round(float(pose.split()[5]) / (np.pi / 2.0), 6)
 
 
 def test_the_nose_is_north_and_the_ground_is_under_it_as_each_plugin_has_its_world():
@@ -139,7 +138,7 @@ def test_the_simulated_camera_is_the_calibrated_one(stack):
     link = ElementTree.parse(stack / "models/iris_with_nadir_camera/model.sdf").getroot().find(".//link")
     size = [int(link.findtext(f".//image/{side}")) for side in ("width", "height")]
     assert size == [camera.width_px, camera.height_px] == [300, 300]
-    focal_px = 150.0 / math.tan(float(link.findtext(".//horizontal_fov")) / 2.0)
+    focal_px = 150.0 / np.tan(float(link.findtext(".//horizontal_fov")) / 2.0)
     assert camera.matrix[0, 0] == camera.matrix[1, 1] == pytest.approx(focal_px)
     turn = Rotation.from_euler("xyz", [float(v) for v in link.findtext("pose").split()[3:]]).as_matrix()
     # Gazebo's camera looks along x, with z up in the picture and y to its left; its body is forward-left-up.
@@ -230,9 +229,8 @@ def test_positions_in_a_bag_are_compared_with_its_truth(tmp_path, capsys, monkey
     topics = {"/truth/height_agl": [(time_ns, maker.float64(100.0)) for time_ns in stamps_ns]}
     for topic, north_m in off_m.items():
         places = [map(float, frame.geodetic_from_enu(7.0 * k, north_m)) for k in range(20)]
-        topics[topic] = [
-            (t, maker.position(t, "", *at, np.eye(3))) for t, at in zip(stamps_ns, places, strict=True)
-        ]
+        stamped = zip(stamps_ns, places, strict=True)
+        topics[topic] = [(t, maker.position(t, "", *at, np.eye(3))) for t, at in stamped]
     written(tmp_path / "flight.bag", topics)
     monkeypatch.setattr(sys, "argv", ["compare", str(tmp_path / "flight.bag")])
     loaded(STACK / "scripts/compare").main()

@@ -1,6 +1,5 @@
 """Truths about the pose: recovered where it is there, within its covariance, and refused where it is not."""
 
-import math
 from dataclasses import replace
 
 import cv2
@@ -41,7 +40,7 @@ def narrow_view(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
-    return math.degrees(np.linalg.norm(cv2.Rodrigues(a @ b.T)[0]))
+    return np.degrees(np.linalg.norm(cv2.Rodrigues(a @ b.T)[0]))
 
 
 # Recovered.
@@ -210,8 +209,7 @@ def test_many_matches_on_one_spot_count_once():
     for pixels, carried in zip(spots, (True, False), strict=True):
         rays = np.c_[pixels, np.ones(12)] @ np.linalg.inv(K).T @ s.rotation
         points = s.center_m + rays * (-s.center_m[2] / rays[:, 2])[:, None]
-        pose = solve_pose(np.r_[s.points_m, points], np.r_[s.points_px, pixels], K)
-        assert (pose is not None) == carried
+        assert (solve_pose(np.r_[s.points_m, points], np.r_[s.points_px, pixels], K) is not None) == carried
 
 
 @pytest.mark.parametrize("found", [*map(range, (0, 1, 3)), 12 * [0, 1, 2, 3, 4], 30 * [0]], ids=len)
@@ -237,16 +235,14 @@ def test_points_on_a_line_are_refused():
     rng = np.random.default_rng(16)
     along = rng.uniform(-60, 60, 40)
     points = np.c_[along, 0.5 * along, np.zeros(40)]
-    camera = scene(rng, tilt_deg=0)
-    x = (points - [0, 0, 150]) @ camera.rotation.T
+    x = (points - [0, 0, 150]) @ scene(rng, tilt_deg=0).rotation.T
     for noise in (0.0, 0.5):
         pixels = (x @ K.T)[:, :2] / x[:, 2:] + rng.normal(0, noise, (40, 2))
         assert solve_pose(points, pixels, K) is None
 
 
 def test_points_in_one_place_of_the_map_are_refused():
-    s = scene(np.random.default_rng(18), 50)
-    assert solve_pose(np.zeros((50, 3)), s.points_px, K) is None
+    assert solve_pose(np.zeros((50, 3)), scene(np.random.default_rng(18), 50).points_px, K) is None
 
 
 def test_a_camera_below_the_ground_is_refused():
@@ -259,8 +255,7 @@ def test_the_narrow_view_of_a_plane_is_ambiguous():
     """Nearly parallel rays leave two tilts: a pose is given only when the points tell them apart."""
     points, pixels, noise = narrow_view(np.random.default_rng(20))
     assert solve_pose(points, pixels + noise, NARROW) is None
-    exact = solve_pose(points, pixels, NARROW)
-    assert angle_deg(exact.rotation, tilted(8.0)) < 0.1
+    assert angle_deg(solve_pose(points, pixels, NARROW).rotation, tilted(8.0)) < 0.1
 
 
 def test_a_little_relief_does_not_hide_the_ambiguity():

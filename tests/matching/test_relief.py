@@ -1,6 +1,5 @@
 """Over hills: the ground below is found under what stands on it, and a fix lies where the truth is."""
 
-import math
 from dataclasses import replace
 
 import cv2
@@ -70,8 +69,7 @@ def test_a_fix_over_hills_lies_where_the_truth_is(scene, ground, camera, stated,
     """The map's ground lies up to 40 m off the ground below, and the height is above the latter."""
     site, frame, up_m = scene
     frame = frame if stated else replace(frame, roll_deg=None, pitch_deg=None)
-    prior = None if somewhere else ground.prior(NADIR)
-    fix = matcher_of(site, camera).locate(frame, prior)
+    fix = matcher_of(site, camera).locate(frame, None if somewhere else ground.prior(NADIR))
     assert fix.stage == "refined"
     assert px_off(fix, NADIR) < 0.7
     assert fix.up_m == pytest.approx(up_m, abs=0.2)
@@ -119,7 +117,6 @@ def test_where_nothing_is_known_the_ground_is_the_maps():
 # A map alone: the refined pose over ground whose slope nobody stated
 
 TRUE = {"roll_deg": 4.0, "pitch_deg": -3.0, "heading_deg": 20.0}
-OFF_DEG = [(0.5, -0.3), (-0.4, 0.4), (0.2, 0.5), (-0.5, -0.2)]
 
 
 def tangent(degrees):
@@ -181,7 +178,7 @@ def test_a_slope_that_looks_like_a_tilt_is_told_from_it_by_the_stated_attitude(s
     seen = (sloping - center) @ true
     pixels = seen[:, :2] / seen[:, 2:] * 260.0 + 150.0 + rng.normal(0.0, 0.3, (200, 2))
     told = true.T @ cv2.Rodrigues(np.radians([told_off_deg, 0.0, 0.0]))[0]
-    wide = AttitudePrior(told, math.hypot(0.37, wide_slope_deg(2.0)))
+    wide = AttitudePrior(told, np.hypot(0.37, wide_slope_deg(2.0)))
     camera_matrix = np.array([[260.0, 0.0, 150.0], [0.0, 260.0, 150.0], [0.0, 0.0, 1.0]])
     solved = solve_pose(points, pixels, camera_matrix, prior=wide)
     level = Pose(solved.rotation, solved.center_m, np.zeros(2))
@@ -215,7 +212,7 @@ def level_fixes(ground, site, camera):
     by_peak, refined = [], []
     for rows, refine in ((by_peak, False), (refined, True)):
         matcher = matcher_of(site, camera, refine)
-        for roll_deg, pitch_deg in OFF_DEG:
+        for roll_deg, pitch_deg in [(0.5, -0.3), (-0.4, 0.4), (0.2, 0.5), (-0.5, -0.2)]:
             tilt = {"roll_deg": TRUE["roll_deg"] + roll_deg, "pitch_deg": TRUE["pitch_deg"] + pitch_deg}
             fix = matcher.locate(replace(frame, **tilt), ground.prior(NADIR))
             rows.append((fix, ground.off_m(fix, NADIR)))
@@ -258,6 +255,5 @@ def test_drawn_over_the_relief_a_frame_matches_steep_ground_better_than_on_a_pla
         peak = correlator.search(aligned, correlator.window(aligned))
         scores[over_relief] = peak.score
         assert np.hypot(*(correlator.nadir_px(peak, aligned) - NADIR)) < (2.0 if over_relief else 10.0)
-        nowhere = correlator.nowhere(aligned)
-        assert [patch.shape for patch in nowhere] == [aligned.patch.gray.shape] * 2
+        assert [patch.shape for patch in correlator.nowhere(aligned)] == [aligned.patch.gray.shape] * 2
     assert scores[True] > scores[False] + 0.1

@@ -14,8 +14,7 @@ HEIGHT_M, HEADING_DEG = 140.0, 30.0
 
 @pytest.fixture(scope="module")
 def tiled(ground):
-    site = ground.flat_site
-    tile = site.gray(Window(200, 180, TILE_PX, TILE_PX))
+    tile = ground.flat_site.gray(Window(200, 180, TILE_PX, TILE_PX))
     to_crs = [[ground.gsd_m, 0.0, 500_000.0], [0.0, -ground.gsd_m, 5_344_000.0]]
     return OrthoMap.from_arrays(np.tile(tile, (TILES, TILES)), to_crs, f"EPSG:{ground.epsg}")
 
@@ -24,8 +23,7 @@ def above(tiled, camera, nadir_px, rng):
     """A level frame drawn from the map itself, with the noise of another exposure."""
     scale, turn = HEIGHT_M / camera.focal_px / tiled.gsd_m_per_px, math.radians(HEADING_DEG)
     turned = scale * np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    middle = camera.matrix[:2, 2]
-    to_map = np.c_[turned, nadir_px - turned @ middle]
+    to_map = np.c_[turned, nadir_px - turned @ camera.matrix[:2, 2]]
     gray = tiled.gray(Window(0, 0, tiled.width_px, tiled.height_px))
     size = (camera.width_px, camera.height_px)
     seen = cv2.warpAffine(gray, to_map, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)

@@ -110,8 +110,7 @@ def clock_stands(monkeypatch):
     ids=["no tilt", "no heading", "no height"],
 )
 def test_without_a_telemetry_to_hold_to_the_features_do_it_alone(ground, camera, matcher, known):
-    fix = matcher.locate(replace(shot(ground, camera), **known), ground.prior(NADIR))
-    assert fix.stage == "fine"
+    assert matcher.locate(replace(shot(ground, camera), **known), ground.prior(NADIR)).stage == "fine"
 
 
 @pytest.mark.parametrize(
@@ -157,8 +156,7 @@ def test_few_features_leave_the_time_for_all(ground, camera, site, monkeypatch):
 def test_certain_few_features_are_kept_where_all_come_too_late(ground, camera, matcher, monkeypatch):
     refuse_to_refine(monkeypatch)
     monkeypatch.setattr(Sift, "at_scale", out_of_time)
-    fix = matcher.locate(shot(ground, camera), ground.prior(NADIR))
-    assert fix.stage == "coarse"
+    assert matcher.locate(shot(ground, camera), ground.prior(NADIR)).stage == "coarse"
 
 
 def test_a_pose_refined_to_another_height_is_not_taken(ground, camera, matcher, plain):

@@ -66,8 +66,7 @@ def test_crowded_matches_count_less():
 
 
 def test_a_second_place_with_as_many_votes_is_a_rival():
-    rng = np.random.default_rng(9)
-    photo = rng.uniform(-80, 80, (60, 2))
+    photo = np.random.default_rng(9).uniform(-80, 80, (60, 2))
     on_map = photo + np.where(np.arange(60)[:, None] < 30, (31.0, -12.0), (-60.0, 50.0))
     found = vote(photo, on_map, RADIUS_PX, DISTINCT_PX)
     assert np.count_nonzero(found.voters) == 30
@@ -77,8 +76,7 @@ def test_a_second_place_with_as_many_votes_is_a_rival():
 
 
 def test_matches_of_the_pose_are_no_rival_though_a_wrong_height_scatters_their_votes():
-    rng = np.random.default_rng(10)
-    photo, on_map = planted(rng, right=60, wrong=60)
+    photo, on_map = planted(np.random.default_rng(10), right=60, wrong=60)
     on_map[:60] += 0.3 * photo[:60]
     found = vote(photo, on_map, RADIUS_PX, DISTINCT_PX)
     assert found.rival_surprise(NOTHING[:120]) > 0.5 * found.surprise

@@ -35,6 +35,5 @@ def test_any_sequence_ends_in_documented_ways(tiny, steps, method, start):
     ],
 )
 def test_a_bad_frame_costs_itself_and_any_number_of_errors_nothing(tiny, method, words, times):
-    steps = [RIGHT] * 4 + [replace(RIGHT, **words)] * times + [RIGHT] * 3
-    endings = fly(tiny, steps, method, start=True)
+    endings = fly(tiny, [RIGHT] * 4 + [replace(RIGHT, **words)] * times + [RIGHT] * 3, method, start=True)
     assert (endings["fix"], endings.total()) == (7, 7 + times)

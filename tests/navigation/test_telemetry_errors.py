@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engine import AssumedErrors, Attitude, Camera, Fix, Frame, Navigator, Prior, SceneMatcher
+from engine import AssumedErrors, Attitude, Camera, Fix, Frame, Navigator, NavigatorOptions, Prior, SceneMatcher
 from engine.navigation.telemetry_errors import TelemetryErrors, considered
-from engine.options import NavigatorOptions
 from scenematch.runs.paper_recipe import ACCEPT_ALL
 from scenematch.simulator import plan_flight
 from tests.support.fields import fields_of
@@ -172,8 +171,7 @@ def test_an_attitude_that_is_simply_wrong_is_no_lag_of_seconds():
 def test_a_bias_that_changes_is_followed():
     times_s = np.arange(300) * INTERVAL_S
     flight = [(time_s, frame_at(time_s, (0.0, 0.0, -4.0 if time_s < 15.0 else 4.0))) for time_s in times_s]
-    found = taught(flight, angles)
-    assert found.attitude.heading_deg == pytest.approx(-4.0, abs=0.5)
+    assert taught(flight, angles).attitude.heading_deg == pytest.approx(-4.0, abs=0.5)
 
 
 def test_one_wild_attitude_moves_it_by_little():

@@ -94,12 +94,11 @@ def test_it_changes_no_result(flown, method):
 
 
 def test_each_frame_is_there_once_with_its_stamp(runs):
-    track = read_track(runs / "ncc-on" / "track.csv")
     rows = rows_of(runs / "ncc.rrd")
     for entity in ("frame", "state", "plots/latency_ms", "log"):
         assert sorted(rows[entity]) == list(range(FRAMES)), entity
         assert all(len(at) == 1 for at in rows[entity].values()), entity
-    for frame, row in enumerate(track):
+    for frame, row in enumerate(read_track(runs / "ncc-on" / "track.csv")):
         assert rows["frame"][frame][0]["capture"] == row.timestamp_ns
 
 
@@ -140,8 +139,7 @@ def test_the_frame_is_the_picture_that_was_taken(runs):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_ellipsoid_is_the_covariance(seed):
-    rng = np.random.default_rng(seed)
-    root = rng.standard_normal((3, 3))
+    root = np.random.default_rng(seed).standard_normal((3, 3))
     covariance = root @ root.T
     shape = ellipsoid(np.zeros(3), covariance)
     (about,) = shape.rotation_axis_angles.as_arrow_array().to_pylist()
@@ -270,8 +268,7 @@ def test_what_cannot_be_watched_is_refused_in_one_line_before_any_work(tmp_path,
 @pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all is there")
 def test_the_viewer_draws_it_without_a_complaint(runs, tmp_path):
     picture = tmp_path / "view.png"
-    recording = runs / "ncc.rrd"
-    with browser.serve_recording(recording) as address, browser.open_browser(browser.WITH_GL) as page:
+    with browser.serve_recording(runs / "ncc.rrd") as address, browser.open_browser(browser.WITH_GL) as page:
         page.open(address, 1200, 800)
         page.wait_until_still()
         page.save(picture)

@@ -133,8 +133,7 @@ def test_time_zooms_in_all_charts_by_dragging_and_comes_back(browser, pages):
 def test_a_run_is_hidden_on_map_and_charts(browser, pages):
     browser.open(pages["runs"], 1400)
     shown = "return [...document.querySelectorAll('.run1')].filter(g => g.getClientRects().length).length"
-    before = browser.run(shown)
-    assert before > 3
+    assert browser.run(shown) > 3
     browser.run("document.querySelector('[data-run=\"1\"]').click()")
     assert browser.run(shown) == 0
 

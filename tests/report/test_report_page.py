@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine import Fix, NoFix, OptionError, OrthoMap, Prior, Reason, Window
-from engine.options import NccOptions, SiftOptions
+from engine import NccOptions, NoFix, OptionError, OrthoMap, Prior, Reason, SiftOptions, Window
 from scenematch import TrackSettings, evaluate
 from scenematch.cli.app import run
 from scenematch.files.settings import changed, nested, options_from_mapping
@@ -134,8 +133,7 @@ def test_frames_beyond_their_sigmas_are_shown_before_refusals_before_others():
 
 
 def test_notes_come_back_as_they_were(tmp_path):
-    window = Window(3, 4, 50, 60)
-    refusal = NoFix(reason=Reason.AMBIGUOUS, detail='0.41 against 0.40, "here"', window=window)
+    refusal = NoFix(reason=Reason.AMBIGUOUS, detail='0.41 against 0.40, "here"', window=Window(3, 4, 50, 60))
     notes = [
         track_row("a.jpg", refusal, latency_ms=None, deadline_met=None, state="lost"),
         TrackRow(timestamp_ns=1, frame="b.jpg", status="fix", state="tracking", heading_deg=12.5, stage="fine"),
@@ -163,9 +161,7 @@ def matched(flight, site, method, profile="engine"):
     matcher = TrackSettings(method=method, profile=profile, device="cpu", **coarse).matcher(site, flight.camera)
     frame, truth = flight.frames[0], flight.truth[0]
     prior = Prior(lat_deg=truth.lat_deg, lon_deg=truth.lon_deg, sigma_m=4.0)
-    fix = matcher.locate(frame, prior)
-    assert isinstance(fix, Fix)
-    return matcher, frame, fix
+    return matcher, frame, matcher.locate(frame, prior)
 
 
 @pytest.mark.parametrize("profile", ["engine", "paper"])

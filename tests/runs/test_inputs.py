@@ -51,8 +51,7 @@ def shot(tmp_path):
 
 def test_a_picture_is_placed_by_edges_in_the_units_of_its_crs(shot):
     site = MapInput(shot, map_bounds=f"{WEST},{NORTH - 30},{WEST + 40},{NORTH}", map_crs=UTM).open()
-    assert (site.width_px, site.height_px) == (80, 60)
-    assert site.gsd_m_per_px == pytest.approx(0.5, rel=1e-3)
+    assert (site.width_px, site.height_px, site.gsd_m_per_px) == (80, 60, pytest.approx(0.5, rel=1e-3))
     west, south, east, north = site.bounds_deg
     again = MapInput(shot, map_bounds=f"{west},{south},{east},{north}").open()  # degrees, which need no CRS
     middles = [(each.frame.lat_deg, each.frame.lon_deg) for each in (site, again)]
@@ -114,8 +113,7 @@ def photos(tmp_path):
 
 
 def load(files):
-    flight = files.open_flight()
-    return files.load_camera(flight)
+    return files.load_camera(files.open_flight())
 
 
 def test_the_camera_is_that_of_the_photographs_or_of_a_field_of_view(photos):
@@ -239,8 +237,7 @@ def test_a_calibration_is_scaled_on_request_and_said(photos, calibration):
     given = {"camera": calibration, "scale_calibration": True, "mount": "nadir-tail"}
     files = FlightFiles.from_flat(map="m.tif", frames=photos, **given)
     messages = []
-    progress = SimpleNamespace(message=messages.append)
-    camera = files.load_camera(files.open_flight(), progress)
+    camera = files.load_camera(files.open_flight(), SimpleNamespace(message=messages.append))
     assert (camera.width_px, camera.height_px) == (320, 240)
     assert (camera.matrix[0, 0], camera.matrix[0, 2]) == (250.0, 159.5)
     assert np.allclose(camera.mount, mount_rotation("nadir-tail"))

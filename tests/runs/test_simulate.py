@@ -45,8 +45,7 @@ def loop(folder, tmp_path_factory):
 
 def test_a_flight_folder_is_what_track_reads(folder):
     assert {path.name for path in folder.iterdir()} == FOLDER
-    camera = Camera.load(folder / "camera.yaml")
-    flight = open_flight(folder / "frames", folder / "telemetry.csv", camera)
+    flight = open_flight(folder / "frames", folder / "telemetry.csv", Camera.load(folder / "camera.yaml"))
     truth = read_truth(folder / "truth.csv")
     site = OrthoMap.open(folder / "map.tif", surface=folder / "dsm.tif")
     assert len(flight) == len(truth) == 3

@@ -98,13 +98,11 @@ def test_it_grows_uncertain_while_nobody_watches(monkeypatch):
     memory.keep(FIX)
     clock.now_s += 0.1
     prior = memory.prior(15.0)
-    assert (prior.lat_deg, prior.lon_deg) == (48.2, 16.37)
-    assert prior.sigma_m == pytest.approx(0.5 + 15.0 * 0.1)
+    assert (prior.lat_deg, prior.lon_deg, prior.sigma_m) == (48.2, 16.37, pytest.approx(0.5 + 15.0 * 0.1))
 
 
 def test_another_finds_it_though_the_first_closed_nothing_as_one_that_is_killed(tmp_path):
-    first = LastFix(tmp_path / "cache" / "last-fix")
-    first.keep(FIX)
+    LastFix(tmp_path / "cache" / "last-fix").keep(FIX)
     prior = LastFix(tmp_path / "cache" / "last-fix").prior(15.0)
     assert (prior.lat_deg, prior.lon_deg) == (48.2, 16.37)
 

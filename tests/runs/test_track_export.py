@@ -16,7 +16,6 @@ from scenematch import TrackSettings, export_track, track
 from scenematch.files.track import read_track, with_notes
 from tests.support.runs import bare_runs
 
-FRAMES = 5
 ROUNDED_M = 0.5e-3 * 2**0.5  # each axis of track.csv is rounded to a millimetre
 
 
@@ -24,7 +23,7 @@ ROUNDED_M = 0.5e-3 * 2**0.5  # each axis of track.csv is rounded to a millimetre
 def finished(flight_in, tmp_path_factory):
     """Flight folder and output folder of a flight, tracked by NCC, with both TUM files."""
     folder = tmp_path_factory.mktemp("export")
-    files = flight_in(folder / "flight", frames=FRAMES)
+    files = flight_in(folder / "flight", frames=5)
     out = folder / "out"
     with bare_runs():
         track(files, out, TrackSettings(device="cpu"))
@@ -78,10 +77,8 @@ def test_a_run_of_before_is_exported_without_what_it_did_not_note(finished, tmp_
     head = "frame,state,window_x0_px,window_y0_px,heading_deg,stage,confidence,detail"
     lines = [line.split(",") for line in (finished / "notes.csv").read_text().splitlines()[1:]]
     (tmp_path / "notes.csv").write_text("\n".join([head, *(",".join([*line[:7], ""]) for line in lines), ""]))
-    stated = export_track(tmp_path, "tum")
-    assert stated["left_out"] == 0
-    text = (tmp_path / "track.tum").read_text()
-    assert "quaternion is unity" in text.splitlines()[0]
+    assert export_track(tmp_path, "tum")["left_out"] == 0
+    assert "quaternion is unity" in (tmp_path / "track.tum").read_text().splitlines()[0]
     measured = [row.up_m for row in read_track(tmp_path / "track.csv") if row.fixed]
     assert tum(tmp_path / "track.tum")[1][:, 2] == pytest.approx(measured, abs=1e-3)
 

@@ -85,9 +85,8 @@ def test_angles_and_descriptors_are_those_of_the_reference(octaves, both, turn_r
     turns, got = loops.describe(buffer, rows, turn_rad, octaves)
     apart = np.abs((turns - (expected if turn_rad is None else turn_rad) + math.pi) % math.tau - math.pi)
     assert (apart > 0.01).sum() <= 0.05 * len(apart)  # two peaks of one height
-    described = [
-        reference.descriptor_of(p, row, sigma, turn) for p, row, turn in zip(pictures, rows, turns, strict=True)
-    ]
+    each = zip(pictures, rows, turns, strict=True)
+    described = [reference.descriptor_of(picture, row, sigma, turn) for picture, row, turn in each]
     np.testing.assert_allclose(got, np.array(described).reshape(-1, 128), atol=3e-4)
 
 

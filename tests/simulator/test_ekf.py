@@ -26,8 +26,7 @@ SAMPLE = IdealImu(np.array([0.4, -0.3, -9.6]), np.array([0.2, -0.1, 0.3]))
 
 
 def some_belief() -> FilterState:
-    rng = np.random.default_rng(2)
-    spread = rng.normal(0.0, 0.3, (STATES, STATES))
+    spread = np.random.default_rng(2).normal(0.0, 0.3, (STATES, STATES))
     place_m, velocity_mps = np.array([10.0, -5.0, 120.0]), np.array([6.0, 2.0, -0.5])
     biases = np.array([0.05, -0.02, 0.03]), np.array([0.001, 0.002, -0.001]), 0.4, 0.02
     covariance = spread @ spread.T + 0.01 * np.eye(STATES)
@@ -98,8 +97,7 @@ def test_joseph_is_the_textbook_where_that_is_exact():
     H = np.random.default_rng(1).normal(size=(2, STATES))
     R = np.diag([0.3, 0.7])
     after = ekf.correct(estimate, np.zeros(2), H, R)
-    P = estimate.covariance
-    expected = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H)
+    expected = np.linalg.inv(np.linalg.inv(estimate.covariance) + H.T @ np.linalg.inv(R) @ H)
     np.testing.assert_allclose(after.covariance, expected, atol=1e-9)
     np.testing.assert_allclose(after.position_m, estimate.position_m)
 
@@ -118,8 +116,7 @@ def test_a_perfect_imu_carries_a_perfect_belief_along_the_truth():
     for k in range(500):
         if k % 250 == 0:
             state = shaken(state, rng)
-        wanted = np.array([1.0, math.cos(k / 60), 0.1])
-        state, felt = advance(state, wanted, 200.0 + 0.1 * k, air.next())
+        state, felt = advance(state, np.array([1.0, math.cos(k / 60), 0.1]), 200.0 + 0.1 * k, air.next())
         estimate = ekf.predict(estimate, felt, SUITE)
     np.testing.assert_allclose(estimate.position_m, state.position_m, atol=1e-6)
     np.testing.assert_allclose(estimate.enu_from_body, state.enu_from_body, atol=1e-9)
@@ -144,8 +141,7 @@ def fly(seed, seconds, fixes_until_s=math.inf):
         state, felt = advance(state, wanted, 0.2 * k, air.next())
         history.advance(carried.imu(felt))
         if k % 5 == 0:
-            height_m = carried.height_m(state)
-            history.fuse(partial(fuse_height, height_m=height_m, suite=SUITE), state.time_s)
+            history.fuse(partial(fuse_height, height_m=carried.height_m(state), suite=SUITE), state.time_s)
         if k % 10 == 0:
             heading_deg = carried.heading_deg(state)
             history.fuse(partial(fuse_heading, heading_deg=heading_deg, suite=SUITE), state.time_s)
@@ -174,8 +170,7 @@ def flights():
 @pytest.mark.slow
 def test_errors_are_as_large_as_the_covariance_says(flights):
     """The NEES at the end of every flight lies in the 99.9 % interval of its chi-square, whole and by parts."""
-    parts = [ekf.POSITION, ekf.VELOCITY, ekf.TURN, ekf.ACCEL, ekf.GYRO, slice(0, STATES)]
-    for part in parts:
+    for part in [ekf.POSITION, ekf.VELOCITY, ekf.TURN, ekf.ACCEL, ekf.GYRO, slice(0, STATES)]:
         squares = [e[part] @ np.linalg.solve(P[part, part], e[part]) for rows in flights for e, P, _ in rows[-1:]]
         freedom = len(squares) * (part.stop - part.start)
         spread = 3.29 * math.sqrt(2.0 / freedom)  # the chi-square is near enough to a normal one

@@ -1,6 +1,5 @@
 """What cannot be simulated is refused by the name of the argument."""
 
-import math
 from functools import cache, partial
 
 import numpy as np
@@ -56,7 +55,7 @@ def seen(height_agl_m=150.0, attitude=LEVEL, camera=CAMERA):
         (lambda: plan_flight(town=drawn_town(), style=FlightStyle(height_agl_m=400.0)),
          "town: expected a map larger"),
         *((partial(kind, **{name: value}), name)
-          for kind in (SensorNoise, FlightStyle) for name in numbers_of(kind) for value in (-1.0, math.nan)),
+          for kind in (SensorNoise, FlightStyle) for name in numbers_of(kind) for value in (-1.0, np.nan)),
     ],
 )  # fmt: skip
 def test_an_option_that_cannot_be_is_refused(make, words):

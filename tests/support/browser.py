@@ -20,7 +20,6 @@ FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-component-update",
     "--disable-sync", "--no-first-run", "--hide-scrollbars",
 )  # fmt: skip
-WITHOUT_GL = ("--disable-gpu",)
 WITH_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 _PATIENCE_S = 200.0
 _STILL_S = 3.0  # without a change, after which a viewer has drawn all that it has
@@ -113,7 +112,7 @@ class Browser:
 
 
 @contextmanager
-def open_browser(gl: tuple[str, ...] = WITHOUT_GL) -> Iterator[Browser]:
+def open_browser(gl: tuple[str, ...] = ("--disable-gpu",)) -> Iterator[Browser]:
     """A browser with a profile of its own, closed at the end; with ``WITH_GL`` it draws in 3D."""
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service

@@ -23,17 +23,15 @@ def patch_world(x: int, y: int, height: float) -> World:
     heights = np.zeros((SIZE, SIZE), np.float32)
     heights[y - 30 : y + 31, x - 30 : x + 31] = height
     rgb[y - 8 : y + 9, x - 8 : x + 9] = 240
-    sides = np.full((SIZE, SIZE, 4), (90, 60, 60, 0), np.uint8)
-    return World(rgb, sides, heights, TO_CRS, EPSG)
+    return World(rgb, np.full((SIZE, SIZE, 4), (90, 60, 60, 0), np.uint8), heights, TO_CRS, EPSG)
 
 
 def project(camera: Camera, grid: np.ndarray, up: float, position: np.ndarray, height: float, attitude: Attitude):
     """Pixel of a world point by way of latitude and longitude: shares no line with the renderer."""
     lon, lat = transformer(EPSG).transform([grid[0], position[0]], [grid[1], position[1]], direction="INVERSE")
     point, own = LocalFrame(48.25, 16.45).enu_from_geodetic(lat, lon)
-    offset = np.array([*(point - own), up - height])
     enu_from_cam = enu_from_body(attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg) @ camera.mount
-    x, y, z = camera.matrix @ enu_from_cam.T @ offset
+    x, y, z = camera.matrix @ enu_from_cam.T @ np.array([*(point - own), up - height])
     return np.array([x / z, y / z])
 
 

@@ -132,8 +132,7 @@ def _repeated(rng: np.random.Generator) -> Matches:
     """A few matches, each found again and again within a pixel or two."""
     points, pixels = _anywhere(4, 11, 0.0, 40.0)(rng)
     index = rng.integers(0, len(points), int(rng.integers(20, 150)))
-    jitter = rng.normal(0, rng.uniform(0, 1.5), (len(index), 2))
-    return points[index], pixels[index] + jitter
+    return points[index], pixels[index] + rng.normal(0, rng.uniform(0, 1.5), (len(index), 2))
 
 
 def _shared(of: str) -> Callable[[np.random.Generator], Matches]:
