@@ -30,9 +30,8 @@ WITHOUT_TORCH = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def fresh():
-    """A new interpreter that imports the engine, then uses it: what it had loaded by then and what it printed."""
+def test_importing_the_engine_prints_nothing_and_its_names_load_what_they_use_alone():
+    """In a new interpreter that imports the engine, then uses it."""
     report = (
         "import json, sys, warnings; warnings.simplefilter('error'); import engine; "
         "top = lambda: sorted({name.split('.')[0] for name in sys.modules}); found = {'bare': top()}; "
@@ -45,11 +44,8 @@ def fresh():
     )
     done = done_by(report)
     before, _, found = done.stdout.partition("REPORT ")
-    return {"printed": before + done.stderr, **json.loads(found)}
-
-
-def test_importing_the_engine_prints_nothing_and_its_names_load_what_they_use_alone(fresh):
-    assert fresh["printed"] == ""
+    assert before + done.stderr == ""
+    fresh = json.loads(found)
     assert not {"torch", "cv2", "numpy", *UNUSED}.intersection(fresh["bare"])
     assert "numpy" in fresh["values"]
     assert not {"torch", *UNUSED}.intersection(fresh["values"])

@@ -428,18 +428,14 @@ def huge_route(huge, tmp_path_factory):
     return write_route(tmp_path_factory.mktemp("route"), huge, np.array([[200, 250], [640, 300]]) + CORNER)
 
 
-def place_option(site, xy_px, radius_m):
-    lat, lon = lat_lon(site, xy_px)
-    return f"--around={lat:.8f},{lon:.8f},{radius_m:g}"
-
-
 @pytest.mark.slow
 def test_a_huge_map_is_audited_around_a_place_in_a_part_of_the_memory(huge_path, huge, tmp_path, capsys):
     """Its grey levels and validity would take 1,152 MB."""
     import matplotlib.figure  # noqa: F401  an import while memory is traced takes long
 
+    lat, lon = lat_lon(huge, MIDDLE)
     tracemalloc.start()
-    summary = answer(capsys, audit(huge_path, tmp_path / "out", place_option(huge, MIDDLE, 80.0)))
+    summary = answer(capsys, audit(huge_path, tmp_path / "out", f"--around={lat:.8f},{lon:.8f},80"))
     peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak_bytes < HUGE_SIDE * HUGE_SIDE / 3

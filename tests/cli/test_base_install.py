@@ -24,12 +24,6 @@ print("CODES", json.dumps([run(line) for line in {lines}]))
 """
 
 
-def run_without(lines):
-    """Exit codes of commands in a new interpreter that has none of these packages, and what they said."""
-    done = done_by(PROGRAM.format(absent=OF_DESKS, lines=[[str(word) for word in line] for line in lines]))
-    return json.loads(done.stdout.rpartition("CODES ")[2]), done.stderr
-
-
 @pytest.mark.slow
 def test_a_vehicle_needs_no_extra_of_a_desk(flight, tmp_path):
     files, picture, out = file_options(flight), flight / "frames" / "000000.jpg", tmp_path / "out"
@@ -46,10 +40,11 @@ def test_a_vehicle_needs_no_extra_of_a_desk(flight, tmp_path):
         ["map", "info", flight / "map.tif"],
         ["bridge", "mavlink", "--connect=udpout:127.0.0.1:9", *files, "--settings=bridge.seconds=0.1"],
     ]
-    codes, stated = run_without(lines)
+    done = done_by(PROGRAM.format(absent=OF_DESKS, lines=[[str(word) for word in line] for line in lines]))
+    codes = json.loads(done.stdout.rpartition("CODES ")[2])
     names = [" ".join(map(str, line[:2])) for line in lines]
-    assert dict(zip(names, codes, strict=True)) == dict.fromkeys(names, 0), stated
-    assert "Traceback" not in stated
+    assert dict(zip(names, codes, strict=True)) == dict.fromkeys(names, 0), done.stderr
+    assert "Traceback" not in done.stderr
     assert (out / "report.html").is_file()
 
 

@@ -22,17 +22,12 @@ def polar():
 
 
 @pytest.fixture(scope="module")
-def north_deg(polar):
-    """Where true north is at the place of the pictures, by two places on its meridian."""
+def frame(polar, camera):
+    """Its heading counts from true north, which is found by two places on the meridian of its own place."""
     lat, lon = (float(v) for v in polar.site.geodetic_from_pixel(NADIR))
     south, north = polar.site.frame.enu_from_geodetic(np.array([lat - 1e-5, lat + 1e-5]), lon)
-    turn = math.degrees(math.atan2(*(north - south)))
-    assert -1.6 < turn < -1.4
-    return turn
-
-
-@pytest.fixture(scope="module")
-def frame(polar, camera, north_deg):
+    north_deg = math.degrees(math.atan2(*(north - south)))
+    assert -1.6 < north_deg < -1.4
     drawn = polar.frame(camera, NADIR, 80.0, heading_deg=PLANE_DEG)
     return replace(drawn, heading_deg=PLANE_DEG - north_deg)
 
