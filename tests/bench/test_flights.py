@@ -17,8 +17,7 @@ from bench.live.flights.video_camera import SIZE, Footage, ground_from_pixel, re
 from bench.live.standin import State
 from engine.geo import LocalFrame
 from tests.support.refusals import refusal
-from tests.support.subtitles import write_subtitles
-from tests.support.videos import write_video
+from tests.support.videos import write_subtitles, write_video
 
 PLACE = LocalFrame(33.64, 72.99)
 

@@ -20,8 +20,7 @@ from scenematch.files.truth import interpolate_truth, read_truth
 from tests.support.commands import answer, file_options
 from tests.support.photos import write_pictures
 from tests.support.refusals import misuse, refusal
-from tests.support.subtitles import write_subtitles
-from tests.support.videos import write_video
+from tests.support.videos import write_subtitles, write_video
 
 
 def at(log, *seconds):

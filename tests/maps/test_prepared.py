@@ -9,7 +9,7 @@ from engine.kernels.scores import enhance
 from engine.maps import prepared, tiles
 from engine.maps.prepared import PreparedMap, Region
 from engine.ncc_fft import prepare
-from tests.support.threads import called_at_once
+from tests.support.waiting import called_at_once
 
 AFFINE = np.array([[0.5, 0.0, 500_000.0], [0.0, -0.5, 5_300_000.0]])
 WINDOWS = [

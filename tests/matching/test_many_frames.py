@@ -16,8 +16,7 @@ from engine.runtime import workers as processes
 from engine.runtime.step_costs import Costs
 from tests.support.fixes import values_of
 from tests.support.refusals import misuse, refusal
-from tests.support.threads import called_at_once
-from tests.support.waiting import is_running, wait_until
+from tests.support.waiting import called_at_once, is_running, wait_until
 
 PLACES = [np.array([300.0 + 6.0 * k, 290.0 + 4.0 * (k % 3)]) for k in range(6)]
 

@@ -23,8 +23,7 @@ from tests.support.commands import refusal
 from tests.support.photos import gimbal, photograph
 from tests.support.refusals import misuse
 from tests.support.refusals import refusal as refusal_of_call
-from tests.support.subtitles import write_subtitles
-from tests.support.videos import write_video
+from tests.support.videos import write_subtitles, write_video
 
 UTM, WEST, NORTH = "EPSG:32633", 598_000.0, 5_342_000.0
 FOCAL_35MM = 0xA405
