@@ -180,7 +180,7 @@ def write_map(path: Path, pieces: list[Piece]) -> None:
             transform = from_bounds(piece.left, piece.bottom, piece.right, piece.top, *pixels.shape[:0:-1])
             with rasterio.open(
                 target, "w", driver="GTiff", width=pixels.shape[2], height=pixels.shape[1], count=4, dtype="uint8",
-                crs="EPSG:4326", transform=transform, photometric="RGB", alpha="unspecified", tiled=True,
+                crs="EPSG:4326", transform=transform, photometric="RGB", alpha="yes", tiled=True,
             ) as file:  # fmt: skip
                 file.write(pixels)
         merge(placed, dst_path=path)

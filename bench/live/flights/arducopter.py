@@ -81,14 +81,14 @@ class LoggedPilot(Pilot):
     def __init__(self, link: Any, place: LocalFrame) -> None:
         super().__init__(link, place)
         self.times_s: list[tuple[float, float]] = []  # of this machine's monotonic clock, and the simulator's
-        self.began_s = 0.0  # the simulator's start, since 1970 by its own clock
+        self.since_1970_s = 0.0  # of the monotonic clock's zero, by the simulator's first dated message
 
     def take(self, message: Any) -> None:
         """Note what a message says, and when."""
         if message.get_type() == "GLOBAL_POSITION_INT":
             self.times_s.append((time.monotonic(), message.time_boot_ms * 1e-3))
-        elif message.get_type() == "SYSTEM_TIME":
-            self.began_s = message.time_unix_usec * 1e-6 - message.time_boot_ms * 1e-3
+        elif message.get_type() == "SYSTEM_TIME" and message.time_unix_usec and not self.since_1970_s:
+            self.since_1970_s = message.time_unix_usec * 1e-6 - time.monotonic()
         super().take(message)
 
 
@@ -196,10 +196,10 @@ def read_log(log: Path, pilot: LoggedPilot) -> tuple[Track, Track, Track]:
         else:
             if kind == "VISP":
                 captured_s, (lat_deg, lon_deg) = row.RTimeUS * 1e-6, origin.geodetic_from_enu(row.PY, row.PX)
-                captured_s += float(np.interp(captured_s, here_s, lead_s))
             else:
-                captured_s = _GPS_EPOCH_S + row.GWk * _WEEK_S + row.GMS * 1e-3 - pilot.began_s
+                captured_s = _GPS_EPOCH_S + row.GWk * _WEEK_S + row.GMS * 1e-3 - pilot.since_1970_s
                 lat_deg, lon_deg = row.Lat, row.Lng
+            captured_s += float(np.interp(captured_s, here_s, lead_s))
             east_north = place.enu_from_geodetic(lat_deg, lon_deg)[:2]
             tracks["fixes"].append((captured_s, *east_north, row.TimeUS * 1e-6))
     widths = {"SIM": 3, "POS": 3, "fixes": 4}
