@@ -1,3 +1,4 @@
+#!/usr/bin/env python3
 """Drape a map over the ground of a Gazebo world: a mesh textured with the map, as model://map_ground.
 
 The model's x is east, its y is north. There is one version for Gazebo classic and one for Gazebo Harmonic.

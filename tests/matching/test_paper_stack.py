@@ -226,9 +226,11 @@ def test_the_truths_attitude_is_turned_from_north_west_to_east_north(truth_scrip
 def test_positions_in_a_bag_are_compared_with_its_truth(tmp_path, capsys, monkeypatch):
     maker, frame, stamps_ns = maker_of("ros1"), LocalFrame(48.0, 15.0), [10**9 + k * 10**8 for k in range(20)]
     off_m = {"/truth/fix": 0.0, "/scenematch/fix": 1.5, "/mavros/global_position/global": 6.0}
+    off_m["/mavros/global_position/raw/fix"] = 0.5  # which repeats each position once
     topics = {"/truth/height_agl": [(time_ns, maker.float64(100.0)) for time_ns in stamps_ns]}
     for topic, north_m in off_m.items():
-        places = [map(float, frame.geodetic_from_enu(7.0 * k, north_m)) for k in range(20)]
+        each = 2 if topic.endswith("raw/fix") else 1
+        places = [map(float, frame.geodetic_from_enu(7.0 * (k - k % each), north_m)) for k in range(20)]
         stamped = zip(stamps_ns, places, strict=True)
         topics[topic] = [(t, maker.position(t, "", *at, np.eye(3))) for t, at in stamped]
     written(tmp_path / "flight.bag", topics)
@@ -238,4 +240,5 @@ def test_positions_in_a_bag_are_compared_with_its_truth(tmp_path, capsys, monkey
     assert [(row[0], row[1], row[2], row[3], row[-1]) for row in rows] == [
         ("scenematch", "20", "10.0", "1.50", "0"),
         ("the autopilot's estimate", "20", "10.0", "6.00", "20"),
+        ("its GPS receiver", "10", "5.0", "0.50", "0"),
     ]
