@@ -5,9 +5,9 @@
 
 ``park``, of pierotofy: 18 photographs as a drone took them. Map and heights are the repository's point cloud,
 which was made of the same photographs; the package laspy reads it. ``campus``, of m-hamza-mughal: a video on a
-satellite map of another date. Nobody published where it was filmed, nor how the camera hangs. Heights and headings,
+satellite map of another date. Nobody published where it was filmed, nor how the camera hangs: heights, headings,
 rounded to 5 m and 2 degrees, and the truth, the ground in the middle of each fifth frame, are read off the map by
-OpenCV's SIFT; the truth is good to about a metre. Both repositories are under the 2-clause BSD licence.
+OpenCV's SIFT. That truth is good to about a metre. Both repositories have the 2-clause BSD licence.
 """
 
 from __future__ import annotations
