@@ -42,7 +42,7 @@ def evaluate(
         The summary.
 
     Raises:
-        TelemetryError: the folder holds no finished track.
+        TelemetryError: the folder holds no finished track, or the given truth is of other times.
         OptionError: the page would lose its frames.
     """
     folder = Path(folder)
@@ -61,7 +61,10 @@ def evaluate(
         progress.message(f"{folder / PAGE} loses the frames that it shows: {frames.why_missing}")
     if path is not None:
         record = replace(record, truth=str(Path(path).resolve()))
-    return write_results(folder, rows, truth_rows, site, record, frames, progress=progress)
+    is_to_score = truth is not None
+    return write_results(
+        folder, rows, truth_rows, site, record, frames, is_to_score=is_to_score, progress=progress
+    )
 
 
 def open_recorded_map(record: RunRecord, progress: Progress = SILENT) -> OrthoMap:

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from engine.errors import EngineError
+from engine.errors import EngineError, TelemetryError
 from engine.matching.matcher import SceneMatcher
 from engine.orthomap import OrthoMap
 from engine.values import Truth
@@ -47,18 +47,23 @@ def write_results(
     frames: ReportFrames,
     *,
     report: bool = True,
+    is_to_score: bool = False,
     progress: Progress = SILENT,
 ) -> dict[str, Any]:
-    """Write summary.json and, if requested, the report page, replacing older ones."""
+    """Write summary.json and, if requested, the report page, replacing older ones.
+
+    Raises:
+        TelemetryError: it is only to be scored, and the truth is of other times.
+    """
     telemetry = None if frames.flight is None else frames.flight.rows
     summary = summarise(rows, truth, frame=site.frame, ground=record.ground) | {"settings": record.facts()}
     if summary.get("scored_fixes") == 0 and summary["fixes"]:
         fixed = [row.timestamp_ns for row in rows if row.fixed and row.timestamp_ns is not None]
         given = [row.timestamp_ns for row in truth or []]
-        progress.message(
-            f"no fix is scored: expected a truth at the times of the fixes, {_span(fixed)}, got {_span(given)} in "
-            f"{record.truth}"
-        )
+        text = f"expected a truth at the times of the fixes, {_span(fixed)}, got {_span(given)} in {record.truth}"
+        if is_to_score:
+            raise TelemetryError(f"truth: {text}")
+        progress.message(f"no fix is scored: {text}")
     write_json(out / SUMMARY, summary)
     if report:
         is_loop = "closed_loop" in summary["settings"]  # a loop.csv may be another run's

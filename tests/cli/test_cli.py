@@ -112,19 +112,22 @@ def test_json_is_all_there_is_on_standard_output(flight, tmp_path, capsys):
     assert {row["deadline_met"] for row in cells(out / "track.csv")} == {"true"}
 
 
-def test_a_truth_of_other_times_is_named_with_both_and_counts_no_false_fix(done, flight, tmp_path, capsys):
+def test_a_truth_of_other_times_scores_nothing_and_replaces_no_scores(done, flight, tmp_path, capsys):
     folder = Path(shutil.copytree(done, tmp_path / "again"))
     late = Path(shutil.copy(flight / "truth.csv", tmp_path / "late.csv"))
     stamps = [int(row["timestamp_ns"]) for row in cells(late)]
     for row, stamp in enumerate(stamps):
         set_cell(late, row, "timestamp_ns", str(1_700_000_000_000_000_000 + stamp))
-    assert run(["evaluate", str(folder), f"--truth={late}"]) == 0
+    when = f"{stamps[0] / 1e9:.1f} to {stamps[-1] / 1e9:.1f} s, got 2023-11-14T22:13:21Z to 2023-11-14T22:13:25Z"
+    text = f"expected a truth at the times of the fixes, {when} in {late}"
+    kept = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    assert refusal(capsys, ["evaluate", str(folder), f"--truth={late}"], code=1) == f"--truth: {text}\n"
+    assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == kept
+    assert run(track(flight, tmp_path / "out", f"--truth={late}")) == 0  # a run is kept all the same
     printed = capsys.readouterr()
-    when = f"{stamps[0] / 1e9:.1f} to {stamps[-1] / 1e9:.1f} s"
-    assert f"no fix is scored: expected a truth at the times of the fixes, {when}" in printed.err
-    assert f"got 2023-11-14T22:13:21Z to 2023-11-14T22:13:25Z in {late}" in printed.err
+    assert f"no fix is scored: {text}" in printed.err
     assert "false fixes" not in printed.out
-    assert json.loads((folder / "summary.json").read_text(encoding="utf-8"))["scored_fixes"] == 0
+    assert json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["scored_fixes"] == 0
 
 
 def test_start_comes_before_the_telemetry(flight, tmp_path):
