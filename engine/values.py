@@ -411,6 +411,10 @@ class Fix:
         left = risk - (1.0 - (self.confidence or 0.0))
         return self.sigma_m * math.sqrt(-2.0 * math.log(left)) if left > 0.0 else math.inf
 
+    def __str__(self) -> str:
+        place = f"{self.lat_deg:.7f}, {self.lon_deg:.7f}, sigma {self.sigma_m:.1f} m"
+        return f"{place}, by {self.method}, {self.stage}"
+
     def refused(self, reason: Reason, detail: str) -> NoFix:
         """Turn this fix into a refusal that keeps it as its :attr:`NoFix.match`."""
         return NoFix(
@@ -450,6 +454,9 @@ class NoFix:
     timings: Timings = field(default_factory=Timings)
     match: Fix | None = None
     looks: tuple[Look, ...] = ()
+
+    def __str__(self) -> str:
+        return f"no fix, {self.reason.value}: {self.detail}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

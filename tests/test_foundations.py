@@ -15,7 +15,7 @@ from engine import NavigatorOptions, set_threads
 from engine.budget import Budget, Deadline
 from engine.errors import DeviceError, DtypeError, EngineError, OptionError, ShapeError
 from engine.runtime.device import resolve
-from engine.values import Attitude, Fix, Frame, NoFix, Peak, Prior, Timings, Window
+from engine.values import Attitude, Fix, Frame, NoFix, Peak, Prior, Reason, Timings, Window
 from tests.support.fixes import a_fix
 from tests.support.interpreters import done_by
 from tests.support.refusals import misuse, refusal
@@ -252,3 +252,11 @@ def test_a_matcher_takes_one_thread_unless_somebody_chose(chosen, expected):
     if chosen == "environment":
         environment["OMP_NUM_THREADS"] = "2"
     assert done_by(MATCHERS, chosen, env=environment).stdout.startswith(expected)
+
+
+def test_an_answer_prints_as_one_line_that_says_where_or_why_not():
+    fix = a_fix(sigma_m=2.96, stage="refined")
+    assert str(fix) == "48.0000000, 15.0000000, sigma 3.0 m, by ncc, refined"
+    assert (
+        str(fix.refused(Reason.AMBIGUOUS, "two places look alike")) == "no fix, ambiguous: two places look alike"
+    )
