@@ -100,7 +100,7 @@ class MavlinkBridge:
         self._confirmed = False  # by an operator, for the next fix
         self._peer: PeerAddress = None
         self._connected_ns = 0  # when the vehicle was first heard, or heard again
-        self._last_done_ns = {"heartbeat": 0, "timesync": 0, "log": 0}
+        self._last_done_ns: dict[str, int] = {}
         self._closed = threading.Event()
         self._link: Link | None = connection.open()
         self._decoder = self._new_decoder(self._link)
@@ -316,7 +316,7 @@ class MavlinkBridge:
         """Start over with a vehicle that is heard for the first time or again."""
         self._counters.reconnections += self._connected_ns != 0
         self._connected_ns = now_ns
-        self._last_done_ns["timesync"] = 0
+        self._last_done_ns.pop("timesync", None)
         self._requests.restart(now_ns)
         self.telemetry.reset()
 
@@ -335,7 +335,8 @@ class MavlinkBridge:
             self._send(request)
 
     def _is_due(self, task: str, now_ns: int, period_s: float) -> bool:
-        due = now_ns - self._last_done_ns[task] >= round(period_s * 1e9)
+        last_ns = self._last_done_ns.get(task)
+        due = last_ns is None or now_ns - last_ns >= round(period_s * 1e9)
         if due:
             self._last_done_ns[task] = now_ns
         return due
