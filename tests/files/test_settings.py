@@ -85,5 +85,5 @@ def test_a_file_cannot_hold_what_is_no_value():
 
 def test_meanings_are_whole_sentences_of_the_docstring():
     meanings = field_descriptions(NavigatorOptions)
-    assert meanings["memory_s"].endswith("agree with each other outweigh it.")
+    assert meanings["memory_s"].endswith("agree with each other can outweigh it.")
     assert set(meanings) == set(NavigatorOptions.__dataclass_fields__)
