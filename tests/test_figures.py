@@ -79,7 +79,8 @@ FIGURES = {  # page: claim: results page, heading and words of each row that sta
         "within 1.51 m largest error 1.71 m": [("photographs.md", "A public", "| `track`")],
         "18 of a park, 44 m up": [("photographs.md", "A public", "18 photographs")],
         "3.1 degrees too high": [("photographs.md", "A public", "`check` located")],
-        "81.7 degrees wide": [("photographs.md", "Photographs", "The [walkthrough]")],
+        "81.7 degrees": [("photographs.md", "Photographs", "The [walkthrough]")],
+        "`--hfov-deg 70.8` gives 0.73 m RMS": [("photographs.md", "A public", "| the same, `--hfov")],
     },
     "docs/walkthrough-video.md": {
         "All 265 frames are fixed, 0.83 m RMS": [("video.md", "A public", "| `--method ncc --settings")],
