@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from engine.budget import Budget
 from engine.errors import EngineError, TelemetryError
+from engine.geo import wrap_difference_deg
 from engine.navigation.navigator import Navigator
 from engine.values import Fix, NoFix, Prior, Reason
+from engine.window import SPREAD_SIGMAS
 from scenematch.files.flight import FlightFrame
 from scenematch.files.settings import changed
-from scenematch.files.telemetry import ground_amsl_m
+from scenematch.files.telemetry import TelemetryRow, ground_amsl_m
 from scenematch.files.track import TrackRow, read_track, track_row, write_notes, write_track
 from scenematch.runs.arguments import parse_budget, parse_position
 from scenematch.runs.checking import as_rows, diagnose_flight
@@ -28,7 +30,8 @@ from scenematch.runs.settings import TrackSettings
 if TYPE_CHECKING:  # rerun is optional
     from scenematch.report.live_view import LiveView
 
-# Shares of frames fixed: below the first the inputs are checked, below the second the check is always kept.
+# Shares of frames that are as they should be: below the first the inputs are checked, below the second what the
+# check says is always kept.
 _CHECKED_SHARE, _FEW_SHARE = 0.9, 0.5
 
 
@@ -54,7 +57,7 @@ def track(
         settings: of the run; None uses the defaults.
         force: whether the folder may already exist.
         report: whether to draw the page; :func:`scenematch.runs.evaluation.evaluate` can draw it later.
-        diagnosis: whether to check the inputs if few frames were fixed.
+        diagnosis: whether to check the inputs if few frames were fixed, or few show the stated heading.
         live_view: where to send the live view.
         inputs: the inputs, if :func:`scenematch.runs.inputs.open_inputs` has already read them.
         progress: receives progress and messages.
@@ -80,12 +83,14 @@ def track(
     frames = progress.track(flight, len(flight), description)
     with open_view(matcher, live_view) as view:
         answered = _answered(frames, navigator, budget, use_priors=start is None, view=view)
-        write_notes(out / NOTES, write_track(out / TRACK, answered))
+        answers = write_track(out / TRACK, answered)
+        write_notes(out / NOTES, answers)
     # From the rows in the file, so that evaluate gives the same figures.
     rows, shown = read_track(out / TRACK), ReportFrames(flight, matcher)
     record = _record(files, settings, inputs, str(matcher.device))
-    share = _fixed_share(rows)
+    what, share = _worst_share(rows, answers, flight.rows, settings.acceptance.heading_bias_deg)
     if diagnosis and settings.profile == "engine" and share < _CHECKED_SHARE:
+        progress.message(f"{share:.0%} of the frames {what}: looking for errors in the inputs")
         record = replace(record, diagnosis=_diagnosis(files, settings, inputs, share, progress))
     return write_results(out, rows, inputs.truth, site, record, shown, report=report, progress=progress)
 
@@ -96,11 +101,24 @@ def _fixed_share(rows: Sequence[TrackRow]) -> float:
     return sum(row.fixed for row in answered) / len(answered) if answered else 1.0
 
 
+def _worst_share(
+    rows: Sequence[TrackRow], answers: Sequence[TrackRow], telemetry: Sequence[TelemetryRow], bias_deg: float
+) -> tuple[str, float]:
+    """The share of frames that were fixed, or of those that show the stated heading, whichever is smaller."""
+    stated_deg = {row.timestamp_ns: row.heading_deg for row in telemetry if row.heading_deg is not None}
+    off_deg = [
+        abs(wrap_difference_deg(row.heading_deg - stated_deg[row.timestamp_ns]))
+        for row in answers
+        if row.heading_deg is not None and row.timestamp_ns in stated_deg
+    ]
+    agreeing = sum(off <= SPREAD_SIGMAS * bias_deg for off in off_deg) / len(off_deg) if off_deg else 1.0
+    return min(("were fixed", _fixed_share(rows)), ("show the stated heading", agreeing), key=lambda each: each[1])
+
+
 def _diagnosis(
     files: FlightFiles, settings: TrackSettings, inputs: FlightInputs, share: float, progress: Progress
 ) -> dict[str, str]:
     """Errors found in the inputs; none if the check fails, which must not lose the track."""
-    progress.message(f"{share:.0%} of the frames were fixed: looking for errors in the inputs")
     try:
         found = diagnose_flight(files, settings.start, inputs=inputs, progress=progress)
     except (EngineError, MemoryError, KeyboardInterrupt):

@@ -1,6 +1,7 @@
 """Runs as a library: a flight tracked in three lines of Python, what it reports, and errors by argument."""
 
 import sys
+from dataclasses import replace
 
 import pytest
 
@@ -11,6 +12,7 @@ from scenematch import FlightFiles, Progress, TrackSettings, track
 from scenematch.bridges.links import parse_connection
 from scenematch.check import Diagnosis, Finding
 from scenematch.check.findings import Contradiction
+from scenematch.files.corrections import Corrections
 from scenematch.files.logs.ulog import read_ulog
 from scenematch.files.ros.bags import import_rosbags
 from scenematch.files.track import read_track
@@ -173,3 +175,18 @@ def test_a_run_with_refused_frames_ends_with_what_does_not_fit(flight_in, tmp_pa
     if said:
         assert said["radians"] == "the heading is in radians; try --correct angles=radians"
         assert said["pictures"].endswith("; 6 of 16 (38%) contradict the heading")
+
+
+@pytest.mark.parametrize("off_deg", [0.0, 60.0])
+def test_a_heading_that_the_pictures_contradict_is_looked_into_though_all_frames_are_fixed(
+    flight_in, tmp_path, monkeypatch, off_deg
+):
+    finding = Finding("heading", "the heading reads 60 degrees too high", "--correct heading_offset_deg=-60")
+    found = Diagnosis([finding], 6, 6, ("attitude",), (Contradiction("heading", 6, 6),))
+    monkeypatch.setattr("scenematch.runs.tracking.diagnose_flight", lambda *_, **__: found)
+    files = flight_in(tmp_path / "flight", frames=6)
+    corrections = Corrections(heading_offset_deg=off_deg)
+    settings, files = TrackSettings(method="sift"), replace(files, corrections=corrections)
+    summary = track(files, tmp_path / "out", settings, report=False)
+    assert summary["fixes"] == summary["frames"]
+    assert (summary["settings"]["diagnosis"] is not None) == (off_deg > 0.0)
