@@ -6,8 +6,8 @@ paper's flight over it. The stand-in has no estimator: the figures describe the 
 
 ``--port N`` flies beside a bridge of your own on that port, without faults; it takes off when the bridge listens,
 where the first picture was taken. ``--sitl ADDRESS`` flies ArduPilot's simulator there instead of the stand-in,
-along the same course (:mod:`bench.live.flights.sitl`), beside a bridge of your own too. FLIGHT may then be a video
-with DJI's subtitles beside it.
+along the same course (:mod:`bench.live.flights.sitl`), beside a bridge of your own too. With either FLIGHT may be
+a video with DJI's subtitles beside it.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """The camera of a simulated vehicle that shows a recorded video, from where the vehicle is.
 
-``python -m bench.live.flights.video_camera VIDEO --hfov-deg DEG [--link udpin:127.0.0.1:14551]`` writes JPEG
-pictures to its standard output, for ``--camera-source exec:``. VIDEO has DJI's ``.SRT`` beside it. ArduPilot's
-simulator (SITL) sends SIM_STATE, its true state; each picture is the frame of the video that was taken nearest to
-there, moved, turned and scaled over level ground by what is left. The camera looks straight down whatever the
-vehicle does, as one on a gimbal. Only the middle of a frame is shown, so that it can be moved by the rest.
+``python -m bench.live.flights.video_camera FLIGHT --hfov-deg DEG [--link udpin:127.0.0.1:14551]`` writes JPEG
+pictures to its standard output, for ``--camera-source exec:``. FLIGHT is a video with DJI's ``.SRT`` beside it, or
+a flight folder with its ``flight.mp4``. ArduPilot's simulator (SITL) sends SIM_STATE, its true state; each picture
+is the frame of the video that was taken nearest to there, moved, turned and scaled over level ground by what is
+left. The camera looks straight down whatever the vehicle does, as one on a gimbal. Only the middle of a frame is
+shown, so that it can be moved by the rest.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ def recorded_from_shown(frame: State, frame_size: tuple[int, int], vehicle: Stat
 class Footage:
     """A video's frames, one in so many, with where each was taken."""
 
-    def __init__(self, video: Path, hfov_deg: float, every: int = 3) -> None:
-        motion, self.place, _ = recorded(video)
-        capture = cv2.VideoCapture(str(video))
+    def __init__(self, flight: Path, hfov_deg: float, every: int = 3) -> None:
+        motion, self.place, _ = recorded(flight)
+        capture = cv2.VideoCapture(str(flight / "flight.mp4" if flight.is_dir() else flight))
         rate_hz, self._jpegs, self.states, index = capture.get(cv2.CAP_PROP_FPS), [], [], 0
         while capture.grab():
             if index % every == 0:
@@ -134,14 +135,14 @@ def film(view: View, link: Any, out: BinaryIO, rate_hz: float, delay_s: float, g
 def main() -> None:
     """Film until the pipe is closed."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("video", type=Path)
+    parser.add_argument("flight", type=Path)
     parser.add_argument("--hfov-deg", type=float, required=True, help="of the video")
     parser.add_argument("--link", default="udpin:127.0.0.1:14551")
     parser.add_argument("--rate-hz", type=float, default=10.0)
     parser.add_argument("--ground-alt-m", type=float, default=0.0, help="above sea level, as in SITL's --home")
     parser.add_argument("--delay-ms", type=float, default=60.0, help="from the state to the picture")
     arguments = parser.parse_args()
-    footage = Footage(arguments.video, arguments.hfov_deg)
+    footage = Footage(arguments.flight, arguments.hfov_deg)
     print(f"pictures of {SIZE[0]} x {SIZE[1]}, --hfov-deg {footage.hfov_deg:.2f}", file=sys.stderr, flush=True)
     link = mavutil.mavlink_connection(arguments.link, source_system=250)
     pace = (arguments.rate_hz, arguments.delay_ms * 1e-3)
