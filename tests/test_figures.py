@@ -97,7 +97,7 @@ FIGURE = re.compile(
     r"(?<![\w.])(\d+(?:\.\d+)?)(?= (?:m|mm|ms|s|GB|MB|degrees|%|of \d+|RMS)(?!\w)| to [\d.]+ (?:m|ms|s|%))"
 )
 UNMEASURED = {  # what the front pages state as assumed
-    "README.md": ["only good to 1 m", "adds 3 m unless", "over 10 m off"],
+    "README.md": ["only good to 1 m", "includes: 3 m (1 sigma) unless", "over 10 m off"],
     "docs/index.md": [],
 }
 
