@@ -13,10 +13,9 @@ from __future__ import annotations
 import argparse
 import csv
 import math
-import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,9 +23,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from bench.command import new_folder
 from engine import Camera
 from engine.geo import wrap_heading_deg
 from scenematch.files.flight import camera_info
+from scenematch.files.geotiff import write_geotiff
 from scenematch.files.telemetry import TelemetryRow, write_telemetry
 from scenematch.files.truth import truth_from_telemetry, write_truth
 
@@ -130,10 +131,8 @@ def _stamp_ns(text: str) -> int:
 def write_flight(out: Path, photos: list[Photo], pieces: list[Piece], given: argparse.Namespace) -> int:
     """Write the flight folder; returns how many of the photographs are there."""
     photos = [photo for photo in photos if photo.path.is_file()]
-    (out / "frames").mkdir(parents=True)
     rows = [_telemetry_row(photo, k, given) for k, photo in enumerate(photos)]
-    for photo in photos:
-        (out / "frames" / photo.path.name).symlink_to(photo.path.resolve())
+    link_frames(out, [photo.path for photo in photos])
     write_telemetry(out / "telemetry.csv", rows)
     truth = [truth_from_telemetry(row, p.lat_deg, p.lon_deg) for row, p in zip(rows, photos, strict=True)]
     write_truth(out / "truth.csv", truth)
@@ -142,6 +141,13 @@ def write_flight(out: Path, photos: list[Photo], pieces: list[Piece], given: arg
     (out / "camera.yaml").write_text(camera_info(camera), encoding="utf-8")
     write_map(out / "map.tif", pieces)
     return len(photos)
+
+
+def link_frames(out: Path, pictures: Iterable[Path]) -> None:
+    """Link pictures from a flight folder's frames."""
+    (out / "frames").mkdir()
+    for picture in pictures:
+        (out / "frames" / picture.name).symlink_to(picture.resolve())
 
 
 def _telemetry_row(photo: Photo, k: int, given: argparse.Namespace) -> TelemetryRow:
@@ -167,22 +173,18 @@ def _telemetry_row(photo: Photo, k: int, given: argparse.Namespace) -> Telemetry
 
 def write_map(path: Path, pieces: list[Piece]) -> None:
     """Put the pieces together in EPSG:4326; alpha says where there is none."""
-    import rasterio
     from rasterio.merge import merge
-    from rasterio.transform import from_bounds
 
     with tempfile.TemporaryDirectory(dir=path.parent) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", PendingDeprecationWarning)  # rasterio's own use of affine
         placed = [Path(folder) / f"{k}.tif" for k in range(len(pieces))]
         for piece, target in zip(pieces, placed, strict=True):
             with Image.open(piece.path) as picture:
-                pixels = np.moveaxis(np.asarray(picture.convert("RGBA")), 2, 0)
-            transform = from_bounds(piece.left, piece.bottom, piece.right, piece.top, *pixels.shape[:0:-1])
-            with rasterio.open(
-                target, "w", driver="GTiff", width=pixels.shape[2], height=pixels.shape[1], count=4, dtype="uint8",
-                crs="EPSG:4326", transform=transform, photometric="RGB", alpha="yes", tiled=True,
-            ) as file:  # fmt: skip
-                file.write(pixels)
+                pixels = np.asarray(picture.convert("RGBA"))
+            height, width = pixels.shape[:2]
+            right, down = (piece.right - piece.left) / width, (piece.bottom - piece.top) / height
+            first = piece.left + 0.5 * right, piece.top + 0.5 * down  # the middle of the first pixel
+            write_geotiff(target, pixels, [[right, 0.0, first[0]], [0.0, down, first[1]]], 4326)
         merge(placed, dst_path=path)
 
 
@@ -197,16 +199,11 @@ def main() -> None:
     parser.add_argument("--ground-m", type=float, help="level of the ground above the sea")
     parser.add_argument("--interval-s", type=float, help="between photographs without times")
     given = parser.parse_args()
-    if given.out.exists():
-        raise SystemExit(f"out: expected a folder that does not exist, got {given.out}")
     if (given.name == "uav-visloc") != (given.part is not None):
         raise SystemExit(f"part: expected a sequence with uav-visloc only, got {given.part}")
-    read = read_wildnav(given.root) if given.part is None else read_uav_visloc(given.root, given.part)
-    try:
+    with new_folder(given.out):
+        read = read_wildnav(given.root) if given.part is None else read_uav_visloc(given.root, given.part)
         count = write_flight(given.out, *read, given)
-    except BaseException:
-        shutil.rmtree(given.out, ignore_errors=True)
-        raise
     print(f"{given.out}: {count} of {len(read[0])} photographs")
 
 

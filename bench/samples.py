@@ -13,26 +13,27 @@ OpenCV's SIFT. That truth is good to about a metre. Both repositories have the 2
 from __future__ import annotations
 
 import argparse
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from bench.command import new_folder
+from bench.datasets import link_frames
 from engine import Camera, OrthoMap
 from engine.values import Window
 from scenematch.files.flight import camera_info
+from scenematch.files.geotiff import write_geotiff
 from scenematch.files.telemetry import TelemetryRow, write_telemetry
 from scenematch.files.truth import truth_from_telemetry, write_truth
 
 Array = NDArray[np.float64]
 
-STEP_M, REACH_M = 0.1, 1.0
-"""Pixels of the park's map, and how far from a point they reach."""
+PARK_EPSG, STEP_M, REACH_M = 32615, 0.1, 1.0
+"""Zone and pixels of the park's map, and how far from a point they reach."""
 HFOV_DEG, EVERY = 64.1, 5
 """Of the campus' camera, assumed; and how many frames lie between two that are located."""
 _MIN_MATCHES, _NEIGHBOURS, _APART_PX, _SMOOTH = 8, 15, 10.0, 5
@@ -48,13 +49,13 @@ def park(root: Path, out: Path) -> int:
     points = np.column_stack([getattr(cloud, name) for name in ("x", "y", "z", "red", "green", "blue")])
     seen, near, corner = from_above(points.astype(np.float64))
     colours = np.dstack([seen[..., 1:], 255 * near]).astype(np.uint8)
-    heights_m = np.where(near, seen[..., 0], np.nan)[..., None].astype(np.float32)
-    write_raster(out / "map.tif", colours, corner, photometric="RGB", alpha="yes")
-    write_raster(out / "dsm.tif", heights_m, corner)
+    heights_m = np.where(near, seen[..., 0], np.nan).astype(np.float32)
+    west, north = corner + 0.5 * STEP_M * np.array([1.0, -1.0])
+    placed = np.array([[STEP_M, 0.0, west], [0.0, -STEP_M, north]]), PARK_EPSG
+    write_geotiff(out / "map.tif", colours, *placed)
+    write_geotiff(out / "dsm.tif", heights_m, *placed)
     photos = sorted((root / "images").glob("*.JPG"))
-    (out / "frames").mkdir()
-    for photo in photos:
-        (out / "frames" / photo.name).symlink_to(photo.resolve())
+    link_frames(out, photos)
     return len(photos)
 
 
@@ -75,19 +76,6 @@ def from_above(points: Array) -> tuple[Array, NDArray[np.bool_], Array]:
     of_label = np.zeros((label.max() + 1, seen.shape[2]))
     of_label[label[empty == 0]] = seen[empty == 0]
     return of_label[label], np.asarray(away_px * STEP_M <= REACH_M), low + np.array([0.0, height * STEP_M])
-
-
-def write_raster(path: Path, raster: NDArray[Any], corner: Array, **how: Any) -> None:
-    """A GeoTIFF (H, W, C) in the park's zone."""
-    import rasterio
-    from rasterio.transform import from_origin
-
-    height, width, count = raster.shape
-    with rasterio.open(
-        path, "w", driver="GTiff", width=width, height=height, count=count, dtype=raster.dtype, crs="EPSG:32615",
-        transform=from_origin(*corner, STEP_M, STEP_M), **how,
-    ) as file:  # fmt: skip
-        file.write(np.moveaxis(raster, 2, 0))
 
 
 def campus(root: Path, out: Path) -> int:
@@ -165,14 +153,8 @@ def main() -> None:
     make, needed = SAMPLES[given.name]
     if not (given.root / needed).is_file():
         raise SystemExit(f"root: expected a clone with {needed}, got {given.root}")
-    if given.out.exists():
-        raise SystemExit(f"out: expected a folder that does not exist, got {given.out}")
-    given.out.mkdir(parents=True)
-    try:
+    with new_folder(given.out):
         count = make(given.root, given.out)
-    except BaseException:
-        shutil.rmtree(given.out)
-        raise
     print(f"{given.out}: {count} pictures")
 
 

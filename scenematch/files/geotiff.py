@@ -33,7 +33,7 @@ def write_geotiff(
 
     Args:
         path: the file, replaced in one step if it exists.
-        array: (H, W) or (H, W, 3) of numbers.
+        array: (H, W) or (H, W, 3) of numbers, or (H, W, 4) with an alpha.
         pixel_to_crs: (2, 3) affine transform to units of the CRS.
         crs: EPSG code of the CRS, or the CRS.
         nodata: the value of pixels without data, or None.
@@ -83,4 +83,5 @@ def tiled_profile(
         "tiled": True, "blockxsize": 256, "blockysize": 256, "BIGTIFF": "IF_SAFER",
         "compress": "deflate", "predictor": 3 if dtype.startswith("float") else 2,
     }  # fmt: skip
-    return profile | {"photometric": "RGB"} if count == 3 else profile
+    colours = {3: {"photometric": "RGB"}, 4: {"photometric": "RGB", "alpha": "yes"}}
+    return profile | colours.get(count, {})
