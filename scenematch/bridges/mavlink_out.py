@@ -27,11 +27,11 @@ from scenematch.bridges.vehicle import (
     north_east_m,
 )
 from scenematch.files.quaternions import quaternion_wxyz
+from scenematch.files.stamps import GPS_EPOCH_S, GPS_WEEK_S
 
 SENSOR_ID = 1
 """Sensor id in GLOBAL_POSITION_SENSOR; PX4 fuses the one that EKF2_AGP0_ID names, and 0 means none."""
 
-_GPS_EPOCH_S, _LEAP_S, _WEEK_MS = 315964800, 18, 604_800_000
 # A fix has no satellites, and the message no value for unknown. The fields that arming checks and estimators read
 # express the accuracy: a metre of sigma becomes a dilution of 1 and 10 satellites.
 _DILUTION_PER_M, _MIN_DILUTION = 1.0, 0.5
@@ -256,7 +256,7 @@ def receiver_message(
         times_ns: its timestamps on the monotonic clock and since 1970.
         velocity: of a fix; the message states none for a receiver's position.
     """
-    week, week_ms = divmod(times_ns[1] // 1_000_000 - (_GPS_EPOCH_S - _LEAP_S) * 1000, _WEEK_MS)
+    week, week_ms = divmod(times_ns[1] // 1_000_000 - GPS_EPOCH_S * 1000, GPS_WEEK_S * 1000)
     alt_m, up_mps, sigma_m = vehicle.alt_amsl_m, vehicle.up_velocity_mps, place.sigma_m
     dilution = max(_DILUTION_PER_M * sigma_m, _MIN_DILUTION)
     ignored = 0 if alt_m is not None else mavlink.GPS_INPUT_IGNORE_FLAG_ALT

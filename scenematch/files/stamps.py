@@ -19,6 +19,8 @@ from decimal import Decimal
 from engine.errors import TelemetryError
 from scenematch.files.tables import CsvRow
 
+GPS_EPOCH_S, GPS_WEEK_S = 315_964_800 - 18, 604_800
+"""UTC since 1970 at which GPS counts from 0, less today's leap seconds; and a week of it."""
 STAMP_COLUMNS = ("timestamp_ns", "timestamp_us", "timestamp_ms", "timestamp_s", "timestamp_utc")
 """Columns that may contain a timestamp, in order of preference."""
 OTHER_STAMPS = {STAMP_COLUMNS[0]: STAMP_COLUMNS[1:]}

@@ -34,6 +34,7 @@ from bench.live.flights.fly import FAR_M, FLIGHT_S, RATE_HZ, Bridge, change, con
 from bench.live.flights.recorded import recorded
 from bench.live.flights.sitl import Motion, Pilot, climb
 from engine.geo import LocalFrame
+from scenematch.files.stamps import GPS_EPOCH_S, GPS_WEEK_S
 from scenematch.report.loop_record import rms
 from scenematch.runs.simulation import write_flight
 from scenematch.simulator import plan_flight
@@ -56,7 +57,6 @@ DRIFTS = (
     Fault("fixes not used", 150.0, 12.0),
 )
 _AFTER_S = 30.0  # from the last fault to the end
-_GPS_EPOCH_S, _WEEK_S, _FIX_3D = 315_964_800 - 18, 604_800, 3  # since 1970, less the leap seconds
 Track = NDArray[np.float64]
 """(N, 3 or 4) seconds since the simulator's start, metres east and north, and when a fix came."""
 
@@ -191,19 +191,21 @@ def read_log(log: Path, pilot: LoggedPilot) -> tuple[Track, Track, Track]:
             origin = LocalFrame(row.Lat, row.Lng) if row.Type == 0 else origin
         elif kind in tracks:
             tracks[kind].append((row.TimeUS * 1e-6, *place.enu_from_geodetic(row.Lat, row.Lng)[:2]))
-        elif (kind == "VISP" and row.Ign) or (kind == "GPS" and not (row.I == 1 and row.Status >= _FIX_3D)):
-            continue  # without a position it says only that the camera works; the first receiver is a real one
-        else:
-            if kind == "VISP":
-                captured_s, (lat_deg, lon_deg) = row.RTimeUS * 1e-6, origin.geodetic_from_enu(row.PY, row.PX)
-            else:
-                captured_s = _GPS_EPOCH_S + row.GWk * _WEEK_S + row.GMS * 1e-3 - pilot.since_1970_s
-                lat_deg, lon_deg = row.Lat, row.Lng
+        elif (fix := _fix_of(row, origin, pilot.since_1970_s)) is not None:
+            captured_s, *at_deg = fix
             captured_s += float(np.interp(captured_s, here_s, lead_s))
-            east_north = place.enu_from_geodetic(lat_deg, lon_deg)[:2]
-            tracks["fixes"].append((captured_s, *east_north, row.TimeUS * 1e-6))
+            tracks["fixes"].append((captured_s, *place.enu_from_geodetic(*at_deg)[:2], row.TimeUS * 1e-6))
     widths = {"SIM": 3, "POS": 3, "fixes": 4}
     return tuple(np.array(tracks[kind]).reshape(-1, n) for kind, n in widths.items())  # type: ignore[return-value]
+
+
+def _fix_of(row: Any, origin: LocalFrame, since_1970_s: float) -> tuple[float, float, float] | None:
+    """Capture on this machine's clock, latitude and longitude of a row of VISP or GPS; None if it is no fix."""
+    if row.get_type() == "VISP":  # without a position it says only that the camera works
+        return None if row.Ign else (row.RTimeUS * 1e-6, *map(float, origin.geodetic_from_enu(row.PY, row.PX)))
+    if row.I != 1 or row.Status < mavutil.mavlink.GPS_FIX_TYPE_3D_FIX:  # the first receiver is the simulator's
+        return None
+    return GPS_EPOCH_S + row.GWk * GPS_WEEK_S + row.GMS * 1e-3 - since_1970_s, row.Lat, row.Lng
 
 
 def off_m(truth: Track, track: Track) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from engine.errors import TelemetryError
 from scenematch.files.resampling import FlightLog, TimeSeries, make_position_series, make_series
+from scenematch.files.stamps import GPS_EPOCH_S, GPS_WEEK_S
 
 _HEAD, _FMT = b"\xa3\x95", 0x80  # the first two bytes of each message; the type that defines the others
 _MAX_US = 1e13  # a third of a year: a larger stamp is corrupt
@@ -40,7 +41,7 @@ _FIELDS = {
     "CAM": (),
     "TRIG": (),
 }
-_GPS_EPOCH_S, _LEAP_S, _WEEK_S, _LAST_WEEK = 315_964_800, 18, 604_800, 10_000
+_LAST_WEEK = 10_000
 _FIX_3D, _RANGE_GOOD, _DOWN, _TERRAIN_OK = 3, 4, 25, 2
 
 Columns = Mapping[str, NDArray[np.float64]]
@@ -184,10 +185,10 @@ def _utc_ns(gps: Columns | None) -> int | None:
     if gps is None:
         return None
     known = (gps["Status"] >= _FIX_3D) & (gps["GWk"] > 0) & (gps["GWk"] < _LAST_WEEK) & (gps["GMS"] >= 0)
-    known &= gps["GMS"] < _WEEK_S * 1000
+    known &= gps["GMS"] < GPS_WEEK_S * 1000
     if not known.any():
         return None
-    since_epoch_s = gps["GWk"][known].astype(np.int64) * _WEEK_S + _GPS_EPOCH_S - _LEAP_S
+    since_epoch_s = gps["GWk"][known].astype(np.int64) * GPS_WEEK_S + GPS_EPOCH_S
     utc_ns = since_epoch_s * 1_000_000_000 + gps["GMS"][known].astype(np.int64) * 1_000_000
     differences = np.sort(utc_ns - _stamps_ns(gps)[known])
     return int(differences[len(differences) // 2])
