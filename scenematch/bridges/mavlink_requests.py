@@ -32,17 +32,18 @@ class AutopilotRequests:
         if with_gimbal:
             self._rates_hz = self._rates_hz | GIMBAL_RATES_HZ[options.firmware]
         self._without_origin_ns = 0  # since when the autopilot has reported no origin
-        self._last_ns = 0
+        self._last_ns: int | None = None
 
     def restart(self, now_ns: int) -> None:
         """Ask at once: the vehicle is heard for the first time or again."""
-        self._without_origin_ns, self._last_ns = now_ns, 0
+        self._without_origin_ns, self._last_ns = now_ns, None
 
     def due(self, telemetry: MavlinkTelemetry, now_ns: int) -> list[Any]:
         """The messages to send now; call it often while the vehicle is connected."""
         if telemetry.origin is not None:
             self._without_origin_ns = now_ns
-        if now_ns - self._last_ns < (_PERIOD_WITH_ORIGIN_NS if telemetry.origin else _PERIOD_NS):
+        period_ns = _PERIOD_WITH_ORIGIN_NS if telemetry.origin else _PERIOD_NS
+        if self._last_ns is not None and now_ns - self._last_ns < period_ns:
             return []
         self._last_ns = now_ns
         intervals = [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,9 +146,9 @@ class RecentValues:
             return near[0][1] if near else None
         (t0, first), (t1, last) = near
         share = (time_ns - t0) / (t1 - t0)
-        steps = zip_longest((b - a for a, b in zip(first, last, strict=True)), self._angles, fillvalue=False)
-        moved = [share * (math.remainder(d, 360.0) if is_angle else d) for d, is_angle in steps]
-        return tuple(a + d for a, d in zip(first, moved, strict=True))
+        steps = [b - a for a, b in zip(first, last, strict=True)]
+        steps = [math.remainder(d, 360.0) if any(self._angles[i : i + 1]) else d for i, d in enumerate(steps)]
+        return tuple(a + share * d for a, d in zip(first, steps, strict=True))
 
 
 def scalar(values: tuple[float, ...] | None) -> float | None:

@@ -88,7 +88,7 @@ def track(
     # From the rows in the file, so that evaluate gives the same figures.
     rows, shown = read_track(out / TRACK), ReportFrames(flight, matcher)
     record = _record(files, settings, inputs, str(matcher.device))
-    what, share = _worst_share(rows, answers, flight.rows, settings.acceptance.heading_bias_deg)
+    what, share = _worst_share(answers, flight.rows, settings.acceptance.heading_bias_deg)
     if diagnosis and settings.profile == "engine" and share < _CHECKED_SHARE:
         progress.message(f"{share:.0%} of the frames {what}: looking for errors in the inputs")
         record = replace(record, diagnosis=_diagnosis(files, settings, inputs, share, progress))
@@ -102,7 +102,7 @@ def _fixed_share(rows: Sequence[TrackRow]) -> float:
 
 
 def _worst_share(
-    rows: Sequence[TrackRow], answers: Sequence[TrackRow], telemetry: Sequence[TelemetryRow], bias_deg: float
+    answers: Sequence[TrackRow], telemetry: Sequence[TelemetryRow], bias_deg: float
 ) -> tuple[str, float]:
     """The share of frames that were fixed, or of those that show the stated heading, whichever is smaller."""
     stated_deg = {row.timestamp_ns: row.heading_deg for row in telemetry if row.heading_deg is not None}
@@ -112,7 +112,9 @@ def _worst_share(
         if row.heading_deg is not None and row.timestamp_ns in stated_deg
     ]
     agreeing = sum(off <= SPREAD_SIGMAS * bias_deg for off in off_deg) / len(off_deg) if off_deg else 1.0
-    return min(("were fixed", _fixed_share(rows)), ("show the stated heading", agreeing), key=lambda each: each[1])
+    return min(
+        ("were fixed", _fixed_share(answers)), ("show the stated heading", agreeing), key=lambda each: each[1]
+    )
 
 
 def _diagnosis(
