@@ -47,8 +47,8 @@ FIGURES = {  # page: claim: results page, heading and words of each row that sta
         "by `global_position_sensor` 1.4 m": [("mavlink.md", "PX4 SITL", "| `global_position_sensor`, 1")],
         "some 0.1 s": [("vehicle.md", "The unit of systemd", "| worker killed |")],
         "takes 2 to 3 s to its first fix":
-            [("mavlink.md", "Flights with faults", "| bridge, NCC |", "| bridge, `auto` |")],
-        "3 to 6 s without": [("mavlink.md", "Flights with faults", "| bridge, NCC |", "| bridge, `auto` |")],
+            [("mavlink.md", "Starts", "| bridge, NCC |", "| bridge, `auto` |")],
+        "3 to 6 s without": [("mavlink.md", "Starts", "| bridge, NCC |", "| bridge, `auto` |")],
     },
     "docs/odometry.md": {
         "Drift over 5 s without a match was 2 m per 100 m":

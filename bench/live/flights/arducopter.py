@@ -1,11 +1,11 @@
 """``python -m bench.live.flights.arducopter FLIGHT SITL``: ArduCopter's simulator, the bridge and a drawn town.
 
 SITL is the program ``arducopter`` in its source tree, of which it takes the default parameters. It climbs on GNSS,
-selects the fixes, switches the receiver off and flies the course of :mod:`bench.live.flights.fly` for so long, in
-wind. With ``--faults`` the bridge is killed and the camera covered, frozen and shifted; with ``--drifts`` wind
-carries the vehicle away until the EKF lets go of its position, or the EKF leaves fixes out. ``--boots`` flies so
-often beside one bridge: the simulator ends in the air and is started anew. What the EKF and the fixes were off is
-from SITL's own log.
+selects the fixes, switches the receiver off and flies the paper's course over a drawn town for so long, in wind.
+With ``--faults`` the bridge is killed and the camera covered, frozen and shifted; with ``--drifts`` wind carries
+the vehicle away until the EKF lets go of its position, or the EKF leaves fixes out. ``--boots`` flies so often
+beside one bridge: the simulator ends in the air and is started anew. What the EKF and the fixes were off is from
+SITL's own log.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from pymavlink import mavutil
 
 from bench.live.bridge_counts import free_port
+from bench.live.flights.bridge import Bridge, change
 from bench.live.flights.faults import Fault, events
-from bench.live.flights.fly import FAR_M, FLIGHT_S, RATE_HZ, Bridge, change, conditions, longest_silence_s
+from bench.live.flights.fly import FAR_M, conditions
 from bench.live.flights.recorded import recorded
 from bench.live.flights.sitl import Motion, Pilot, climb
 from engine.geo import LocalFrame
@@ -39,6 +40,7 @@ from scenematch.report.loop_record import rms
 from scenematch.runs.simulation import write_flight
 from scenematch.simulator import plan_flight
 
+RATE_HZ, FLIGHT_S = 5.0, 145.0  # of the course
 DELAY_MS = 80.0
 _PILOT_AT = "udpin:127.0.0.1:14552"
 FAULTS = (
@@ -212,6 +214,12 @@ def off_m(truth: Track, track: Track) -> NDArray[np.float64]:
     """How far a track is from the truth at its times."""
     true = np.column_stack([np.interp(track[:, 0], truth[:, 0], truth[:, k]) for k in (1, 2)])
     return np.asarray(np.hypot(*(track[:, 1:3] - true).T))
+
+
+def longest_silence_s(arrived_s: NDArray[np.float64], begin_s: float, end_s: float) -> float:
+    """The longest gap between fixes, or between one and the begin or end."""
+    within = arrived_s[(arrived_s > begin_s) & (arrived_s < end_s)]
+    return float(np.diff([begin_s, *within, end_s]).max())
 
 
 def _rms_and_worst(off: NDArray[np.float64]) -> str:

@@ -37,15 +37,3 @@ def events(faults: Sequence[Fault]) -> list[tuple[float, bool, Fault]]:
     """Beginnings and ends in their order: when, whether it is an end, and of what."""
     both = [(fault.begin_s, False, fault) for fault in faults] + [(fault.end_s, True, fault) for fault in faults]
     return sorted(both, key=lambda event: event[0])
-
-
-FAULTS = (
-    Fault("bridge killed", 15.0, 3.0),
-    Fault("worker killed", 35.0),
-    Fault("camera covered", 45.0, 10.0),
-    Fault("picture frozen", 65.0, 6.0),
-    Fault("autopilot silent", 80.0, 5.0),
-    Fault("autopilot restarted", 95.0),
-    Fault("bridge killed", 110.0, 15.0),
-)
-FLIGHT_S = 145.0

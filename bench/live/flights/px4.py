@@ -21,6 +21,7 @@ from pymavlink import mavutil
 
 from bench.live.flights.arducopter import (
     DELAY_MS,
+    FLIGHT_S,
     LoggedPilot,
     Track,
     endure,
@@ -30,8 +31,9 @@ from bench.live.flights.arducopter import (
     report,
     sitl_bridge,
 )
+from bench.live.flights.bridge import Bridge
 from bench.live.flights.faults import Fault
-from bench.live.flights.fly import FLIGHT_S, Bridge, conditions
+from bench.live.flights.fly import conditions
 from bench.live.flights.recorded import recorded
 from bench.live.flights.sitl import Motion
 from engine.geo import LocalFrame
@@ -41,7 +43,7 @@ _INT32, _REAL32 = 6, 9
 _WIND = {"SIH_WIND_N": 0.87, "SIH_WIND_E": 0.5}
 _CLIMB_S = 150.0
 _OWN = {
-    "SDLOG_PROFILE": 129,
+    "SDLOG_PROFILE": 131,
     "EKF2_GPS_CTRL": 7,
     "NAV_DLL_ACT": 0,
     "NAV_RCL_ACT": 0,
@@ -60,7 +62,8 @@ class Px4Pilot(LoggedPilot):
             for name, share in _WIND.items():
                 self.link.mav.param_set_send(1, 1, name.encode(), fault.wind_mps * share, _REAL32)
         if fault.kind == "fixes not used":
-            self.set_integer("EKF2_EV_CTRL", int(is_over))
+            for name in ("EKF2_EV_CTRL", "EKF2_AGP0_CTRL"):
+                self.set_integer(name, int(is_over))
 
     def set_integer(self, name: str, value: int) -> None:
         """Set a parameter of whole numbers, whose bits PX4 takes for those of a float."""
@@ -69,7 +72,7 @@ class Px4Pilot(LoggedPilot):
 
 
 @contextlib.contextmanager
-def simulator(build: Path, folder: Path, place: LocalFrame, wind_mps: float) -> Iterator[None]:
+def simulator(build: Path, folder: Path, place: LocalFrame, message: str, wind_mps: float) -> Iterator[None]:
     """PX4 with fresh parameters, and the camera."""
     run, pipe, fault_file = folder / "px4", folder / "camera", folder / "fault"
     run.mkdir(exist_ok=True)
@@ -77,7 +80,7 @@ def simulator(build: Path, folder: Path, place: LocalFrame, wind_mps: float) -> 
         old.unlink(missing_ok=True)
     os.mkfifo(pipe)
     command = [sys.executable, "-m", "scenematch", "bridge", "mavlink", "--force", "--firmware", "px4"]
-    written = ["--settings", "mavlink.message=odometry", "--write-params", str(run / "scenematch.params")]
+    written = ["--settings", f"mavlink.message={message}", "--write-params", str(run / "scenematch.params")]
     subprocess.run([*command, *written], check=True)
     lines = (run / "scenematch.params").read_text(encoding="ascii").splitlines()
     values = dict(line.split("\t")[2:4] for line in lines if not line.startswith("#")) | _OWN
@@ -131,16 +134,22 @@ def fly(pilot: Px4Pilot, motion: Motion, duration_s: float, bridge: Bridge, faul
 
 
 def read_log(log: Path, place: LocalFrame) -> list[Track]:
-    """The truth, the EKF and the fixes by their time of capture, of a ULog; these with when they came."""
+    """The truth, the EKF and the fixes by their time of capture, of a ULog; these with when they came.
+
+    PX4 stamps GLOBAL_POSITION_SENSOR by its arrival: the capture is what EKF2 takes for it.
+    """
     from pyulog import ULog
 
-    names = ("vehicle_global_position_groundtruth", "vehicle_global_position", "vehicle_visual_odometry")
-    data = {each.name: each.data for each in ULog(str(log), [*names, "vehicle_local_position"]).data_list}
+    read = ULog(str(log))
+    data = {each.name: each.data for each in read.data_list}
     tracks = []
-    for name in names[:2]:
-        known = data[name]
-        east_north = place.enu_from_geodetic(known["lat"], known["lon"])
-        tracks.append(np.column_stack([known["timestamp"] * 1e-6, east_north]))
+    for name in ("vehicle_global_position_groundtruth", "vehicle_global_position", "aux_global_position"):
+        if (known := data.get(name)) is not None:
+            east_north = place.enu_from_geodetic(known["lat"], known["lon"])
+            tracks.append(np.column_stack([known["timestamp"] * 1e-6, east_north]))
+    if len(tracks) > 2:
+        delay_s = np.array([read.initial_parameters["EKF2_AGP0_DELAY"] * 1e-3, 0.0, 0.0])
+        return [*tracks[:2], np.column_stack([tracks[2] - delay_s, tracks[2][:, 0]])]
     origin, fixes = data["vehicle_local_position"], data["vehicle_visual_odometry"]
     frame = LocalFrame(origin["ref_lat"][-1], origin["ref_lon"][-1])
     lat_deg, lon_deg = frame.geodetic_from_enu(fixes["position[1]"], fixes["position[0]"])
@@ -153,20 +162,21 @@ def main() -> None:
     """Fly, and print the tables."""
     parser = parser_of(__doc__)
     parser.add_argument("build", type=Path)
+    parser.add_argument("--message", choices=("odometry", "global_position_sensor"), default="odometry")
     arguments, before = parser.parse_args(), os.getloadavg()[0]
     folder, faults, seconds = planned(arguments)
     motion, place, _ = recorded(folder)
     with (
-        simulator(arguments.build.absolute(), folder, place, arguments.wind_mps),
+        simulator(arguments.build.absolute(), folder, place, arguments.message, arguments.wind_mps),
         contextlib.ExitStack() as stack,
     ):
-        bridge = sitl_bridge(folder, 14540, arguments.method, "odometry", realtime=True, firmware="px4")
+        bridge = sitl_bridge(folder, 14540, arguments.method, arguments.message, realtime=True, firmware="px4")
         stack.callback(bridge.kill)
         link = mavutil.mavlink_connection("udpin:127.0.0.1:14550", source_system=255)
         link.wait_heartbeat()
         pilot = Px4Pilot(link, place)
         begin_s = fly(pilot, motion, seconds, bridge, faults)
-    print(f"{arguments.method}, wind {arguments.wind_mps:g} m/s, {conditions(before)}\n")
+    print(f"{arguments.method}, {arguments.message}, wind {arguments.wind_mps:g} m/s, {conditions(before)}\n")
     tracks = read_log(max((folder / "px4").rglob("*.ulg"), key=os.path.getmtime), place)
     print(report(tracks, begin_s, seconds, faults))
 

@@ -1,9 +1,9 @@
 """The camera of a simulated vehicle over a drawn town.
 
-``python -m bench.live.flights.town_camera FLIGHT PIPE FAULT_FILE`` draws the town of
-:mod:`bench.live.flights.fly` as seen from SITL's true state, and writes JPEG pictures like
-:mod:`bench.live.flights.video_camera` to a named pipe, for ``--camera-source "exec:cat PIPE"``. While FAULT_FILE
-names a fault, the picture is covered, frozen, or taken 40 m further east, as if the map were shifted.
+``python -m bench.live.flights.town_camera FLIGHT PIPE FAULT_FILE`` draws the town of a flight as seen from SITL's
+true state, and writes JPEG pictures like :mod:`bench.live.flights.video_camera` to a named pipe, for
+``--camera-source "exec:cat PIPE"``. While FAULT_FILE names a fault, the picture is covered, frozen, or taken 40 m
+further east, as if the map were shifted.
 """
 
 from __future__ import annotations
