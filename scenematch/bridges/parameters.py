@@ -16,7 +16,7 @@ MAX_DELAY_MS = 250.0
 
 MESSAGES = {
     "ardupilot": ("vision_position_estimate", "odometry", "gps_input"),
-    "px4": ("global_position_sensor", "odometry"),
+    "px4": ("odometry", "global_position_sensor"),
 }
 """Messages that each firmware accepts; the first is the default."""
 

@@ -639,6 +639,7 @@ def test_parameter_files():
     assert all(len(row) == 5 and row[:2] == ["1", "1"] and len(row[2]) <= 16 for row in rows)
     assert ["1", "1", "EKF2_AGP0_CTRL", "1", "6"] in rows
     assert ["1", "1", "EKF2_AGP0_DELAY", "120", "9"] in rows
+    assert ["1", "1", "EKF2_DELAY_MAX", "120", "9"] in rows  # a fix that waits longer is further behind
     assert "EKF2_EV_CTRL\t1\t6" in parameter_file(MavlinkOptions(firmware="px4", message="odometry"))
     assert "250" in misuse(parameter_file, MavlinkOptions(message="vision_position_estimate"), delay_ms=251)
 

@@ -62,7 +62,8 @@ def test_a_url_is_repeated_as_it_was_typed(url, capsys):
 def test_files_that_commands_write_are_named(tmp_path, capsys):
     parameters = tmp_path / "p.param"
     command = ["bridge", "mavlink", "--firmware=px4", f"--write-params={parameters}"]
-    written = answer(capsys, [*command, "--settings=parameters.delay_ms=90"])
+    settings = ("mavlink.message=global_position_sensor", "parameters.delay_ms=90")
+    written = answer(capsys, [*command, *(f"--settings={setting}" for setting in settings)])
     assert written == {"parameters": str(parameters), "delay_ms": 90}
     assert "EKF2_AGP0_DELAY\t90" in parameters.read_text(encoding="utf-8")
     assert spoken(capsys, command, 2)["argument"] == "--write-params"
