@@ -35,7 +35,7 @@ def degrees_1e7(east_m, north_m):
 
 
 def test_the_fixes_of_a_flight_are_scored():
-    scored = [(1.0, 0.1, 10.0), (17.0, 9.0, 10.0), (20.5, 0.3, 10.0), (36.0, 0.4, 20.0)]
+    scored = [(0.1, 10.0), (9.0, 10.0), (0.3, 10.0), (0.4, 20.0)]
     assert "| 4 | 4.51 | 0.35 | 9.00 | 1 | 10, 20 |" in fly.report(scored, "begun").splitlines()
 
 

@@ -22,12 +22,13 @@ from bench.live.flights.recorded import captured_s, off_m, recorded
 from bench.live.flights.sitl import fly_sitl
 from bench.live.standin import MS, Agenda, RealClock, S, Standin, State
 from engine.errors import EngineError
+from scenematch.report.loop_record import rms
 
 FAR_M = 5.0
 FIRMWARES = {"ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": mavlink.MAV_AUTOPILOT_PX4}
 _LAST_ANSWER_S = 1.0  # the answer to the last picture comes after the flight
-Fixes = list[tuple[float, float, float]]
-"""Arrival of each, seconds after the first picture; error in metres; age in milliseconds."""
+Fixes = list[tuple[float, float]]
+"""Error of each in metres; its age on arrival in milliseconds."""
 
 
 def wait_for_bridge(port: int) -> None:
@@ -44,11 +45,7 @@ def wait_for_bridge(port: int) -> None:
                 time.sleep(0.02)
 
 
-def fly(
-    flight: Path,
-    port: int,
-    firmware: str = "ardupilot",
-) -> Fixes:
+def fly(flight: Path, port: int, firmware: str = "ardupilot") -> Fixes:
     """Fly the stand-in once a bridge listens."""
     motion, place, duration_s = recorded(flight)
     wait_for_bridge(port)
@@ -59,8 +56,7 @@ def fly(
         return motion(time_s - begin_ns * 1e-9)
 
     def on_fix(fix: Any, arrived_ns: int) -> None:
-        age_ms = arrived_ns * 1e-6 - captured_s(fix) * 1e3
-        fixes.append(((arrived_ns - begin_ns) * 1e-9, off_m(fix, now, pilot), age_ms))
+        fixes.append((off_m(fix, now, pilot), arrived_ns * 1e-6 - captured_s(fix) * 1e3))
 
     agenda = Agenda(clock)
     pilot = Standin(agenda, port, now, place, on_fix, firmware=FIRMWARES[firmware])
@@ -74,11 +70,11 @@ def report(fixes: Fixes, begun: str) -> str:
     """A table of the fixes."""
     if not fixes:
         return f"{begun}\n\nno fixes"
-    _, off, age_ms = np.array(fixes).T
+    off, age_ms = np.array(fixes).T
     lines = [
         begun, "", "| fixes | RMS m | median m | worst m | beyond 5 m | age p50, p99 ms |",
         "|---|---|---|---|---|---|",
-        f"| {len(off)} | {np.sqrt((off**2).mean()):.2f} | {np.median(off):.2f} | {off.max():.2f} "
+        f"| {len(off)} | {rms(off):.2f} | {np.median(off):.2f} | {off.max():.2f} "
         f"| {(off > FAR_M).sum()} | {np.median(age_ms):.0f}, {np.percentile(age_ms, 99):.0f} |",
     ]  # fmt: skip
     return "\n".join(lines)

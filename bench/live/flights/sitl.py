@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from bench.live.flights.faults import Fault
 from bench.live.standin import State
 from engine.geo import LocalFrame
+from scenematch.report.loop_record import rms
 
 Motion = Callable[[float], State]
 RATES_HZ = {
@@ -175,8 +176,7 @@ def report(pilot: Pilot) -> str:
     """A table of the parts."""
     lines = ["| part | states | EKF to truth, RMS m | worst m |", "|---|---|---|---|"]
     for part, errors in pilot.errors_m.items():
-        off = np.asarray(errors)
-        lines.append(f"| {part} | {len(off)} | {np.sqrt((off**2).mean()):.2f} | {off.max():.2f} |")
+        lines.append(f"| {part} | {len(errors)} | {rms(np.array(errors)):.2f} | {max(errors):.2f} |")
     return "\n".join(lines)
 
 
