@@ -217,6 +217,11 @@ def velocity_of(frame: Frame) -> Array | None:
     return np.array([frame.east_velocity_mps, frame.north_velocity_mps])
 
 
+def stamps_m2(mps: Array, options: NavigatorOptions) -> float:
+    """Variance of a way at this velocity (2,) because the stamps at both of its ends are off."""
+    return 2.0 * options.attitude_jitter_s**2 * float(mps @ mps)
+
+
 def stated_step(before: Step | None, frame: Frame, interval_s: float, options: NavigatorOptions) -> Step | None:
     """The way to a frame by the velocities that came with it and with the one before.
 
@@ -236,6 +241,6 @@ def stated_step(before: Step | None, frame: Frame, interval_s: float, options: N
         return None
     mean_mps, changes = (end_mps, 3.0) if begin_mps is None else (0.5 * (begin_mps + end_mps), 12.0)
     between_m2 = options.acceleration_mps2**2 * interval_s**3 / changes  # of a walk between known ends
-    between_m2 += 2.0 * options.attitude_jitter_s**2 * float(mean_mps @ mean_mps)  # both stamps are off
+    between_m2 += stamps_m2(mean_mps, options)
     sigma_mps = frame.velocity_sigma_mps or options.measured_velocity_sigma_mps
     return Step(mean_mps * interval_s, begin_mps, end_mps, sigma_mps, between_m2)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from engine.matching.evidence import RELIABILITY, nats_of, needed_nats
-from engine.navigation.motion import Array, PositionEstimate, Step, Ways, en_m, place_of
+from engine.navigation.motion import Array, PositionEstimate, Step, Ways, en_m, place_of, stamps_m2
 from engine.options import NavigatorOptions
 from engine.values import RISK, SIGNIFICANCE, Fix
 
@@ -123,6 +123,9 @@ class Track:
     def matched(self, place: PositionEstimate, fix: Fix, support: float) -> Track:
         """The track after a match: its position is the match's own, its velocity is filtered (Kalman).
 
+        What the track's uncertainty does not explain is an error of the stamp and no velocity; the next frame is
+        expected as far off again.
+
         Args:
             place: of the match.
             fix: the match.
@@ -131,7 +134,9 @@ class Track:
         Returns:
             Track: at the same time.
         """
-        variance_m2, apart_m = place.sigma_m**2, place.en_m - self.filtered_m
+        apart_m = place.en_m - self.filtered_m
+        unexplained_m2 = 0.5 * float(apart_m @ apart_m) - self.covariance[1, 1]  # so the stamp is further off
+        variance_m2 = max(place.sigma_m**2, unexplained_m2)
         gain = self.covariance[:, 1] / (self.covariance[1, 1] + variance_m2)
         gain[0] = 1.0
         left = np.diag([0.0, 1.0, 1.0])
@@ -192,6 +197,7 @@ class Track:
         both = fades_s * (1.0 - kept) ** 2
         noise = np.array([[place, place, both], [place, place, both], [both, both, 1.0 - kept**2]])
         covariance = way @ self.covariance @ way.T + sigma_mps**2 * noise
+        covariance[:2, :2] += stamps_m2(self.velocity_mps, options)
         return way_s * self.velocity_mps, kept * self.velocity_mps, covariance
 
 

@@ -160,6 +160,18 @@ def test_without_a_velocity_a_jump_is_believed_once_a_vehicle_could_have_flown_i
     assert fixed == [*range(20), *range(fixed[20], 45)]
 
 
+@pytest.mark.parametrize(("late_s", "lost"), [(0.05, 0), (0.09, 0), (0.15, 1), (0.25, 2)])
+@pytest.mark.parametrize("velocity", [(8.0, 0.0), UNKNOWN])
+def test_a_picture_stamped_late_costs_no_other_frame(late_s, lost, velocity):
+    """At 8 m/s and ten pictures a second, known to 5 cm; those that its stamp has overtaken are left out."""
+    times_s = [0.1 * k for k in range(60)]
+    del times_s[31 : 31 + lost]
+    places = [(10.0 + 8.0 * time_s, 20.0) for time_s in times_s]
+    stamps_s = [time_s + late_s * (k == 30) for k, time_s in enumerate(times_s)]
+    run = flown(*places, seconds=stamps_s, velocity=velocity, sigma_m=0.05, confidence=1.0 - 1e-9)
+    assert {*range(len(places))} - {*run.fixed} <= {30}
+
+
 @pytest.mark.parametrize(("seconds_before", "held_s"), [(20.0, 10.0), (150.0, 18.0)])
 def test_a_jump_that_lasts_is_unhealthy_at_first_and_believed_in_the_end(seconds_before, held_s):
     """A map that shifts by 40 m. Past evidence fades within a minute, however long the flight was right."""

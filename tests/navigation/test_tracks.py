@@ -73,6 +73,7 @@ def test_without_a_measurement_it_drifts_as_a_process_of_bounded_velocity(interv
         state = way @ state
         covariance = way @ covariance @ way.T
         covariance[1, 1] += 2.0 * sigma_mps**2 / fades_s * interval_s / steps
+    covariance[0, 0] += 2.0 * (OPTIONS.attitude_jitter_s * 7.0) ** 2  # the stamps of both ends are off
     track = a_track(velocity=(7.0, 0.0)).carried(Ways(interval_s), OPTIONS)
     assert (track.en_m[0], track.velocity_mps[0]) == pytest.approx(tuple(state), rel=1e-3, abs=1e-3)
     assert position_and_velocity(track) == pytest.approx(covariance, rel=2e-3)
@@ -88,6 +89,15 @@ def test_a_match_gives_the_position_and_filters_the_velocity():
     before = np.block([[position_and_velocity(track), np.zeros((2, 1))], [np.zeros((1, 2)), sigma_m**2]])
     assert position_and_velocity(after) == pytest.approx(errors @ before @ errors.T)
     assert (after.support, after.misses) == (30.0, 0)
+
+
+def test_what_a_track_cannot_explain_is_the_stamps_error():
+    """10 m off, 2 m explained: the velocity changes as by a match that is as uncertain as the rest."""
+    track = a_track(velocity=(3.0, 0.0))
+    off = track.matched(PositionEstimate(np.array([10.0, 0.0]), 0.1), fix_at(10.0), 30.0)
+    gain = 1.0 / 50.0  # half of the square, as the two axes share it
+    assert (off.en_m[0], off.velocity_mps[0]) == pytest.approx((10.0, 3.0 + gain * 10.0))
+    assert off.estimate.sigma_m == pytest.approx(math.sqrt(50.0 - 4.0))
 
 
 def test_matches_of_metres_tell_a_velocity_within_seconds():
