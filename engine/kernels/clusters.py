@@ -1,7 +1,5 @@
 """Clusters of points in the plane, compiled by numba: for a few hundred points NumPy's call overhead dominates."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine.runtime.jit import compiled, inlined

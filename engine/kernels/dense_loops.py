@@ -3,8 +3,6 @@
 Arrays of samples are (3, N), (2, N) or (N,) float64 as in :mod:`engine.kernels.dense`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine.kernels.small_matrices import pixel_of, rotated

@@ -4,8 +4,6 @@ Arrays of samples are (3, N), (2, N) or (N,) float64, and the order of the eight
 :mod:`engine.kernels.dense`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine.kernels.dense_loops import CELLS, MIN_SAMPLES, compare_levels, project

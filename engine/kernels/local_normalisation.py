@@ -3,8 +3,6 @@
 Sums of whole grey levels, counted from middle grey, are exact in int32.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine.kernels.sums import MIDDLE_GREY

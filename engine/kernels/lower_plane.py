@@ -1,7 +1,5 @@
 """Quantile regression of a plane through heights, compiled by numba: a few rounds over two hundred heights."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine.kernels.small_matrices import add_equation, solve

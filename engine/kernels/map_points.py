@@ -3,8 +3,6 @@
 One point costs a microsecond instead of thirty by NumPy calls; a frame needs some dozens.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine.runtime.jit import compiled

@@ -1,7 +1,5 @@
 """The two nearest of many descriptors for the CPU, compiled by numba: one pass over a table of cosines."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine.runtime.jit import compiled

@@ -3,8 +3,6 @@
 Arrays of matches are (3, N), (2, N) or (N,) float64, and names are those of :mod:`engine.matching.pnp`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

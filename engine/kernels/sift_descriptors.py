@@ -5,8 +5,6 @@ height, width, offset, and the strides of level and row. ``keypoints`` are rows 
 level, octave, in pixels of the octave.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

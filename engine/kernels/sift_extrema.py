@@ -5,8 +5,6 @@ them while they are cached. To the loops a strip is one long row: entering a loo
 ``buffer`` is the flat scale space of :mod:`engine.sift.scale_space`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine.runtime.jit import compiled, inlined

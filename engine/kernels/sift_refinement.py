@@ -3,8 +3,6 @@
 ``buffer`` is the flat scale space of :mod:`engine.sift.scale_space`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine.runtime.jit import compiled, inlined

@@ -3,8 +3,6 @@
 Scalars and loops only: an expression of whole arrays takes numba longer to compile than all of these together.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from engine.runtime.jit import compiled, inlined

@@ -3,8 +3,6 @@
 Sums are in float64 and about the window's mean, or of a picture about 0: a large offset would cost digits.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

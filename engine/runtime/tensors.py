@@ -5,8 +5,6 @@ seconds and 180 MB, and on the CPU NCC and SIFT work on NumPy arrays: their modu
 have a tensor.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
