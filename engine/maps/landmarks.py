@@ -22,6 +22,7 @@ from engine.maps.rasters import COARSE_LIMIT_PX
 from engine.maps.recently_used import RecentlyUsed
 from engine.maps.tiles import HALO_PX, TILE_PX, tiles_under, widened, within
 from engine.runtime.device import Device, Picture, as_float, on_host, to_device
+from engine.sift.values import fields_of, ranks_within
 from engine.values import Window
 
 if TYPE_CHECKING:  # a map is built on what lies here
@@ -64,9 +65,6 @@ class Landmarks:
     features: Features
     xy_px: NDArray[np.float32]
     points_m: Array
-
-
-_Key = tuple[int, bool, Window]  # level, upright and window of the tile
 
 
 class LandmarkMap:
@@ -144,7 +142,8 @@ class LandmarkMap:
             own = (corner == (key[2].x0, key[2].y0)).all(axis=1)
             self.tiles[key] = self._with_points({field: stored[field][own] for field in _STORED}, level)
 
-    def _keys(self, window: Window, level: int, upright: bool) -> list[_Key]:
+    def _keys(self, window: Window, level: int, upright: bool) -> list[tuple[int, bool, Window]]:
+        """Level, upright and window of the tiles that a window touches."""
         return [(level, upright, tile) for tile in tiles_under(window, TILE_PX, self._site.level_shape(level))]
 
     def _describe(self, level: int, upright: bool, own: Window) -> NamedArrays:
@@ -165,11 +164,11 @@ class LandmarkMap:
             contrast_threshold=MIN_CONTRAST,
             spread=1,  # by strength alone; the level's cells spread landmarks
         )
-        fields = (found.valid, found.xy_px, found.scale_px, found.angle_deg, found.descriptors)
-        valid, *all_slots = (on_host(values[0]) for values in fields)
+        *all_slots, valid = (on_host(values[0]) for values in fields_of(found))
         positions, scale, angle, descriptors = (values[valid] for values in all_slots)
         xy = positions + np.array([wide.x0, wide.y0], np.float32)
-        rank = _rank_in_cells(xy)
+        _, cell = np.unique(np.rint(xy).astype(np.int64) // CELL_PX, axis=0, return_inverse=True)
+        rank = ranks_within(cell.ravel())
         kept = np.flatnonzero(rank < MAX_PER_CELL)
         arrays = (xy, scale, angle, rank, descriptors)
         named = zip(_STORED.items(), arrays, strict=True)
@@ -177,9 +176,8 @@ class LandmarkMap:
 
     def _with_points(self, tile: NamedArrays, level: int) -> NamedArrays:
         map_px = self._site.full_from_level(tile["xy_px"], level)
-        return tile | {
-            "points_m": np.column_stack([self._site.enu_from_pixel(map_px), self._site.surface_at(map_px)])
-        }
+        points_m = np.column_stack([self._site.enu_from_pixel(map_px), self._site.surface_at(map_px)])
+        return tile | {"points_m": points_m}
 
 
 def _count(tile: NamedArrays) -> int:
@@ -205,13 +203,3 @@ def _inside(tile: NamedArrays, window: Window, max_rank: int) -> NDArray[np.intp
     left, top = window.x0 - 0.5, window.y0 - 0.5
     inside = (x >= left) & (x < left + window.width_px) & (y >= top) & (y < top + window.height_px)
     return np.flatnonzero(inside & (tile["rank"] < max_rank))
-
-
-def _rank_in_cells(xy_px: NDArray[np.float32]) -> NDArray[np.int64]:
-    """(N,) how many before each are in the same cell."""
-    column, row = (np.rint(xy_px).astype(np.int64) // CELL_PX).T
-    _, cell, counts = np.unique(np.stack([row, column]), axis=1, return_inverse=True, return_counts=True)
-    order = np.argsort(cell.ravel(), kind="stable")
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return rank

@@ -16,21 +16,20 @@ from engine.kernels.sift_refinement import refine_extrema
 from engine.runtime import threads
 from engine.sift.descriptors import ORIENT_STEP, ORIENT_WINDOW, SMOOTHING, TENTS
 from engine.sift.scale_space import EDGE_RATIO, FIRST_SIGMA_PX, SCALES, TRUNCATE, Octave, octaves_of
-from engine.sift.values import Features, SiftChoice
+from engine.sift.values import Features, SiftChoice, ranks_within
 
 Floats = NDArray[np.float32]
-Filters = tuple[Floats, NDArray[np.int64]]
 Octaves = tuple[Octave, ...]
 
 _BORDER = 4  # octave pixels along the edge without keypoints
 _EARLY = 0.8  # share of the contrast threshold that a voxel must reach before it is refined
 _MOVES = 2  # times that a keypoint may move to a neighbouring voxel
 _MAX_SHIFT = 0.7  # distance from the last voxel, in voxels, beyond which a refinement has not converged
-_X, _Y, _GROWTH, _CONTRAST, _, _OCTAVE = range(6)
+_, _, _GROWTH, _CONTRAST, _, _OCTAVE = range(6)
 
 
 @lru_cache(maxsize=16)
-def filters(sigmas: tuple[float, ...], up: int) -> Filters:
+def filters(sigmas: tuple[float, ...], up: int) -> tuple[Floats, NDArray[np.int64]]:
     """Gaussian filters of all levels along one axis.
 
     Args:
@@ -134,28 +133,17 @@ def strongest(
     Returns:
         (M, 6) at most ``max_keypoints`` of them.
     """
-    pixel_px = _pixel_px(keypoints, octaves)
-    x, y = keypoints[:, _X] * pixel_px, keypoints[:, _Y] * pixel_px
+    xy, octave = xy_px(keypoints, octaves), octaves[0]
     if mask is not None:
-        column = np.clip(np.rint(x).astype(np.intp), 0, mask.shape[1] - 1)
-        row = np.clip(np.rint(y).astype(np.intp), 0, mask.shape[0] - 1)
+        column, row = np.clip(np.rint(xy).astype(np.intp), 0, np.array(mask.shape)[::-1] - 1).T
         allowed = mask[row, column]
-        keypoints, x, y = keypoints[allowed], x[allowed], y[allowed]
+        keypoints, xy = keypoints[allowed], xy[allowed]
     order = np.argsort(-keypoints[:, _CONTRAST] * np.sqrt(scale_px(keypoints)), kind="stable")
-    octave = octaves[0]
-    column = np.clip((x * (octave.up * spread / octave.width)).astype(np.int64), 0, spread - 1)
-    row = np.clip((y * (octave.up * spread / octave.height)).astype(np.int64), 0, spread - 1)
-    is_crowded = _rank((row * spread + column)[order]) >= 2 * max_keypoints / spread**2
+    cells_per_px = np.array([octave.up * spread / n for n in (octave.width, octave.height)], np.float32)
+    column, row = np.clip((xy * cells_per_px).astype(np.int64), 0, spread - 1).T
+    is_crowded = ranks_within((row * spread + column)[order]) >= 2 * max_keypoints / spread**2
     kept = np.argsort(is_crowded, kind="stable")[:max_keypoints]
     return np.asarray(keypoints[order[kept]], np.float32)
-
-
-def _rank(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How many before each element (N,) are of the same group."""
-    order = np.argsort(group, kind="stable")
-    rank, ordered = np.empty_like(order), group[order]
-    rank[order] = np.arange(len(group)) - np.searchsorted(ordered, ordered)
-    return rank
 
 
 def describe(

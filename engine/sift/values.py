@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engine.runtime.device import Picture
 from engine.values import check
@@ -66,6 +67,14 @@ class Features:
 def fields_of(features: Features) -> tuple[Picture, ...]:
     """The five fields, in their order."""
     return features.xy_px, features.scale_px, features.angle_deg, features.descriptors, features.valid
+
+
+def ranks_within(group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many elements before each (N,) are of the same group, such as a cell of the picture."""
+    order = np.argsort(group, kind="stable")
+    ranks, ordered = np.empty_like(order), group[order]
+    ranks[order] = np.arange(len(group)) - np.searchsorted(ordered, ordered)
+    return ranks
 
 
 @dataclass(frozen=True, slots=True)
