@@ -99,9 +99,7 @@ def peak(
     if levels is None:
         return None  # no gain
     scores = _coarse_scores(levels)
-    count = _CANDIDATES_WIDE if wide else _CANDIDATES
-    candidates = best_positions(scores, _SEPARATION_PX, count + 1)
-    found, is_certain, unresolved = _refined_candidates(levels, scores, candidates, count, stops=not wide)
+    found, is_certain, unresolved = _refined_candidates(levels, scores, wide=wide)
     if not found:
         return None
     best, origin = max(found, key=lambda pair: pair[0].score)
@@ -169,30 +167,29 @@ def _share_on_map(
 
 
 def _refined_candidates(
-    levels: _Levels, scores: FloatImage, candidates: list[Candidate], count: int, *, stops: bool
+    levels: _Levels, scores: FloatImage, *, wide: bool
 ) -> tuple[list[tuple[Peak, Candidate]], bool, float]:
     """Refine candidates until they exclude every other position.
 
     Args:
         levels: of window and template.
         scores: on the coarsest level.
-        candidates: in falling order, one more than ``count`` if available.
-        count: upper bound on the refined candidates.
-        stops: return nothing as soon as it is known that they do not exclude every other position.
+        wide: refine more of them, also if they do not exclude every other position; else return nothing as soon as
+            that is known.
 
     Returns:
         Each refined position with its candidate; whether these exclude every other position; and the best coarse
         score of those that lie at the window's edge, and were not refined.
     """
-    loss = levels.loss
+    loss, count = levels.loss, _CANDIDATES_WIDE if wide else _CANDIDATES
     found: list[tuple[Peak, Candidate]] = []
     best, error, unresolved, is_certain = -math.inf, 0.0, -1.0, True
-    for index, candidate in enumerate(candidates):
+    for index, candidate in enumerate(best_positions(scores, _SEPARATION_PX, count + 1)):
         if found and is_certain and candidate[2] + error < best:
             break  # candidates are in falling order: none of the rest can win
         refined, is_peak = _refined(levels, scores, *candidate[:2]) if index < count else (None, False)
         is_certain = is_certain and is_peak
-        if stops and not is_certain:
+        if not (wide or is_certain):
             return [], False, unresolved
         if refined is None:
             unresolved = max(unresolved, candidate[2]) if index < count else unresolved
