@@ -49,13 +49,12 @@ class Warp:
         chebyshev = np.cos(np.pi * (np.arange(14.0) + 0.5) / 14.0)  # nodes that spread the error evenly
         nodes, between = square_points(chebyshev), square_points(np.linspace(-1.0, 1.0, 17))
         values = exact(self._centre + self._half * nodes)
-        self._coefficients: Array = np.zeros((6, 6, 2))
-        self.fitted = bool(np.isfinite(values).all())
-        if self.fitted:
-            coefficients = np.linalg.lstsq(_powers(nodes), values, rcond=None)[0]
-            self._coefficients[:] = coefficients.reshape(6, 6, 2)
-            error = _powers(between) @ coefficients - exact(self._centre + self._half * between)
-            self.fitted = bool(np.abs(error).max() <= tolerance)  # NaN compares as not fitted
+        self._coefficients: Array | None = None
+        if np.isfinite(values).all():
+            fitted = np.linalg.lstsq(_powers(nodes), values, rcond=None)[0]
+            error = _powers(between) @ fitted - exact(self._centre + self._half * between)
+            if np.abs(error).max() <= tolerance:  # not if NaN
+                self._coefficients = np.ascontiguousarray(fitted.reshape(6, 6, 2))
 
     def __call__(self, points: Array) -> Array:
         """Transform points.
@@ -68,7 +67,7 @@ class Warp:
         """
         from engine.kernels.map_points import polynomials  # numba takes a while to import
 
-        if self.fitted:
+        if self._coefficients is not None:
             flat = np.ascontiguousarray(points, np.float64).reshape(-1, 2)
             out = np.empty_like(flat)
             if polynomials(flat, self._centre, self._half, self._coefficients, out):
@@ -236,9 +235,7 @@ class Grid:
         upright = linear[0, 0] > 0 and linear[1, 1] < 0 and abs(linear[[0, 1], [1, 0]]).max() < 1e-3 * step
         if self.crs.is_geographic or not upright:
             return False
-        lon, lat = np.moveaxis(
-            self.pixels_of(wgs84())[0](self.centre_px + np.array([[0, 0], [1, 0], [0, 1]])), -1, 0
-        )
+        lon, lat = self.pixels_of(wgs84())[0](self.centre_px + np.array([[0, 0], [1, 0], [0, 1]])).T
         steps_m = np.linalg.norm(LocalFrame(lat[0], lon[0]).enu_from_geodetic(lat[1:], lon[1:]), axis=1)
         return bool(steps_m.max() <= 1.01 * steps_m.min())
 
