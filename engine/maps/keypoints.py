@@ -56,13 +56,12 @@ class KeypointMap:
         Returns:
             Keypoints: in pixels of the window.
         """
-        corner = np.array([window.x0, window.y0], np.float32)
-        size = np.array([window.width_px, window.height_px], np.float32)
         windows = tiles_under(window, TILE_PX, self._site.level_shape(level))
         parts = []
         for tile in self.tiles.get(*((own, level) for own in windows)):
-            xy = tile.xy_px - tile.xy_px.new_tensor(corner)
-            inside = ((xy >= 0.0) & (xy <= xy.new_tensor(size) - 1.0)).all(dim=1)
+            xy = tile.xy_px - tile.xy_px.new_tensor([window.x0, window.y0])
+            last = xy.new_tensor([window.width_px - 1, window.height_px - 1])
+            inside = ((xy >= 0.0) & (xy <= last)).all(dim=1)
             parts.append(Keypoints(xy, tile.descriptors).only(inside))
         share = min(1.0, count / max(1, sum(map(len, parts))))
         parts = [part.only(torch.arange(int(share * len(part)), device=part.xy_px.device)) for part in parts]

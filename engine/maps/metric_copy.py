@@ -71,9 +71,8 @@ def _resampled(reader: GrayReader, source: Grid, warp: Warp, window: Window) -> 
     """A block of the copy: grey is cubic, and valid if all pixels that it is made of are."""
     import cv2
 
-    columns = np.arange(window.x0, window.x1, dtype=np.float64)
-    rows = np.arange(window.y0, window.y1, dtype=np.float64)
-    at = np.nan_to_num(warp(np.stack(np.meshgrid(columns, rows), axis=-1)), nan=-9.0, posinf=-9.0, neginf=-9.0)
+    rows, columns = np.mgrid[window.slices]
+    at = np.nan_to_num(warp(np.stack([columns, rows], axis=-1)), nan=-9.0, posinf=-9.0, neginf=-9.0)
     seen = window_about(at.reshape(-1, 2), (source.height_px, source.width_px), margin_px=3)
     if seen is None:
         return np.zeros(at.shape[:2], np.uint8), np.zeros(at.shape[:2], np.bool_)

@@ -112,9 +112,8 @@ def vrt_of_folder(folder: Path, argument: str) -> str:
         _check_beside(first, tile, argument)
     corners = np.array([_position(first, tile, argument) for tile in tiles])
     low, high = corners.min(axis=0), (corners + [tile.size for tile in tiles]).max(axis=0)
-    return _vrt_text(
-        tiles, (corners - low).tolist(), (high - low).tolist(), _moved(first.transform, *low.tolist())
-    )
+    transform = _moved(first.transform, *low.tolist())
+    return _vrt_text(tiles, (corners - low).tolist(), (high - low).tolist(), transform)
 
 
 def _moved(transform: Any, x: int, y: int) -> list[float]:

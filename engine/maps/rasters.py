@@ -112,12 +112,11 @@ def open_source(
         names = ", ".join(name.rpartition(":")[2] for name in dataset.subdatasets)
         raise MapError(f"{argument}: expected a GeoPackage with one raster, got {names} in {file}")
     size = dataset.width, dataset.height
-    own = None if transform.is_identity else _centred(transform)
-    if own is not None:
+    if not transform.is_identity:
         for name, bounds in (("bounds_deg", bounds_deg), ("bounds_crs", bounds_crs)):
             if bounds is not None:
                 raise MapError(f"{name}: expected none for a file with a georeference of its own, {file}")
-        grid = Grid(*size, own, _crs_of(file, argument, own_crs, crs))
+        grid = Grid(*size, _centred(transform), _crs_of(file, argument, own_crs, crs))
     elif bounds_deg is not None or bounds_crs is not None:
         found = earth_crs(crs if crs is not None else "EPSG:4326", "crs")
         edges = bounds_crs if bounds_deg is None else _from_degrees(bounds_deg, found, *size)
@@ -229,9 +228,8 @@ class GrayReader:
         self.invalid_share = 1.0 - float(valid.mean())
         if not valid.any():
             raise MapError(f"map: expected at least one valid pixel, got only nodata in {source.path}")
-        self._limits: Array | None = None
-        if data.dtype != np.uint8:
-            self._limits = np.percentile(_luma(data)[valid], STRETCH_PERCENT)
+        is_gray = data.dtype == np.uint8
+        self._limits = None if is_gray else np.percentile(_luma(data)[valid], STRETCH_PERCENT)
 
     def _read(self, window: Window, size: tuple[int, int], *, smooth: bool = False) -> tuple[NDArray[Any], Mask]:
         """Bands and validity of a window in pixels of the file, resampled to ``size`` (rows, columns)."""
@@ -270,9 +268,8 @@ class GrayReader:
             x = (np.arange(window.x0, window.x1) + 0.5) * scale * width / grid.width_px
             valid &= ~((data == value).all(axis=0) & area[np.ix_(y.astype(int), x.astype(int))])
         luma = _luma(data)
-        if self._limits is None:
-            return luma, valid
-        return stretched(luma, self._limits), valid
+        gray = luma if self._limits is None else stretched(luma, self._limits)
+        return gray, valid
 
 
 def palette_of(dataset: Any) -> Gray | None:

@@ -185,9 +185,8 @@ def surface_part(source: Source, grid: Grid) -> Window:
         MapError: it has no heights (a picture, complex numbers), or does not overlap the map.
     """
     dtypes = source.dataset.dtypes
-    dtype = dtypes[0]
-    if np.dtype(dtype).kind not in "iuf":
-        raise MapError(f"surface: expected heights as real numbers, got {dtype} in {source.path}")
+    if np.dtype(dtypes[0]).kind not in "iuf":
+        raise MapError(f"surface: expected heights as real numbers, got {dtypes[0]} in {source.path}")
     if len(dtypes) >= 3 and set(dtypes) == {"uint8"}:  # the map given twice: its red would become relief
         raise MapError(
             f"surface: expected one band of heights, got a picture of {len(dtypes)} bands, {source.path}"
