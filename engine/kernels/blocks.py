@@ -18,7 +18,8 @@ from engine.kernels.sums import check_finite
 from engine.runtime.threads import in_parallel, own_array
 
 FloatImage = NDArray[np.float32]
-_Block = tuple[tuple[slice, slice], NDArray[np.floating]]  # where its scores lie, and its transform
+Spectrum = NDArray[np.floating]  # in the packed order of OpenCV's real transforms
+_Block = tuple[tuple[slice, slice], Spectrum]  # where its scores lie, and its transform
 
 # A float32 transform has an error of about 1e-7 of the window's norm in every numerator, which is divided by the
 # norm of a patch: if a patch's norm is smaller than the window's by this factor, the transform is in float64.
@@ -146,9 +147,9 @@ def fast_side(n: int) -> int:
 
 def _window_spectrum(
     window: FloatImage, mean: float, size: tuple[int, int], inverse_norms: FloatImage
-) -> NDArray[np.floating]:
+) -> Spectrum:
     """The transform of a window minus a mean, in float64 if some patch is too weak for float32."""
-    values: NDArray[np.floating] = np.empty(size, np.float32)
+    values: Spectrum = np.empty(size, np.float32)
     energy = surface_loops.centre(values, window, mean)
     if energy * float(inverse_norms.max()) ** 2 > _FLOAT32_NORM_RATIO**2:
         values = values.astype(np.float64)
@@ -156,17 +157,15 @@ def _window_spectrum(
     return values
 
 
-def _model_spectrum(model: FloatImage, size: tuple[int, int], kind: np.dtype[np.floating]) -> NDArray[np.floating]:
-    """The transform of a template with zeros beyond it, in the packed order of OpenCV's real transforms."""
+def _model_spectrum(model: FloatImage, size: tuple[int, int], kind: np.dtype[np.floating]) -> Spectrum:
+    """The transform of a template with zeros beyond it."""
     values = np.zeros(size, kind)
     values[: model.shape[0], : model.shape[1]] = model
     transform(values, 0, len(model))
     return values
 
 
-def _write_scores(
-    out: FloatImage, block: NDArray[np.floating], model: NDArray[np.floating], inverse_norms: FloatImage
-) -> None:
+def _write_scores(out: FloatImage, block: Spectrum, model: Spectrum, inverse_norms: FloatImage) -> None:
     """Write the scores by the transforms of part of a window and of a template, both of one type."""
     is_kept = max(block.shape) <= _CACHED_SIDE  # a larger one takes longer to transform than fresh pages do
     products = own_array("products", block.shape, block.dtype) if is_kept else np.empty_like(block)

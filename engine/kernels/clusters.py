@@ -94,13 +94,11 @@ def count_apart(points, apart):
     """How many of the points (N, 2), in turn, are further than ``apart`` from all that were counted before."""
     counted, total = np.empty((len(points), 2)), 0
     for n in range(len(points)):
-        is_apart = True
         for m in range(total):
             off_x, off_y = points[n, 0] - counted[m, 0], points[n, 1] - counted[m, 1]
             if off_x * off_x + off_y * off_y <= apart * apart:
-                is_apart = False
                 break
-        if is_apart:
+        else:
             counted[total] = points[n]
             total += 1
     return total

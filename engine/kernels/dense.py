@@ -29,7 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-FloatImage = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +85,7 @@ class EnhancedFrame:
         matrix: (3, 3) pinhole intrinsics.
     """
 
-    levels: FloatImage
+    levels: NDArray[np.float32]
     matrix: Array
 
 

@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 from engine.kernels.sums import over_nodata, share_on_map
 
 FloatImage = NDArray[np.float32]
-Sums = NDArray[np.float64]
-Index = NDArray[np.int64]
-Counts = NDArray[np.int32]
 
 
 class LocalScores:
@@ -37,7 +34,7 @@ class LocalScores:
         image: FloatImage,
         template: FloatImage,
         middle: tuple[int, int],
-        counts: Counts | None = None,
+        counts: NDArray[np.int32] | None = None,
         min_overlap: float = 0.0,
     ) -> None:
         from engine.kernels import blocks  # numba takes a while to import
@@ -59,7 +56,7 @@ class LocalScores:
             share = share_on_map(counts[y0 : y1 + h + 1, x0 : x1 + w + 1], h, w)
             self._inverse_norm, self._off = over_nodata(self._inverse_norm, share, min_overlap)
 
-    def at(self, y: Index, x: Index) -> Sums:
+    def at(self, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.float64]:
         """Scores at positions at which the template fits.
 
         Args:

@@ -13,7 +13,6 @@ from engine.runtime.device import Picture, as_float, device_of, on_host, same_ki
 from engine.sift.values import ROUNDING, TRAIN_CHUNK, Features, Limits, Matches
 
 Floats = NDArray[np.float32]
-AnyArray = NDArray[Any]
 
 _MAX = float(np.finfo(np.float32).max)
 
@@ -70,7 +69,7 @@ def tested(nearest: tuple[Picture, ...], ratio: float) -> tuple[Picture, ...]:
     return index, distance, quotient, (distance < math.inf) & (quotient <= ratio) & is_mutual
 
 
-def _nearest(query: Features, train: Features, limits: Limits) -> tuple[AnyArray, ...]:
+def _nearest(query: Features, train: Features, limits: Limits) -> tuple[NDArray[Any], ...]:
     """For each query (B, N) the largest cosine, its slot, the second largest, whether it is the slot's best."""
     from engine.kernels import nearest  # numba takes a while to import
 
