@@ -180,14 +180,10 @@ def describe(
 
 def xy_px(keypoints: Floats, octaves: Octaves) -> Floats:
     """Positions (K, 2) in pixels of the picture."""
-    return np.asarray(keypoints[:, :2] * _pixel_px(keypoints, octaves)[:, None], np.float32)
+    pixel_px = np.exp2(keypoints[:, _OCTAVE]) / np.float32(octaves[0].up)  # of the octave's, in the picture's
+    return np.asarray(keypoints[:, :2] * pixel_px[:, None], np.float32)
 
 
 def scale_px(keypoints: Floats) -> Floats:
     """Sigmas (K,) in pixels of the picture."""
     return np.asarray(np.float32(FIRST_SIGMA_PX) * keypoints[:, _GROWTH] * np.exp2(keypoints[:, _OCTAVE]))
-
-
-def _pixel_px(keypoints: Floats, octaves: Octaves) -> Floats:
-    """(K,) pixels of the picture per octave pixel."""
-    return np.asarray(np.exp2(keypoints[:, _OCTAVE]) / np.float32(octaves[0].up))
