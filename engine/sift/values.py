@@ -70,7 +70,14 @@ def fields_of(features: Features) -> tuple[Picture, ...]:
 
 
 def ranks_within(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How many elements before each (N,) are of the same group, such as a cell of the picture."""
+    """How many elements before each are of the same group.
+
+    Args:
+        group: (N,) of each, such as its cell of a picture.
+
+    Returns:
+        (N,).
+    """
     order = np.argsort(group, kind="stable")
     ranks, ordered = np.empty_like(order), group[order]
     ranks[order] = np.arange(len(group)) - np.searchsorted(ordered, ordered)
