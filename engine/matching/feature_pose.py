@@ -20,7 +20,7 @@ from engine.matching.align import MIN_DOWN
 from engine.matching.candidates import PoseCandidate
 from engine.matching.covariance import tilt_covariance
 from engine.matching.evidence import RELIABILITY, Evidence, probability
-from engine.matching.feature_matching import VOTE_SHARE, Matched, match_views
+from engine.matching.feature_matching import VOTE_SHARE, Matched, PointSearch
 from engine.matching.pose import MIN_INLIERS, AttitudePrior, PoseStats, solve_pose
 from engine.matching.query import Query
 from engine.matching.unknown_slope import from_level_ground, wide_slope_deg
@@ -160,8 +160,19 @@ class FeatureMatcher:
         height_m = self.query.telemetry.known_height_m
         hypothesis = TelemetryHypothesis((height_m, height_m), x_axis_deg(self.query))
         views = [view_in(self.query, window, height_m, self.options.scale)]
-        found = match_views(self.query, self.landmarks, self.options, views, hypothesis, self.finder)[0]
+        found = self._search.find(views, hypothesis)[0]
         return found.points_px, found.points_m, self._pose(found, hypothesis)
+
+    @property
+    def _search(self) -> PointSearch:
+        """What finds the frame's points on the map: features, or the matcher in their place."""
+        source = self.finder or self.landmarks
+        if self.finder is None and self.options.matcher is not None:
+            from engine.matching.point_finding import PointFinder
+
+            source = PointFinder(self.options.matcher)
+        assert source is not None  # only a finder needs no landmarks
+        return PointSearch(self.query, source, self.options)
 
     def _find_with(self, hypothesis: TelemetryHypothesis) -> PoseCandidate | NoFix:
         """Match, lift and solve, under one hypothesis about the telemetry."""
@@ -174,7 +185,7 @@ class FeatureMatcher:
             pixels = max(view.crop.area_px for view in views)
             detail = f"a window of {pixels} pixels is too large to search; a more accurate position is needed"
             return query.refuse(Reason.MAP_TOO_LARGE, detail, self.method, window=views[0].window)
-        matched = match_views(query, self.landmarks, options, views, hypothesis, self.finder)
+        matched = self._search.find(views, hypothesis)
         matched.sort(key=lambda found: len(found.points_px), reverse=True)
         count, window = len(matched[0].points_px), matched[0].view.window
         if count < MIN_INLIERS:
