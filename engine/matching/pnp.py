@@ -169,14 +169,6 @@ def gauss_newton(problem: Problem, R: Array, center: Array, *, slack: float = 1.
     return Fit(rotation, center, Reprojection(tangents, projected, squared), inliers, information, variance)
 
 
-def _inverse(problem: Problem, information: Array) -> Array | None:
-    """Return the covariance (6, 6) by matches and known attitude, or None if they do not determine the pose."""
-    total = information.copy()
-    total[3:, 3:] += problem.precision
-    found, covariance = cv2.invert(total, flags=cv2.DECOMP_CHOLESKY)
-    return np.asarray(covariance) if found else None
-
-
 def turn_from_attitude(problem: Problem, R: Array) -> Array:
     """Return the rotation from the known attitude to another.
 
@@ -204,8 +196,10 @@ def match_covariance(problem: Problem, fit: Fit) -> Array | None:
         (6, 6) of the centre in the map's axes (m) and of the rotation about the camera's (rad), or None if some
         direction is not determined.
     """
-    covariance = _inverse(problem, fit.information)
-    if covariance is None:
+    information = fit.information.copy()
+    information[3:, 3:] += problem.precision
+    found, covariance = cv2.invert(information, flags=cv2.DECOMP_CHOLESKY)
+    if not found:
         return None
     sigma = np.sqrt(np.diag(covariance))
     if np.linalg.eigvalsh(covariance / np.outer(sigma, sigma))[0] < _MIN_EIGENVALUE:

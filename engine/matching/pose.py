@@ -146,8 +146,15 @@ def solve_pose(
     if len(known) < MIN_INLIERS or _spread(points_px[known].T) < options.min_spread_px:
         return None
     origin = points_m[known].mean(0)
-    problem = _problem(
-        (points_m[known] - origin).T, points_px[known].T, camera_matrix, weights[known], options, prior
+    problem = Problem(
+        points=(points_m[known] - origin).T,
+        pixels=points_px[known].T,
+        K=camera_matrix,
+        weights=weights[known],
+        attitude=None if prior is None else prior.rotation,
+        precision=np.zeros((3, 3)) if prior is None else prior.precision,
+        tolerance_px=options.reprojection_px,
+        min_inliers=MIN_INLIERS,
     )
     fit = _fit(problem) if start is None else _fit_from(problem, start, origin)
     if fit is not None and prior is not None:
@@ -164,46 +171,9 @@ def solve_pose(
     if other is not None:  # the place is known but not the tilt: either pose may be right
         apart = np.append(other.center - fit.center, np.zeros(3))
         covariance = covariance + 0.5 * apart[:, None] * apart
-    return _stats(fit, origin, covariance, known, len(points_m), log10_nfa, log10_tried)
-
-
-def _problem(
-    points: Array, pixels: Array, K: Array, weights: Array, options: PoseOptions, prior: AttitudePrior | None
-) -> Problem:
-    """The problem of points (3, N) about their mean and pixels (2, N)."""
-    return Problem(
-        points=points,
-        pixels=pixels,
-        K=K,
-        weights=weights,
-        attitude=None if prior is None else prior.rotation,
-        precision=np.zeros((3, 3)) if prior is None else prior.precision,
-        tolerance_px=options.reprojection_px,
-        min_inliers=MIN_INLIERS,
-    )
-
-
-def _stats(
-    fit: Fit,
-    origin: Array,
-    covariance: Array,
-    known: NDArray[np.intp],
-    count: int,
-    log10_nfa: float,
-    log10_tried: float,
-) -> PoseStats:
-    """The result of a fit to some of the matches, in metres about an origin (3,)."""
-    center = fit.center + origin
-    inliers = np.zeros(count, bool)
+    inliers = np.zeros(len(points_m), bool)
     inliers[known[fit.inliers]] = True
-    return PoseStats(
-        rotation=fit.rotation,
-        center_m=center,
-        covariance=covariance,
-        inliers=inliers,
-        log10_nfa=log10_nfa,
-        log10_tried=log10_tried,
-    )
+    return PoseStats(fit.rotation, fit.center + origin, covariance, inliers, log10_nfa, log10_tried)
 
 
 def _spread(points: Array) -> float:
@@ -261,20 +231,16 @@ def _supported(problem: Problem, fit: Fit, options: PoseOptions) -> bool:
     return above > 0 and _spread(problem.pixels[:, fit.inliers]) >= options.min_spread_px
 
 
-def _distinct(pixels: Array, options: PoseOptions) -> int:
-    """Return how many of the pixels (2, N) show something of their own."""
-    from engine.kernels import clusters  # numba takes a while to import
-
-    return int(clusters.count_apart(np.ascontiguousarray(pixels.T), options.distinct_px))
-
-
 def _false_alarms(problem: Problem, fit: Fit, options: PoseOptions) -> tuple[float, float]:
     """Return log10 of the expected number of poses with as many inliers of N matches by chance, and of all poses.
 
     NFA = (N - 3) C(N, k) C(k, 3) 4 p^(k - 3), k the distinct inliers (Moisan and Stival). p is the probability
     that a wrong match is an inlier. Three matches determine up to four poses.
     """
-    total, k = problem.pixels.shape[1], _distinct(problem.pixels[:, fit.inliers], options)
+    from engine.kernels import clusters  # numba takes a while to import
+
+    total, agreeing_px = problem.pixels.shape[1], np.ascontiguousarray(problem.pixels[:, fit.inliers].T)
+    k = int(clusters.count_apart(agreeing_px, options.distinct_px))
     if k < MIN_INLIERS:
         return math.inf, 0.0
     area_px2 = float((np.ptp(problem.pixels, axis=1) + 1).prod())
