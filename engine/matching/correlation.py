@@ -42,7 +42,6 @@ class Aligned:
     Attributes:
         pose: the height and heading that aligned it.
         level: of the pyramid.
-        jacobian: (2, 2) metres per pixel of the level.
         view: how the ground is seen.
         patch: the rectified frame.
         template: (h, w) the patch, enhanced.
@@ -52,7 +51,6 @@ class Aligned:
 
     pose: GridPose
     level: int
-    jacobian: Array
     view: GroundView
     patch: Patch
     template: NDArray[np.float32]
@@ -98,8 +96,7 @@ class Correlator:
         if isinstance(drawn, NoFix):
             return drawn
         view, patch, place, is_over_relief = drawn
-        jacobian = self.query.jacobian * 2.0**level
-        return Aligned(pose, level, jacobian, view, patch, enhance(patch.gray), place, is_over_relief)
+        return Aligned(pose, level, view, patch, enhance(patch.gray), place, is_over_relief)
 
     def nowhere(self, aligned: Aligned) -> list[NDArray[np.uint8]]:
         """Patches for the null hypothesis, as large as the frame's: upside down, and mirrored.
@@ -194,12 +191,14 @@ class Correlator:
         self, region: Region, template: NDArray[np.float32], exclusion_px: float, stop: EarlyStop | None
     ) -> Peak:
         """The peak coarse to fine if that suffices, else over every place if there is time."""
-        scheduler, search = self.query.scheduler, region.search
+        scheduler, search, least = self.query.scheduler, region.search, MIN_VALID_SHARE
+        by_levels = isinstance(search.image, np.ndarray) and not self.options.exhaustive  # on the CPU
         with scheduler.stage("match"):
-            found = self._coarse_to_fine(region, template, exclusion_px, stop)
-            if found is not None:
-                return found
-            if not (coarse_to_fine.is_wide(search) and self._has_coarse_levels(region)):
+            if by_levels:
+                found = coarse_to_fine.peak(search, template, exclusion_px, min_overlap=least, stop=stop)
+                if found is not None:
+                    return found
+            if not (by_levels and coarse_to_fine.is_wide(search)):
                 return self._of_every_place(region, template, exclusion_px)
         work_px = float(math.prod(search.image.shape))
         if not scheduler.can_afford({_EVERY_PLACE: work_px}):
@@ -207,17 +206,6 @@ class Correlator:
             raise OutOfTime
         with scheduler.costed(_EVERY_PLACE, work_px), scheduler.stage("match"):
             return self._of_every_place(region, template, exclusion_px)
-
-    def _coarse_to_fine(
-        self, region: Region, template: NDArray[np.float32], exclusion_px: float, stop: EarlyStop | None
-    ) -> Peak | None:
-        if not self._has_coarse_levels(region):
-            return None
-        return coarse_to_fine.peak(region.search, template, exclusion_px, min_overlap=MIN_VALID_SHARE, stop=stop)
-
-    def _has_coarse_levels(self, region: Region) -> bool:
-        """Whether to score places at half resolution: on the CPU."""
-        return isinstance(region.search.image, np.ndarray) and not self.options.exhaustive
 
     def _of_every_place(self, region: Region, template: NDArray[np.float32], exclusion_px: float) -> Peak:
         own, least = to_device(template, self.query.device), MIN_VALID_SHARE

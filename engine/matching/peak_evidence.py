@@ -102,7 +102,8 @@ def fix_of(correlator: Correlator, aligned: Aligned, peak: Peak, window: Window,
     rows, columns = aligned.template.shape
     peak_px2 = peak_covariance_px(peak, rows * columns)
     peak_px2 = peak_px2 + misalignment_covariance_px2(peak, (rows, columns), pose.known_height_m, errors)
-    covariance = ncc_covariance_m2(peak_px2, pose, query.camera, aligned.jacobian, errors)
+    jacobian = query.jacobian * 2.0**aligned.level
+    covariance = ncc_covariance_m2(peak_px2, pose, query.camera, jacobian, errors)
     return query.fix(
         METHOD,
         correlator.nadir_px(peak, aligned),
