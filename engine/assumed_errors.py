@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from engine.values import MAX_SIGMA_M, Frame, GridPose, check, check_positive
@@ -68,18 +67,8 @@ class AssumedErrors:
 
     def of_frame(self, frame: Frame) -> AssumedErrors:
         """The errors, with the frame's stated accuracies in place of assumed ones."""
-        return _with_accuracy(self, frame.heading_sigma_deg, frame.tilt_sigma_deg, frame.height_sigma_m)
-
-
-@lru_cache(maxsize=16)  # a frame asks several times
-def _with_accuracy(
-    errors: AssumedErrors,
-    heading_sigma_deg: float | None,
-    tilt_sigma_deg: float | None,
-    height_sigma_m: float | None,
-) -> AssumedErrors:
-    stated = {"heading_deg": heading_sigma_deg, "tilt_deg": tilt_sigma_deg}
-    if height_sigma_m is not None:
-        stated |= {"height_m": height_sigma_m, "height_share": 0.0}
-    known = {name: value for name, value in stated.items() if value is not None}
-    return replace(errors, **known) if known else errors
+        stated = {"heading_deg": frame.heading_sigma_deg, "tilt_deg": frame.tilt_sigma_deg}
+        if frame.height_sigma_m is not None:
+            stated |= {"height_m": frame.height_sigma_m, "height_share": 0.0}
+        known = {name: value for name, value in stated.items() if value is not None}
+        return replace(self, **known) if known else self
