@@ -55,11 +55,8 @@ class PointFinder:
             (M, 2) pixels of the picture and (M, 2) pixels of the view's level.
         """
         picture = _plain_outside(as_tensor(picture), valid)
-        if self.keypoints is not None and isinstance(self.matcher, KeypointMatcher):
-            assert self.options is not None  # whoever has keypoints has limits
-            points, places = self._by_keypoints(
-                query, view, picture, self.matcher, self.keypoints, valid, self.options
-            )
+        if self.keypoints is not None:
+            points, places = self._by_keypoints(query, picture, valid, view, self.keypoints)
         else:
             with query.scheduler.stage("match"), torch.inference_mode():
                 crop = as_tensor(as_picture(query.site.gray(view.crop, view.level), query.device))
@@ -70,16 +67,12 @@ class PointFinder:
         return points[known], places[known] + view.corner_px
 
     def _by_keypoints(
-        self,
-        query: Query,
-        view: MapView,
-        picture: torch.Tensor,
-        matcher: KeypointMatcher,
-        known: KeypointMap,
-        valid: NDArray[np.bool_],
-        options: LearnedOptions,
+        self, query: Query, picture: torch.Tensor, valid: NDArray[np.bool_], view: MapView, known: KeypointMap
     ) -> tuple[Array, Array]:
         """Matched pixels of picture and crop; the crop's keypoints are looked up."""
+        matcher, options = self.matcher, self.options
+        assert isinstance(matcher, KeypointMatcher)  # or the map had no keypoints
+        assert options is not None  # whoever has keypoints has limits
         with query.scheduler.stage("frame features"):
             mine = matcher.extract(picture, _WIDER * options.max_keypoints)
             shown = np.flatnonzero(_is_valid(_points(mine.xy_px), valid))[: options.max_keypoints]
