@@ -17,7 +17,7 @@ from engine.matching.sift import Sift
 from engine.options import MatcherOptions
 from engine.orthomap import OrthoMap
 from engine.runtime.device import Device
-from engine.values import Fix, Window
+from engine.values import Window
 
 
 class Auto(Method):
@@ -93,7 +93,7 @@ class Auto(Method):
         if len(both) < 2 or not is_one:
             best = max(both or [first, second], key=nats)
             return best if is_one else best.against([first, second])
-        if not _agree(first.fix, second.fix):
+        if not (agree_in_place(first.fix, second.fix) and agree_in_height(first.fix, second.fix)):
             # A telemetry error shifts the patch that NCC searches for, and the pose less so.
             return replace(second, fix=reaching(second.fix, first.fix))
         greater, best = max(both, key=nats).evidence, min(both, key=lambda each: each.fix.sigma_m)
@@ -102,7 +102,3 @@ class Auto(Method):
     def explain(self, query: Query, window: Window) -> Explanation:
         """As NCC does."""
         return self.ncc.explain(query, window)
-
-
-def _agree(first: Fix, second: Fix) -> bool:
-    return agree_in_place(first, second) and agree_in_height(first, second)

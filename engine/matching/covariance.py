@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
-from engine.errors import OptionError
 from engine.geo import transport_covariance
 from engine.values import GridPose, Peak
 
@@ -122,20 +121,15 @@ def ncc_covariance_m2(
 
     Args:
         peak_px2: (2, 2) covariance of the peak in square pixels.
-        pose: height and attitude that aligned the frame.
+        pose: known height and attitude that aligned the frame.
         camera: its mount gives the direction of the optical axis.
         enu_jacobian: (2, 2) metres east and north per pixel.
         errors: of the telemetry and the map.
 
     Returns:
         (3, 3) east, north, up in square metres.
-
-    Raises:
-        OptionError: the pose lacks its height or its heading.
     """
-    attitude, height = pose.grid_attitude, pose.height_agl_m
-    if attitude is None or height is None:
-        raise OptionError("pose: expected a height and a heading for a fix by correlation")
+    attitude, height = pose.known_attitude, pose.known_height_m
     values = (height, attitude.roll_deg, attitude.pitch_deg, attitude.heading_deg)
     height_sigma = errors.height_sigma_m(height)
     sigmas = (height_sigma, *errors.tilts_deg(pose), errors.heading_deg)

@@ -46,8 +46,6 @@ def _give_back_memory() -> None:
 def _bounded(prior: Prior) -> Prior:
     """The prior, with uncertainty and movement limited to the width of any map."""
     moved = (prior.moved_east_m, prior.moved_north_m)
-    if prior.sigma_m <= MAX_SIGMA_M and max(map(abs, moved)) <= MAX_SIGMA_M:
-        return prior
     east, north = (min(max(v, -MAX_SIGMA_M), MAX_SIGMA_M) for v in moved)
     return replace(prior, sigma_m=min(prior.sigma_m, MAX_SIGMA_M), moved_east_m=east, moved_north_m=north)
 

@@ -65,9 +65,7 @@ class Sift(Method):
             upsample=1,
         )
         self._ncc_options = options.ncc
-        if samples is None:
-            samples = SampleMap(site)
-        self.samples = samples
+        self.samples = SampleMap(site) if samples is None else samples
 
     @property
     def cache_counters(self) -> dict[str, int]:

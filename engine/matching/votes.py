@@ -68,7 +68,18 @@ class Vote:
         return self._surprise_of(elsewhere[clusters.densest(self.shifts_px[elsewhere], self.radius_px)])
 
     def _surprise_of(self, agreeing: NDArray[np.bool_] | NDArray[np.intp]) -> float:
-        return _surprise(self.photo_px[agreeing], len(self.photo_px), self.chance, self.distinct_px)
+        """-log of the probability that so many of all matches agree with one of them by chance.
+
+        Of matches that see the same pixels one counts, among as many fewer in all.
+        """
+        from engine.kernels import clusters  # numba takes a while to import
+
+        agreeing_px = self.photo_px[agreeing]
+        votes = len(agreeing_px)
+        if votes < 2:
+            return 0.0
+        distinct = int(clusters.count_apart(np.ascontiguousarray(agreeing_px), self.distinct_px))
+        return distinct / votes * _binomial_surprise(len(self.photo_px) - 1, votes - 1, self.chance)
 
 
 def vote(photo_px: Array, map_px: Array, radius_px: float, distinct_px: float) -> Vote | None:
@@ -127,20 +138,6 @@ def chance_of_agreeing(
     uniform = math.pi * radius_px * radius_px / area_px2
     share: float = wrong / (total * max(total - 1, 1))
     return min(max(share, uniform), 1.0)
-
-
-def _surprise(agreeing_px: Array, total: int, chance: float, distinct_px: float) -> float:
-    """-log of the probability that so many of all matches agree with one of them by chance.
-
-    Of matches that see the same pixels one counts, among as many fewer in all.
-    """
-    from engine.kernels import clusters  # numba takes a while to import
-
-    votes = len(agreeing_px)
-    if votes < 2:
-        return 0.0
-    distinct = int(clusters.count_apart(np.ascontiguousarray(agreeing_px), distinct_px))
-    return distinct / votes * _binomial_surprise(total - 1, votes - 1, chance)
 
 
 def _binomial_surprise(n: int, k: int, p: float) -> float:
