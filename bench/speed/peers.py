@@ -215,8 +215,7 @@ class OpenCvFeatures:
             stats.covariance_center_m2 + np.diag([slope_m2, slope_m2, 0]) + errors.map_m**2 * np.eye(3),
             score=float(stats.inliers.mean()),
             window=window,
-            east_north_m=stats.center_m[:2],
-            up_m=float(stats.center_m[2]),
+            center_m=stats.center_m,
             grid_attitude=Attitude(*attitude_from_rotation(stats.rotation.T @ self._camera.mount.T)),
         )
 

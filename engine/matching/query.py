@@ -68,11 +68,9 @@ class Query:
         if prior is None:
             return None
         with np.errstate(invalid="ignore"):
-            if prior.east_m is not None and prior.north_m is not None:
-                return self.site.pixel_from_enu(np.array([prior.east_m, prior.north_m]))
-            assert prior.lat_deg is not None  # a Prior has one of the two
-            assert prior.lon_deg is not None
-            return self.site.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
+            if prior.lat_deg is not None and prior.lon_deg is not None:
+                return self.site.pixel_from_geodetic(prior.lat_deg, prior.lon_deg)
+            return self.site.pixel_from_enu(np.array([prior.east_m, prior.north_m]))  # a Prior has one of the two
 
     def prior_chi_square(self, fix: Fix) -> float | None:
         """Chi-square of a fix against the prior (:func:`.prior_chi_square`); None without a prior."""
@@ -204,8 +202,7 @@ class Query:
         *,
         score: float,
         window: Window,
-        east_north_m: Array | None = None,
-        up_m: float | None = None,
+        center_m: Array | None = None,
         grid_attitude: Attitude | None = None,
         turn_covariance_rad2: Array | None = None,
         map_sigma_m: float = 0.0,
@@ -219,28 +216,30 @@ class Query:
             covariance_m2: (3, 3) east, north, up.
             score: of the match.
             window: the searched window.
-            east_north_m: (2,) of the nadir if known in metres; None computes it.
-            up_m: height of the camera, or None if it is not measured.
+            center_m: (3,) the camera's centre; None if its height is not measured.
             grid_attitude: the heading from grid north; None if it is not measured.
             turn_covariance_rad2: (3, 3) of a small turn about the camera's axes, with a measured attitude.
             map_sigma_m: the georeference's part of the covariance.
             stage: as :attr:`.Fix.stage`.
         """
-        east, north = self.site.enu_from_pixel(nadir_px) if east_north_m is None else east_north_m
+        east, north = self.site.enu_from_pixel(nadir_px) if center_m is None else center_m[:2]
         lat, lon = map(float, self.site.geodetic_from_pixel(nadir_px))
-        angles_deg2 = None
-        if grid_attitude is not None and turn_covariance_rad2 is not None:
-            about_body = transport_covariance(self.camera.mount, turn_covariance_rad2)
-            angles_deg2 = angle_covariance_deg2(about_body, grid_attitude.roll_deg, grid_attitude.pitch_deg)
+        attitude, angles_deg2 = grid_attitude, None
+        if attitude is not None:
+            turn_deg = self.site.frame.convergence_deg(lat, lon)
+            attitude = replace(attitude, heading_deg=wrap_heading_deg(attitude.heading_deg - turn_deg))
+            if turn_covariance_rad2 is not None:
+                about_body = transport_covariance(self.camera.mount, turn_covariance_rad2)
+                angles_deg2 = angle_covariance_deg2(about_body, attitude.roll_deg, attitude.pitch_deg)
         return Fix(
             timestamp_ns=self.frame.timestamp_ns,
             lat_deg=lat,
             lon_deg=lon,
             east_m=float(east),
             north_m=float(north),
-            up_m=up_m,
+            up_m=None if center_m is None else float(center_m[2]),
             covariance_m2=covariance_m2,
-            attitude=self._true_attitude(grid_attitude, lat, lon),
+            attitude=attitude,
             score=score,
             method=method,
             window=window,
@@ -250,13 +249,6 @@ class Query:
             stage=stage,
             attitude_covariance_deg2=angles_deg2,
         )
-
-    def _true_attitude(self, grid_attitude: Attitude | None, lat_deg: float, lon_deg: float) -> Attitude | None:
-        if grid_attitude is None:
-            return None
-        turn_deg = self.site.frame.convergence_deg(lat_deg, lon_deg)
-        heading_deg = wrap_heading_deg(grid_attitude.heading_deg - turn_deg)
-        return Attitude(grid_attitude.roll_deg, grid_attitude.pitch_deg, heading_deg)
 
     @property
     def timings(self) -> Timings:

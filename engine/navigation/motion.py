@@ -171,12 +171,9 @@ def position_of(prior: Prior, site: OrthoMap) -> PositionEstimate:
         prior: by the other source.
         site: the map that defines the axes.
     """
-    if prior.east_m is not None and prior.north_m is not None:
-        return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m)
-    assert prior.lat_deg is not None  # a Prior has one of the two
-    assert prior.lon_deg is not None
-    place_m = site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg)
-    return PositionEstimate(np.asarray(place_m[:2], np.float64), prior.sigma_m)
+    if prior.lat_deg is not None and prior.lon_deg is not None:
+        return PositionEstimate(site.frame.enu_from_geodetic(prior.lat_deg, prior.lon_deg), prior.sigma_m)
+    return PositionEstimate(np.array([prior.east_m, prior.north_m]), prior.sigma_m)  # one of the two is given
 
 
 def place_of(fix: Fix) -> PositionEstimate:

@@ -116,8 +116,7 @@ class PaperSift(Method):
             _COVARIANCE_M2.copy(),
             score=share,
             window=window,
-            east_north_m=center[:2],
-            up_m=float(center[2]),
+            center_m=center,
             grid_attitude=Attitude(*attitude_from_rotation(rotation.T @ query.camera.mount.T)),
         )
 
