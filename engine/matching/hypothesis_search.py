@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.peaks import best_positions
-from engine.maps.prepared import Region
 from engine.matching.correlation import MIN_SIDE_PX, MIN_VALID_SHARE, Aligned, Correlator
 from engine.matching.covariance import score_sigma
 from engine.matching.evidence import Evidence, is_beyond_doubt, is_hopeless, surprise_of
 from engine.matching.peak_evidence import places_in
 from engine.ncc_fft import surfaces
-from engine.runtime.device import Picture, to_device
+from engine.runtime.device import to_device
 from engine.values import GridPose, NoFix, Peak, Window
 from engine.window import SPREAD_SIGMAS
 
@@ -64,23 +62,13 @@ def search(
     level, poses = _coarse_level(correlator, first, window, reach)
     if level == first.level and len(poses) == 1:
         return correlator.search(first, window), first, 1
-    quick, tried = _quick_level(correlator, first, level, reach), len(poses) * places_in(first, window)
-    if quick is not None:
-        best = _from_level(correlator, first, window, *quick)
-        if best is not None and is_beyond_doubt(_nats(*best, tried), correlator.query.risk):
+    query, tried, above = correlator.query, len(poses) * places_in(first, window), level + 1
+    if above < query.site.levels:  # with fewer hypotheses, at a sixteenth of the cost
+        _, turns, shares = _grid_on(first, above, reach)
+        best = _from_level(correlator, first, window, above, _hypotheses(query.telemetry, turns, shares))
+        if best is not None and is_beyond_doubt(_nats(*best, tried), query.risk):
             return *best, len(poses)
     return *(_from_level(correlator, first, window, level, poses) or (None, first)), len(poses)
-
-
-def _quick_level(
-    correlator: Correlator, first: Aligned, level: int, reach: Reach
-) -> tuple[int, list[GridPose]] | None:
-    """Search one level above, with fewer hypotheses, at a sixteenth of the cost; None above the coarsest."""
-    above = level + 1
-    if above == correlator.query.site.levels:
-        return None
-    _, turns, shares = _grid_on(first, above, reach)
-    return above, _hypotheses(correlator.query.telemetry, turns, shares)
 
 
 def _nats(peak: Peak, aligned: Aligned, tried: float) -> float:
@@ -184,22 +172,17 @@ def _coarse(
     separation = max(2, round(correlator.exclusion_px(level)))
     found: list[tuple[float, GridPose, Array]] = []
     with query.scheduler.stage("match"):
-        for aligned, trim, scores in zip(fitting, trims, _surfaces(correlator, region, templates), strict=True):
+        group = max(1, _MAX_COARSE_PX // region.window.area_px)
+        own = to_device(templates, query.device)
+        groups = surfaces(region.search, own, group=group, min_overlap=MIN_VALID_SHARE)
+        each = itertools.chain.from_iterable(groups)  # one at a time; only a group is in memory
+        for aligned, trim, scores in zip(fitting, trims, each, strict=True):
             for x, y, score in best_positions(scores, separation, _CANDIDATES):
                 place = np.array([x + region.window.x0, y + region.window.y0], dtype=np.float64) - trim
                 nadir = query.site.full_from_level(place - aligned.patch.offset_px, level)
                 found.append((score, aligned.pose, nadir))
     found.sort(key=lambda item: -item[0])
     return _separated(found, separation * 2.0**level)
-
-
-def _surfaces(correlator: Correlator, region: Region, templates: NDArray[np.float32]) -> Iterator[Picture]:
-    """Yield one surface (H', W') at a time; only a few are in memory."""
-    area_px = region.window.width_px * region.window.height_px
-    group = max(1, _MAX_COARSE_PX // area_px)
-    own = to_device(templates, correlator.query.device)
-    for several in surfaces(region.search, own, group=group, min_overlap=MIN_VALID_SHARE):
-        yield from several
 
 
 def _same_size(fitting: list[Aligned]) -> tuple[NDArray[np.float32], list[Array]]:

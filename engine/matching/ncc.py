@@ -14,7 +14,7 @@ from engine.maps.tiles import WHOLE_LEVEL_PX
 from engine.matching import hypothesis_search, refusals
 from engine.matching.agreement import are_near
 from engine.matching.candidates import PeakCandidate, nats
-from engine.matching.correlation import METHOD, Aligned, Correlator, expected_window_px
+from engine.matching.correlation import METHOD, Correlator, expected_window_px
 from engine.matching.evidence import Evidence
 from engine.matching.for_reports import Explanation, explain_correlation
 from engine.matching.ladder import Answer, Rung, Works, climb, is_accepted, rehearse
@@ -126,8 +126,10 @@ class Ncc(Method):
         refusal = self._refuse_unusable(query)
         if refusal is not None:
             return refusal
-        correlator = self._correlator(query)
-        aligned = self._align(correlator, coarser)
+        correlator, pose = self._correlator(query), query.telemetry
+        level = min(query.level_of(pose.known_height_m) + coarser, query.site.levels - 1)
+        with query.scheduler.stage("align"):
+            aligned = correlator.align(pose, level)
         if isinstance(aligned, NoFix):
             return aligned
         window = correlator.window(aligned)
@@ -196,13 +198,6 @@ class Ncc(Method):
             detail = "NCC needs the heading; with a sigma of 180 degrees it tries all of them"
             return query.refuse(Reason.NO_HEADING, detail, METHOD)
         return refusals.if_flat(query, METHOD)
-
-    def _align(self, correlator: Correlator, coarser: int) -> Aligned | NoFix:
-        """The frame with its own height and heading."""
-        query, pose = correlator.query, correlator.query.telemetry
-        level = min(query.level_of(pose.known_height_m) + coarser, query.site.levels - 1)
-        with query.scheduler.stage("align"):
-            return correlator.align(pose, level)
 
 
 class _Rungs:

@@ -87,8 +87,7 @@ def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:
     aligned, rival_score, best = found.aligned, found.peak.second_score, -1.0
     quick = EarlyStop(lambda peak: max(peak.score, peak.second_score) <= rival_score, lambda _: False)
     for patch in correlator.nowhere(aligned):
-        enhanced = enhance(patch)
-        rival = correlator.search(replace(aligned, template=enhanced), found.fix.window, quick)
+        rival = correlator.search(replace(aligned, template=enhance(patch)), found.fix.window, quick)
         best = best if rival is None else max(best, rival.score)
     null = surprise_of(best, score_sigma(aligned.template.size))
     return found.weighed(replace(found.evidence, null=null, is_tested=True))
