@@ -16,7 +16,8 @@ from engine.assumed_errors import AssumedErrors
 from engine.budget import Deadline
 from engine.geo import attitude_from_rotation
 from engine.matching.align import to_gray, view_of
-from engine.matching.pose import MIN_INLIERS, AttitudePrior, PoseStats, solve_pose
+from engine.matching.pnp import MIN_INLIERS
+from engine.matching.pose import AttitudePrior, PoseStats, solve_pose
 from engine.matching.query import Query
 from engine.options import SiftOptions
 from engine.runtime.scheduler import Scheduler

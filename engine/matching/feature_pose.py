@@ -21,7 +21,8 @@ from engine.matching.candidates import PoseCandidate
 from engine.matching.covariance import tilt_covariance
 from engine.matching.evidence import RELIABILITY, Evidence, probability
 from engine.matching.feature_matching import VOTE_SHARE, Matched, PointSearch
-from engine.matching.pose import MIN_INLIERS, AttitudePrior, PoseStats, solve_pose
+from engine.matching.pnp import MIN_INLIERS
+from engine.matching.pose import AttitudePrior, PoseStats, solve_pose
 from engine.matching.query import Query
 from engine.matching.unknown_slope import from_level_ground, wide_slope_deg
 from engine.matching.views import TelemetryHypothesis, coarser_scale, level_at, view_in, views_of, x_axis_deg

@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Start = tuple[Array, Array]  # initial pose: rotation (3, 3) and centre (3,)
 
+MIN_INLIERS = 4
+"""Fewest distinct inliers of a pose: three determine it."""
 _MAX_SAMPLES = 1000  # that RANSAC draws
 SLACK = 2.0
 """Factor on the tolerance at the start, for the error of a known attitude or of a pose that fits roughly."""
@@ -44,7 +46,6 @@ class Problem:
         attitude: (3, 3) rotation of the prior, or None.
         precision: (3, 3) inverse covariance of its angles about the camera's axes in 1/rad^2, 0 without one.
         tolerance_px: A match agrees if it reprojects at most this far off.
-        min_inliers: Fewest inliers of a pose.
     """
 
     points: Array
@@ -54,7 +55,6 @@ class Problem:
     attitude: Array | None
     precision: Array
     tolerance_px: float
-    min_inliers: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +62,10 @@ class Reprojection:
     """All matches reprojected by a pose.
 
     Attributes:
-        tangents: (3, N) x / z, y / z and 1 / z in the camera.
         projected: (2, N) pixels, far off for points behind the camera.
         squared: (N,) of the reprojection distance.
     """
 
-    tangents: Array
     projected: Array
     squared: Array
 
@@ -141,7 +139,7 @@ def reproject(problem: Problem, R: Array, center: Array) -> Reprojection:
     from engine.kernels import pose_fit  # numba takes a while to import
 
     rotation = np.ascontiguousarray(R)  # the loops are compiled for one memory layout
-    return Reprojection(*pose_fit.reproject(problem.points, problem.pixels, problem.K, rotation, center))
+    return Reprojection(*pose_fit.reproject(problem.points, problem.pixels, problem.K, rotation, center)[1:])
 
 
 def gauss_newton(problem: Problem, R: Array, center: Array, *, slack: float = 1.0) -> Fit | None:
@@ -160,13 +158,13 @@ def gauss_newton(problem: Problem, R: Array, center: Array, *, slack: float = 1.
 
     rotation = np.ascontiguousarray(R)  # the loops are compiled for one memory layout
     attitude = rotation if problem.attitude is None else np.ascontiguousarray(problem.attitude)
-    found, rotation, center, tangents, projected, squared, inliers, information, variance = fit_pose(
+    found, rotation, center, _, projected, squared, inliers, information, variance = fit_pose(
         problem.points, problem.pixels, problem.K, problem.weights, attitude, problem.precision,
-        problem.tolerance_px, problem.min_inliers, rotation, center, slack,
+        problem.tolerance_px, MIN_INLIERS, rotation, center, slack,
     )  # fmt: skip
     if not found:
         return None
-    return Fit(rotation, center, Reprojection(tangents, projected, squared), inliers, information, variance)
+    return Fit(rotation, center, Reprojection(projected, squared), inliers, information, variance)
 
 
 def turn_from_attitude(problem: Problem, R: Array) -> Array:

@@ -21,17 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import chi_square_of
-from engine.matching.pnp import (
-    SLACK,
-    Fit,
-    Problem,
-    Reprojection,
-    gauss_newton,
-    match_covariance,
-    ransac,
-    reproject,
-    turn_from_attitude,
-)
+from engine.matching import pnp
+from engine.matching.pnp import MIN_INLIERS, SLACK, Fit, Problem, Reprojection
 from engine.matching.votes import chance_of_agreeing
 from engine.options import PoseOptions
 from engine.values import SIGNIFICANCE
@@ -39,8 +30,6 @@ from engine.values import SIGNIFICANCE
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-MIN_INLIERS = 4
-"""Fewest distinct inliers of a pose: three determine it."""
 _SAME_POSE_DEG = 1.5
 _CLOSER = (1.0, 2.0, 4.0)  # factors on the tolerance, tried in turn; without the prior a pose starts from the last
 _CLOSE_SHARE, _CLOSE_INLIERS = 0.15, 12  # fewest inliers, as a share of those within the widest tolerance
@@ -154,7 +143,6 @@ def solve_pose(
         attitude=None if prior is None else prior.rotation,
         precision=np.zeros((3, 3)) if prior is None else prior.precision,
         tolerance_px=options.reprojection_px,
-        min_inliers=MIN_INLIERS,
     )
     fit = _fit(problem) if start is None else _fit_from(problem, start, origin)
     if fit is not None and prior is not None:
@@ -164,7 +152,7 @@ def solve_pose(
     other = _other_pose(problem, fit, options)
     if other is not None and start is None:
         return None
-    (log10_nfa, log10_tried), covariance = _false_alarms(problem, fit, options), match_covariance(problem, fit)
+    (log10_nfa, log10_tried), covariance = _false_alarms(problem, fit, options), pnp.match_covariance(problem, fit)
     is_chance = start is None and log10_nfa >= 0.0  # the votes for a start are the evidence for its place
     if is_chance or covariance is None:
         return None
@@ -185,8 +173,8 @@ def _spread(points: Array) -> float:
 
 
 def _fit(problem: Problem) -> Fit | None:
-    start = ransac(problem)
-    return None if start is None else gauss_newton(problem, *start)
+    start = pnp.ransac(problem)
+    return None if start is None else pnp.gauss_newton(problem, *start)
 
 
 def _fit_from(problem: Problem, start: PoseStart, origin: Array) -> Fit | None:
@@ -195,13 +183,13 @@ def _fit_from(problem: Problem, start: PoseStart, origin: Array) -> Fit | None:
     If most agree only roughly, as over changed ground, the closer ones alone would be chance.
     """
     wide = replace(problem, tolerance_px=max(start.tolerance_px, problem.tolerance_px))
-    near = gauss_newton(wide, start.rotation, start.center_m - origin)
+    near = pnp.gauss_newton(wide, start.rotation, start.center_m - origin)
     if near is None:
         return None
     enough = max(_CLOSE_SHARE * np.count_nonzero(near.inliers), _CLOSE_INLIERS)
     for factor in _CLOSER:
         closer = replace(problem, tolerance_px=min(factor * problem.tolerance_px, wide.tolerance_px))
-        close = gauss_newton(closer, near.rotation, near.center, slack=SLACK)
+        close = pnp.gauss_newton(closer, near.rotation, near.center, slack=SLACK)
         if close is not None and np.count_nonzero(close.inliers) >= enough:
             return close
     return near
@@ -214,11 +202,11 @@ def _without_wrong_prior(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     """
     free = replace(problem, attitude=None, precision=np.zeros((3, 3)))
     wide = replace(free, tolerance_px=_CLOSER[-1] * problem.tolerance_px)
-    near = gauss_newton(wide, fit.rotation, fit.center)
-    close = None if near is None else gauss_newton(free, near.rotation, near.center, slack=SLACK)
+    near = pnp.gauss_newton(wide, fit.rotation, fit.center)
+    close = None if near is None else pnp.gauss_newton(free, near.rotation, near.center, slack=SLACK)
     if close is None or np.count_nonzero(close.inliers) < _CONTESTED * np.count_nonzero(fit.inliers):
         return problem, fit
-    x, y, z = np.degrees(turn_from_attitude(problem, close.rotation)).tolist()
+    x, y, z = np.degrees(pnp.turn_from_attitude(problem, close.rotation)).tolist()
     is_other = math.hypot(x, y) > _CONTESTED_TILT_DEG or abs(z) > _CONTESTED_TURN_DEG
     return (free, close) if is_other else (problem, fit)
 
@@ -260,9 +248,9 @@ def _other_pose(problem: Problem, fit: Fit, options: PoseOptions) -> Fit | None:
     if _same(R, fit.rotation):
         return None
     cost = _cost(problem, fit.rotation, fit.view, fit.variance_px2, options)
-    if _cost(problem, R, reproject(problem, R, center), fit.variance_px2, options) > 2 * cost + 50:
+    if _cost(problem, R, pnp.reproject(problem, R, center), fit.variance_px2, options) > 2 * cost + 50:
         return None  # too far off for a refinement to compensate
-    other = gauss_newton(problem, R, center)
+    other = pnp.gauss_newton(problem, R, center)
     if other is None or _same(other.rotation, fit.rotation):
         return None
     other_cost = _cost(problem, other.rotation, other.view, fit.variance_px2, options)
@@ -291,5 +279,5 @@ def _same(R: Array, other: Array) -> bool:
 def _cost(problem: Problem, R: Array, view: Reprojection, variance: float, options: PoseOptions) -> float:
     """Return chi-square of all matches, each bounded at the threshold, and of the prior."""
     cost = float(problem.weights @ np.minimum(view.squared, options.reprojection_px**2)) / variance
-    turn = turn_from_attitude(problem, R)
+    turn = pnp.turn_from_attitude(problem, R)
     return cost + float(turn @ problem.precision @ turn)
