@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import replace
+from functools import partial
 from typing import TypeGuard
 
 from engine.maps.landmarks import LandmarkMap
@@ -14,7 +15,7 @@ from engine.matching.feature_pose import METHOD, FeatureMatcher
 from engine.matching.for_reports import Explanation, explain_features
 from engine.matching.ladder import SHARES, Answer, Rung, Works, climb, is_accepted, rehearse
 from engine.matching.method import Method
-from engine.matching.pose import MIN_INLIERS
+from engine.matching.pnp import MIN_INLIERS
 from engine.matching.query import Query
 from engine.matching.refinement import CONFIRMING_CORRELATION, Refinement, with_tilt_doubt
 from engine.matching.views import coarser_scale, drawn_px
@@ -58,12 +59,6 @@ class Sift(Method):
         # kornia launches thousands of operations, which takes a GPU far longer than the compiled loops take.
         on = device if self.options.backend == "kornia" else CPU
         self.landmarks = LandmarkMap(site, on, self.options.backend)
-        self._few = replace(
-            self.options,
-            max_keypoints=max(MIN_INLIERS, round(self.options.max_keypoints * _FEW_SHARE)),
-            keypoints_per_px=self.options.keypoints_per_px * _FEW_SHARE,
-            upsample=1,
-        )
         self._ncc_options = options.ncc
         self.samples = SampleMap(site) if samples is None else samples
 
@@ -104,19 +99,16 @@ class Sift(Method):
         return [rungs.few, rungs.refinement, rungs.all, rungs.refinement, rungs.doubted]
 
     def few_options(self, query: Query) -> SiftOptions | None:
-        """Of few features, at their scale; None if they are not wanted or the map has no such level."""
-        height_m = query.telemetry.height_agl_m
+        """Half as many keypoints, a level coarser, not upsampled; None if unwanted or without such a level."""
+        options, height_m = self.options, query.telemetry.height_agl_m
         if query.prior is None or height_m is None or not self.can_refine(query):
             return None
-        scale = coarser_scale(query, height_m, self.options.scale)
-        return None if scale is None else replace(self._few, scale=scale)
-
-    def find_few(self, query: Query, options: SiftOptions) -> PoseCandidate | NoFix:
-        """The pose by half as many keypoints, a level coarser, not upsampled; it follows the stated attitude."""
-        found = FeatureMatcher(query, self.landmarks, options).find_at_once()
-        if isinstance(found, NoFix):
-            return found
-        return replace(found, fix=with_tilt_doubt(query, found.fix), is_quick=True).coarse()
+        scale = coarser_scale(query, height_m, options.scale)
+        if scale is None:
+            return None
+        keypoints = max(MIN_INLIERS, round(options.max_keypoints * _FEW_SHARE))
+        per_px = options.keypoints_per_px * _FEW_SHARE
+        return replace(options, max_keypoints=keypoints, keypoints_per_px=per_px, upsample=1, scale=scale)
 
     def can_refine(self, query: Query) -> bool:
         """Whether poses are refined: only with trusted telemetry over a surface model."""
@@ -183,7 +175,8 @@ class _Rungs:
         self.few = Rung(METHOD, "few features", self._if_few_suffice, self._by_few)
         self.all = Rung(METHOD, "all features", self._if_few_do_not_suffice, self._by_all)
         self.refinement = Rung(METHOD, "pose", self._if_refinable, self._refine)
-        self.doubted = Rung(METHOD, "all features, tilt doubted", self._if_unconfirmed, self._by_matches)
+        by_matches = partial(self._by_all, doubts_tilt=True)
+        self.doubted = Rung(METHOD, "all features, tilt doubted", self._if_unconfirmed, by_matches)
 
     def _if_few_suffice(self, answer: Answer | None) -> Works:
         """Few features, if time allows all of them as well, or only few."""
@@ -198,27 +191,25 @@ class _Rungs:
         return {}
 
     def _by_few(self, answer: Answer | None, step: Hashable) -> Answer | None:
-        """The pose by few features, to be refined."""
-        assert self._few_options is not None  # or it was not offered
-        found = self._sift.find_few(self._query, self._few_options)
-        return found if isinstance(found, PoseCandidate) and found.promises(self._query.risk) else None
+        """The pose by few features if it promises a fix, to be refined; it follows the stated attitude."""
+        query, options = self._query, self._few_options
+        assert options is not None  # or it was not offered
+        found = FeatureMatcher(query, self._sift.landmarks, options).find_at_once()
+        if isinstance(found, NoFix) or not found.promises(query.risk):
+            return None
+        return replace(found, fix=with_tilt_doubt(query, found.fix), is_quick=True).coarse()
 
     def _if_few_do_not_suffice(self, answer: Answer | None) -> Works:
         return self._works if answer is None or (_is_quick(answer) and not answer.refinement_failed) else {}
 
-    def _by_all(self, answer: Answer | None, step: Hashable) -> Answer:
-        """The pose by all features."""
+    def _by_all(self, answer: Answer | None, step: Hashable, *, doubts_tilt: bool = False) -> Answer:
+        """The pose by all features; if the tilt is doubted, it does not rest on the stated one."""
         assert isinstance(step, tuple)
-        return self._sift.at_scale(self._query, step[1])
+        return self._sift.at_scale(self._query, step[1], doubts_tilt=doubts_tilt)
 
     def _if_unconfirmed(self, answer: Answer | None) -> Works:
         """All features without the stated tilt, if a refinement has failed, which makes that doubtful."""
         return self._works if isinstance(answer, PoseCandidate) and answer.refinement_failed else {}
-
-    def _by_matches(self, answer: Answer | None, step: Hashable) -> Answer:
-        """The pose by all features that does not rest on the stated tilt."""
-        assert isinstance(step, tuple)
-        return self._sift.at_scale(self._query, step[1], doubts_tilt=True)
 
     def _if_refinable(self, answer: Answer | None) -> Works:
         """The pose of few features that promise a fix, or of all that suffice, unless a refinement has failed."""

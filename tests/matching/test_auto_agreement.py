@@ -8,6 +8,7 @@ import pytest
 
 from engine import Reason, SceneMatcher
 from engine.matching.evidence import Evidence, probability
+from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.ladder import Rung, climb
 from engine.matching.ncc import Ncc
 from engine.matching.sift import Sift
@@ -65,7 +66,7 @@ def test_two_places_that_are_about_as_evident_refuse(told, sift_nats):
 
 
 def test_a_refined_fix_beyond_doubt_is_not_matched_a_second_time(site, camera, frame, prior, monkeypatch):
-    monkeypatch.setattr(Sift, "find_few", lambda *_: pytest.fail("SIFT was asked"))
+    monkeypatch.setattr(FeatureMatcher, "find_at_once", lambda *_: pytest.fail("SIFT was asked"))
     monkeypatch.setattr(Sift, "find", lambda *_: pytest.fail("SIFT was asked"))
     fix = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)
     assert (fix.method, fix.stage) == ("ncc", "refined")
