@@ -198,7 +198,10 @@ class Navigator:
                 result = result.refused(Reason.BAD_POSE, "the covariance of the match is not positive definite")
         tracks = moment.tracks
         if isinstance(result, Fix):
-            weighed = tracks.weighed(self._match(result, frame, moment.ways, searched, prior, is_given=is_given))
+            area_m2, height_m = self._searched_m2(result, searched), frame.height_agl_m or self._height_of(result)
+            given = None if prior is None else position_of(prior, self._matcher.site)
+            match = Match(result, area_m2, moment.ways, height_m, self._refusals, given, is_given)
+            weighed = tracks.weighed(match)
             result, tracks = self._judged(result, weighed, moment), weighed.tracks
         elif result.reason is not Reason.LATE:  # a lack of time is no evidence about the position
             self._refusals += 1
@@ -299,24 +302,13 @@ class Navigator:
 
     # ---------------------------------------------------------------------------------------------- acceptance
 
-    def _match(
-        self,
-        fix: Fix,
-        frame: Frame,
-        ways: Ways,
-        searched: Prior | None,
-        prior: Prior | None,
-        *,
-        is_given: bool,
-    ) -> Match:
-        """A match, with what it is to be judged by."""
+    def _searched_m2(self, fix: Fix, searched: Prior | None) -> float:
+        """The area in which a match was searched for."""
         about = PositionEstimate(en_m(fix), 0.0 if searched is None else searched.sigma_m, on_map=True)
         area_m2 = SEARCHED * about.spread_m2(fix)
         if searched is None or fix.confidence is None:  # without a confidence it has not weighed the prior
             area_m2 = max(area_m2, fix.window.area_px * self._matcher.site.gsd_m_per_px**2)
-        height_m = frame.height_agl_m or self._height_of(fix)
-        given = None if prior is None else position_of(prior, self._matcher.site)
-        return Match(fix, area_m2, ways, height_m, self._refusals, given, is_given)
+        return area_m2
 
     def _judged(self, fix: Fix, weighed: Weighed, moment: _Moment) -> Fix | NoFix:
         """The fix if there is enough evidence for it; otherwise it is refused."""
