@@ -191,10 +191,8 @@ def _inscribed_size(view: GroundView, shape: tuple[int, ...]) -> tuple[int, int]
         best = int(inside.argmax())
         if inside[best]:
             width, height = (int(2 * side * n) for n in shapes.reshape(-1, 4, 2)[best, 2])
-            break
-    else:
-        return None
-    return (width, height) if min(width, height) >= MIN_SIDE_PX else None
+            return (width, height) if min(width, height) >= MIN_SIDE_PX else None
+    return None
 
 
 # ----------------------------------------------------------------------------------------- the whole frame

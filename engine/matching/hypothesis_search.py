@@ -258,18 +258,8 @@ def _best_at_full_resolution(
         final.append(_refined(correlator, better, fine) if refine else (better, fine))
     if not final:
         return None
-    final.sort(key=lambda pair: -pair[0].score)
-    best, aligned = final[0]
-    return replace(best, second_score=max(_best_elsewhere(correlator, final), best.second_score)), aligned
-
-
-def _best_elsewhere(correlator: Correlator, found: list[tuple[Peak, Aligned]]) -> float:
-    """The best score at a place other than the winner's."""
-    winner = correlator.nadir_px(*found[0])
-    distance_px = correlator.exclusion_px(0)
-    scores = [
-        peak.score
-        for peak, aligned in found[1:]
-        if np.hypot(*(correlator.nadir_px(peak, aligned) - winner)) > distance_px
-    ]
-    return max(scores, default=-1.0)
+    (best, winner), *others = sorted(final, key=lambda pair: -pair[0].score)
+    place, distance_px = correlator.nadir_px(best, winner), correlator.exclusion_px(0)
+    apart_px = [np.hypot(*(correlator.nadir_px(peak, aligned) - place)) for peak, aligned in others]
+    elsewhere = [peak.score for (peak, _), apart in zip(others, apart_px, strict=True) if apart > distance_px]
+    return replace(best, second_score=max([best.second_score, *elsewhere])), winner
