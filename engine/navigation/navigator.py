@@ -226,24 +226,19 @@ class Navigator:
             raise TelemetryError(f"timestamp_ns: expected later than the last frame's {newest}, got {stamp}")
         return (stamp - newest) * 1e-9
 
-    def _seen_motion(self, frame: Frame) -> GroundMotion | None:
-        """How far the vehicle moved since the last frame, if the pictures show it."""
-        if self._pictures is None:
-            return None
-        motion = self._pictures.update(self._with_height(self._errors.without_errors(frame)))
-        return motion if isinstance(motion, GroundMotion) else None
-
     def _next(self, frame: Frame) -> _Moment:
         """A new frame, by what was known before."""
         interval_s, last, stamp_ns = self._interval_s(frame), self._last, frame.timestamp_ns
-        self._motion = motion = self._seen_motion(frame)
+        if self._pictures is not None:
+            motion = self._pictures.update(self._with_height(self._errors.without_errors(frame)))
+            self._motion = motion if isinstance(motion, GroundMotion) else None
         if last is None:
             ways, tracks = Ways(0.0, stated_step(None, frame, 0.0, self._options)), Tracks(self._options)
             begun = tracks.begun(self._start, ways) if self._start else tracks
             return _Moment(0.0, stamp_ns, ways, Picture.of(frame), begun)
         seen = None
-        if motion is not None and math.isclose(motion.interval_s, interval_s, abs_tol=1e-6):
-            seen = motion.step(last.ways.seen)  # not seen if a frame in between failed
+        if self._motion is not None and math.isclose(self._motion.interval_s, interval_s, abs_tol=1e-6):
+            seen = self._motion.step(last.ways.seen)  # not seen if a frame in between failed
         ways = Ways(interval_s, stated_step(last.ways.stated, frame, interval_s, self._options), seen)
         return _Moment(
             last.time_s + interval_s,
