@@ -159,7 +159,7 @@ def test_hypotheses(benchmark: Any, peer: str, threads: int) -> None:
                 for scale in np.linspace(0.9, 1.1, SCALES):
                     attitude = Attitude(frame.roll_deg or 0.0, frame.pitch_deg or 0.0, float(heading))
                     view = view_of(scene.camera, attitude, frame.height_agl_m * scale, jacobian)
-                    patch = rectify(gray, scene.camera, view)
+                    patch = rectify(gray, view)
                     x, y, score = peers.opencv_peak(picture, enhance(patch.gray))
                     if score > best:
                         best, place = score, np.array([x, y]) - patch.offset_px

@@ -126,12 +126,11 @@ class Patch:
     offset_px: Array
 
 
-def rectify(gray: NDArray[np.uint8], camera: Camera, view: GroundView) -> Patch | None:
+def rectify(gray: NDArray[np.uint8], view: GroundView) -> Patch | None:
     """Warp the frame to the map's pixels, and crop to the largest upright rectangle inside a share of it.
 
     Args:
         gray: (H, W) undistorted.
-        camera: its pinhole.
         view: from :func:`view_of`.
 
     Returns:

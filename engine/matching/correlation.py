@@ -16,9 +16,9 @@ from engine.matching import refusals
 from engine.matching.align import FRACTION, MIN_SHRINK, GroundView, Patch, ground_bounds_px, rectify, view_of
 from engine.matching.oblique import is_oblique, relief_patch
 from engine.matching.query import Query
-from engine.ncc_fft import match_template, surface
+from engine.ncc_fft import match_template
 from engine.options import NccOptions
-from engine.runtime.device import Picture, to_device
+from engine.runtime.device import to_device
 from engine.runtime.scheduler import OutOfTime
 from engine.values import GridPose, NoFix, Peak, Reason, Window
 from engine.window import MARGIN, SPREAD_SIGMAS, level_crop
@@ -136,7 +136,7 @@ class Correlator:
         rows, columns = query.site.level_shape(level)
         if (MIN_SHRINK * FRACTION) ** 2 * seen.area_px > rows * columns:
             return query.refuse(Reason.OUTSIDE_MAP, "the frame covers more ground than the map", METHOD)
-        patch = rectify(query.gray, query.camera, seen)
+        patch = rectify(query.gray, seen)
         if patch is None:
             detail = "the frame covers fewer than 8 x 8 pixels of the map"
             return query.refuse(Reason.NO_TEXTURE, detail, METHOD)
@@ -215,21 +215,6 @@ class Correlator:
         """Distance within which a rival is the peak itself, in pixels of a level."""
         return self.options.exclusion_m / (self.query.site.gsd_m_per_px * 2.0**level)
 
-    def surface(self, aligned: Aligned, window: Window) -> tuple[Picture, Array] | None:
-        """The whole surface on which :meth:`search` finds its peak, for reports.
-
-        Returns:
-            Scores (H', W') of the template's top-left pixel, and that place (2,) of the first in pixels of the
-            level; None if the template does not fit the window.
-        """
-        height, width = aligned.template.shape
-        region = self.cut(window, aligned.level)
-        if region.window.width_px < width or region.window.height_px < height:
-            return None
-        own = to_device(aligned.template[None], self.query.device)
-        scores = surface(region.search, own, min_overlap=MIN_VALID_SHARE)[0]
-        return scores, np.array([region.window.x0, region.window.y0], np.float64)
-
     def nadir_px(self, peak: Peak, aligned: Aligned) -> Array:
         """The camera's nadir (2,) in map pixels, from where its patch was found."""
         place = np.array([peak.x, peak.y]) - aligned.patch.offset_px
@@ -249,7 +234,7 @@ def _about(stop: EarlyStop, window: Window) -> EarlyStop:
     )
 
 
-def expected_window_px(query: Query, options: NccOptions) -> dict[int, float]:
+def expected_window_px(query: Query) -> dict[int, float]:
     """Expected pixels of the window per level above the frame's own; the cost is proportional to them."""
     site, camera, height_m = query.site, query.camera, query.telemetry.known_height_m
     assert query.prior is not None

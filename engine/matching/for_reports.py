@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from engine.kernels.coarse_to_fine import WIDE_PX
 from engine.matching.align import Patch, rectify, view_of
-from engine.matching.correlation import Aligned, Correlator
+from engine.matching.correlation import MIN_VALID_SHARE, Aligned, Correlator
 from engine.matching.pose import PoseStats
 from engine.matching.query import Query
-from engine.runtime.device import on_host
+from engine.ncc_fft import surface
+from engine.runtime.device import on_host, to_device
 from engine.values import Window
 
 if TYPE_CHECKING:
@@ -91,14 +92,16 @@ def explain_correlation(correlator: Correlator, window: Window) -> Explanation:
     aligned = correlator.align(pose, level)
     if not isinstance(aligned, Aligned):
         return Explanation(query.gray)
-    found = correlator.surface(aligned, window)
-    if found is None:
+    region, (height, width) = correlator.cut(window, level), aligned.template.shape
+    if region.window.width_px < width or region.window.height_px < height:
         return Explanation(query.gray, aligned.patch.gray)
-    scores, corner = on_host(found[0]), found[1]
+    own = to_device(aligned.template[None], query.device)
+    scores = on_host(surface(region.search, own, min_overlap=MIN_VALID_SHARE)[0])
+    corner = np.array([region.window.x0, region.window.y0], np.float64)
     middle = site.full_from_level(outline_of(corner, aligned.patch.gray).mean(axis=0), level)
-    surface = score_surface(scores, middle, 2.0**level)
-    outline = site.full_from_level(outline_of(corner + surface.peak_px, aligned.patch.gray), level)
-    return Explanation(query.gray, aligned.patch.gray, outline, surface)
+    shown = score_surface(scores, middle, 2.0**level)
+    outline = site.full_from_level(outline_of(corner + shown.peak_px, aligned.patch.gray), level)
+    return Explanation(query.gray, aligned.patch.gray, outline, shown)
 
 
 def explain_features(matcher: FeatureMatcher, window: Window) -> Explanation:
@@ -134,7 +137,7 @@ def rectified_frame(query: Query) -> Patch | None:
         return None
     jacobian = query.jacobian * 2.0 ** query.level_of(pose.height_agl_m)
     view = view_of(query.camera, pose.grid_attitude, pose.height_agl_m, jacobian)
-    return None if view is None else rectify(query.gray, query.camera, view)
+    return None if view is None else rectify(query.gray, view)
 
 
 def _footprint(query: Query, stats: PoseStats, ground_m: float) -> Array | None:

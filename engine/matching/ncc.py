@@ -104,7 +104,7 @@ class Ncc(Method):
         """Correlation on each level, the frame's own first; or the search of the whole map."""
         if query.prior is None:
             return {(_SEARCH, 0): float(query.site.width_px * query.site.height_px)}
-        return {(METHOD, coarser): work for coarser, work in expected_window_px(query, self.options).items()}
+        return {(METHOD, coarser): work for coarser, work in expected_window_px(query).items()}
 
     def can_refine(self, query: Query) -> bool:
         """Whether poses are refined."""

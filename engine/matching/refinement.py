@@ -11,16 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.geo import attitude_from_rotation, chi_square_of
-from engine.kernels.dense import (
-    DenseFit,
-    EnhancedFrame,
-    GaussianPrior,
-    Pose,
-    Samples,
-    correlation_at,
-    covariance_of,
-    refine,
-)
+from engine.kernels import dense
+from engine.kernels.dense import DenseFit, EnhancedFrame, GaussianPrior, Pose, Samples
 from engine.kernels.scores import RADIUS_PX, enhance
 from engine.maps.grids import window_about
 from engine.maps.samples import BLOCK_PX, MAX_SAMPLES, SampleMap
@@ -192,7 +184,7 @@ class Refinement:
             return 0.0
         side_m = min(window.width_px, window.height_px) * query.site.gsd_m_per_px * 2.0**level
         elsewhere = [replace(pose, center_m=pose.center_m + shift) for shift in side_m * _ELSEWHERE]
-        seen = [correlation_at(refined.picture, refined.ground, each) for each in elsewhere]
+        seen = [dense.correlation_at(refined.picture, refined.ground, each) for each in elsewhere]
         chance = np.array([score for score in seen if score != 0.0])  # 0 if too little of the map is seen
         if 2 * len(chance) < len(elsewhere):
             return 0.0
@@ -246,7 +238,7 @@ class Refinement:
         if found is None:
             return None
         fit, picture, ground = found
-        pose_covariance, at = covariance_of(fit, prior), fit.pose
+        pose_covariance, at = dense.covariance_of(fit, prior), fit.pose
         if pose_covariance is None:
             return None
         if self._is_on_unknown_slope:
@@ -325,10 +317,10 @@ class Refinement:
                 starts = [pose]
                 if not has_tilt and fit is None:
                     starts = _tilted(pose, height_m, self._tilt_deg)
-                    starts.sort(key=lambda each: -correlation_at(picture, ground, each))
+                    starts.sort(key=lambda each: -dense.correlation_at(picture, ground, each))
                 fit = None
                 for start in starts[:_STARTS]:
-                    other = refine(picture, ground, start, prior)
+                    other = dense.refine(picture, ground, start, prior)
                     if other is not None and (fit is None or other.correlation > fit.correlation):
                         fit = other
                     if fit is not None and fit.correlation >= CONFIRMING_CORRELATION:
@@ -337,7 +329,7 @@ class Refinement:
         if fit is None or not fit.converged:
             return None
         is_direct = has_tilt and coarser == 0
-        at_prior = fit.first_correlation if is_direct else correlation_at(picture, ground, prior.pose)
+        at_prior = fit.first_correlation if is_direct else dense.correlation_at(picture, ground, prior.pose)
         return (fit, picture, ground) if fit.correlation >= at_prior else None
 
     def _prior(self, fix: Fix) -> GaussianPrior:

@@ -240,7 +240,7 @@ def _seen_at(
             raise OptionError(
                 f"height_agl_m: expected a frame within the map's {extent} m, got {size} m from {height_agl_m:g} m"
             )
-        patch = rectify(blank, camera, view)
+        patch = rectify(blank, view)
         if patch is None:
             raise OptionError(
                 f"height_agl_m: expected a frame of 8 x 8 map pixels or more, got less from {height_agl_m:g} m"

@@ -127,7 +127,7 @@ def test_there_is_no_view_where_a_corner_looks_at_the_horizon(axis, angle):
 def test_a_patch_holds_frame_alone(roll, pitch, heading):
     """No corner of the patch lies outside the frame, and it keeps to whole map pixels and to its size."""
     view = view_of(CAMERA, Attitude(roll, pitch, heading), 150.0, UPRIGHT)
-    patch = rectify(np.full((300, 300), 9, np.uint8), CAMERA, view)
+    patch = rectify(np.full((300, 300), 9, np.uint8), view)
     height, width = patch.gray.shape
     corners = patch.offset_px + np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]])
     seen = np.c_[corners, np.ones(4)] @ view.image_from_map.T
@@ -141,7 +141,7 @@ def test_a_patch_holds_frame_alone(roll, pitch, heading):
 
 def test_a_frame_that_covers_a_few_map_pixels_gives_no_patch():
     view = view_of(CAMERA, Attitude(0.0, 0.0, 0.0), 4.0, UPRIGHT)  # 9 map pixels wide
-    assert rectify(np.zeros((300, 300), np.uint8), CAMERA, view) is None
+    assert rectify(np.zeros((300, 300), np.uint8), view) is None
 
 
 # The largest upright part of an oblique frame that shows the map
