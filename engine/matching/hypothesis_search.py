@@ -30,6 +30,8 @@ Reach = tuple[float, float]
 """How far off the heading, in degrees, and the height, as a share of it, may be."""
 OWN = (0.0, 0.0)
 """The reach of the frame's own hypothesis alone."""
+Found = tuple[Peak, Aligned]
+"""A peak, and the hypothesis that it belongs to."""
 
 # Most hypotheses times places on the coarse level, unless the template gets too small: in all, and in multiples of
 # the places of one look at the frame's own level.
@@ -79,22 +81,17 @@ def _nats(peak: Peak, aligned: Aligned, tried: float) -> float:
 
 def _from_level(
     correlator: Correlator, first: Aligned, window: Window, level: int, poses: list[GridPose]
-) -> tuple[Peak, Aligned] | None:
+) -> Found | None:
     """The best peak over some hypotheses, all scored on one level."""
-    found: list[tuple[Peak, Aligned]] = []
-    middle = max(first.level, level - 1)
-    for pose, nadir in _coarse(correlator, poses, window, level):
-        aligned = correlator.align(pose, middle, nadir)
-        peak = None if isinstance(aligned, NoFix) else _near(correlator, aligned, nadir, level)
-        if peak is not None and isinstance(aligned, Aligned):
-            found.append((peak, aligned))
-    found.sort(key=lambda pair: -pair[0].score)
+    middle, places = max(first.level, level - 1), _coarse(correlator, poses, window, level)
+    near = [_near(correlator, pose, middle, nadir, level) for pose, nadir in places]
+    found = sorted(filter(None, near), key=lambda pair: -pair[0].score)
     several = len(poses) > 1
     if several and found:
         (peak, aligned), tried = found[0], len(poses) * places_in(first, window)
         if is_hopeless(_nats(replace(peak, second_score=0.0), aligned, tried), correlator.query.risk):
             return None
-        found = [_refined(correlator, *pair) for pair in found[: _CANDIDATES // 2]]
+        found = [_refined(correlator, pair) for pair in found[: _CANDIDATES // 2]]
         found.sort(key=lambda pair: -pair[0].score)
     return _best_at_full_resolution(correlator, found, first.level, refine=several)
 
@@ -205,15 +202,18 @@ def _separated(found: list[tuple[float, GridPose, Array]], distance_px: float) -
     return kept
 
 
-def _near(correlator: Correlator, aligned: Aligned, nadir_px: Array, level: int) -> Peak | None:
-    """The peak near a nadir that was found on some level, as far as heading and height move a place there."""
-    return correlator.search(aligned, correlator.near(aligned, nadir_px, round(2.0 * _EDGE_PX * 2**level)))
+def _near(correlator: Correlator, pose: GridPose, level: int, nadir_px: Array, coarse: int) -> Found | None:
+    """The peak on a level near a nadir from a coarse one, as far as heading and height move a place there."""
+    aligned = correlator.align(pose, level, nadir_px)
+    if isinstance(aligned, NoFix):
+        return None
+    peak = correlator.search(aligned, correlator.near(aligned, nadir_px, round(2.0 * _EDGE_PX * 2**coarse)))
+    return None if peak is None else (peak, aligned)
 
 
-def _refined(correlator: Correlator, peak: Peak, aligned: Aligned) -> tuple[Peak, Aligned]:
+def _refined(correlator: Correlator, best: Found) -> Found:
     """Heading and height between the hypotheses: parabolas through three scores, over ever smaller steps."""
-    step = 2.0 * _EDGE_PX / math.hypot(*aligned.template.shape)
-    best = (peak, aligned)
+    step = 2.0 * _EDGE_PX / math.hypot(*best[1].template.shape)
     for _ in range(_ROUNDS):
         for turn, share in ((step, 0.0), (0.0, step)):
             sides = [_moved(correlator, best, sign * turn, sign * share) for sign in (-1.0, 1.0)]
@@ -228,34 +228,23 @@ def _refined(correlator: Correlator, peak: Peak, aligned: Aligned) -> tuple[Peak
     return best
 
 
-def _moved(
-    correlator: Correlator, best: tuple[Peak, Aligned], turn_rad: float, share: float
-) -> tuple[Peak, Aligned] | None:
+def _moved(correlator: Correlator, best: Found, turn_rad: float, share: float) -> Found | None:
     """The peak near the last one, with the heading turned and the height changed by a share."""
-    peak, aligned = best
-    nadir = correlator.nadir_px(peak, aligned)
-    other = correlator.align(_turned(aligned.pose, math.degrees(turn_rad), share), aligned.level, nadir)
-    if isinstance(other, NoFix):
-        return None
-    found = _near(correlator, other, nadir, aligned.level)
-    return None if found is None else (found, other)
+    pose, level = _turned(best[1].pose, math.degrees(turn_rad), share), best[1].level
+    return _near(correlator, pose, level, correlator.nadir_px(*best), level)
 
 
 def _best_at_full_resolution(
-    correlator: Correlator, found: list[tuple[Peak, Aligned]], level: int, *, refine: bool
-) -> tuple[Peak, Aligned] | None:
+    correlator: Correlator, found: list[Found], level: int, *, refine: bool
+) -> Found | None:
     """The best of a few places at full resolution; its rival is the best of the others."""
-    final: list[tuple[Peak, Aligned]] = []
+    final: list[Found] = []
     for peak, aligned in found[: _CANDIDATES // 4]:
-        nadir = correlator.nadir_px(peak, aligned)
-        fine = correlator.align(aligned.pose, level, nadir)
-        if isinstance(fine, NoFix):
-            continue
-        better = _near(correlator, fine, nadir, aligned.level + 1)
-        if better is None:
-            continue
-        # Rivals are refined in heading and height like the winner, or refinement alone would create the lead.
-        final.append(_refined(correlator, better, fine) if refine else (better, fine))
+        nadir_px, coarse = correlator.nadir_px(peak, aligned), aligned.level + 1
+        better = _near(correlator, aligned.pose, level, nadir_px, coarse)
+        if better is not None:
+            # Rivals are refined in heading and height like the winner, or refinement alone would create the lead.
+            final.append(_refined(correlator, better) if refine else better)
     if not final:
         return None
     (best, winner), *others = sorted(final, key=lambda pair: -pair[0].score)
