@@ -41,10 +41,9 @@ class Candidate:
 
     def against(self, others: Iterable[Candidate]) -> Self:
         """The candidate with the evidence for any other place against it."""
-        rivals = [
-            other.evidence.nats for other in others if other.counts and not agree_in_place(other.fix, self.fix)
-        ]
-        return self.weighed(replace(self.evidence, elsewhere=max([self.evidence.elsewhere, *rivals])))
+        rivals = (other for other in others if other.counts and not agree_in_place(other.fix, self.fix))
+        elsewhere = max([self.evidence.elsewhere, *map(nats, rivals)])
+        return self.weighed(replace(self.evidence, elsewhere=elsewhere))
 
     def weighed(self, evidence: Evidence) -> Self:
         """The candidate by other evidence."""

@@ -77,9 +77,8 @@ def candidate_of(
 def places_in(aligned: Aligned, window: Window) -> float:
     """Number of places in a window at which a hypothesis fits."""
     (rows, columns), scale = aligned.template.shape, 2.0**aligned.level
-    return independent_places(
-        max(window.width_px / scale - columns, 1.0) * max(window.height_px / scale - rows, 1.0)
-    )
+    across, down = window.width_px / scale - columns, window.height_px / scale - rows
+    return independent_places(max(across, 1.0) * max(down, 1.0))
 
 
 def null_tested(correlator: Correlator, found: PeakCandidate) -> PeakCandidate:

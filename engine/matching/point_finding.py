@@ -103,9 +103,6 @@ def _points(xy_px: torch.Tensor) -> Array:
 def _is_valid(xy_px: Array, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which points (M, 2) lie where a mask (h, w) is True; non-finite points do not."""
     known = np.asarray(np.isfinite(xy_px).all(axis=1))
-    x, y = (
-        np.clip(np.rint(np.where(known[:, None], xy_px, 0.0)), 0, np.array(valid.shape)[::-1] - 1)
-        .astype(np.intp)
-        .T
-    )
+    places = np.rint(np.where(known[:, None], xy_px, 0.0))
+    x, y = np.clip(places, 0, np.array(valid.shape)[::-1] - 1).astype(np.intp).T
     return np.asarray(known & valid[y, x])

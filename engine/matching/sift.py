@@ -150,10 +150,9 @@ class Sift(Method):
     def works(self, query: Query) -> Works:
         """Shares of the usual scale, by the pixels of the matched picture, which determine the cost."""
         known, scale = query.telemetry, self.options.scale
-        if query.prior is None or known.height_agl_m is None:
-            step = "sift search" if query.prior is None else "sift heights"
-        else:
-            step = METHOD
+        step = METHOD if known.height_agl_m is not None else "sift heights"
+        if query.prior is None:
+            step = "sift search"
         if known.height_agl_m is None or known.grid_heading_deg is None:
             return {(step, share): query.gray.size * (scale * share) ** 2 for share in SHARES}
         return {(step, share): drawn_px(query, known.height_agl_m, scale * share) for share in SHARES}
@@ -213,12 +212,10 @@ class _Rungs:
 
     def _if_refinable(self, answer: Answer | None) -> Works:
         """The pose of few features that promise a fix, or of all that suffice, unless a refinement has failed."""
-        if not (is_accepted(answer, self._query) or _is_quick(answer)):
+        if not isinstance(answer, PoseCandidate) or answer.refinement_failed or answer.fix.stage == "refined":
             return {}
-        assert isinstance(answer, PoseCandidate)  # no other is proposed here
-        offered = (
-            not answer.refinement_failed and answer.fix.stage != "refined" and self._sift.can_refine(self._query)
-        )
+        is_wanted = answer.is_quick or is_accepted(answer, self._query)
+        offered = is_wanted and self._sift.can_refine(self._query)
         return {_REFINEMENT: float(self._query.gray.size)} if offered else {}
 
     def _refine(self, answer: Answer | None, step: Hashable) -> Answer | None:

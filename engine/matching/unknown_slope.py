@@ -139,9 +139,8 @@ def _mixed(pose: Pose, kinds: Sequence[Mixture], height_m: float) -> SlopeFit:
     best = weights.sum(axis=1).argmax()
     step = weights[best] @ steps[best] / weights[best].sum()
     between = steps - step
-    covariance = np.einsum("kn,knij->ij", weights, covariances) + np.einsum(
-        "kn,kni,knj->ij", weights, between, between
-    )
+    covariance = np.einsum("kn,knij->ij", weights, covariances)
+    covariance += np.einsum("kn,kni,knj->ij", weights, between, between)
     slope = pose.slope + step[6:]
     # Sloping ground is seldom a plane: as far away as the camera is high it rises or falls by about as much.
     relief_m2 = height_m**2 * 0.5 * float(slope @ slope + np.trace(covariance[6:, 6:]))
