@@ -376,10 +376,7 @@ class Fix:
     @property
     def relative_covariance_m2(self) -> NDArray[np.float64]:
         """(2, 2) east and north relative to the map and to other fixes on it: without the map's own error."""
-        out = self.covariance_m2[:2, :2].copy()
-        out[0, 0] -= self.map_sigma_m**2
-        out[1, 1] -= self.map_sigma_m**2
-        return out
+        return self.covariance_m2[:2, :2] - self.map_sigma_m**2 * np.eye(2)
 
     @property
     def relative_sigma_m(self) -> float:
