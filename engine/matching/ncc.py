@@ -359,7 +359,6 @@ class _Rungs:
 
     def refinement_of(self, found: PeakCandidate) -> Refinement:
         """Of the frame, with the heading and height of a candidate that a search fitted."""
-        samples, options = self._ncc.samples, self._ncc.options
         if found.is_fitted:
-            return Refinement(self._query.at(found.aligned.pose), samples, options)
-        return Refinement(self._query, samples, options, pictures=self._pictures)
+            return Refinement(self._query.at(found.aligned.pose), self._ncc.samples)
+        return Refinement(self._query, self._ncc.samples, pictures=self._pictures)

@@ -100,10 +100,7 @@ class Query:
     @cached_property
     def jacobian(self) -> Array:
         """(2, 2) metres east and north per map pixel where the vehicle should be, else at the map's middle."""
-        place = self.prior_px
-        if place is None:
-            place = np.array([self.site.width_px - 1, self.site.height_px - 1]) / 2.0
-        return self.site.enu_jacobian(place)
+        return self.site.enu_jacobian(self.site.grid.centre_px if self.prior_px is None else self.prior_px)
 
     def level_of(self, height_m: float) -> int:
         """The pyramid level whose pixels are like the frame's at this height above the ground."""

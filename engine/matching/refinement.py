@@ -24,7 +24,6 @@ from engine.matching.evidence import RELIABILITY, independent_places, surprise_o
 from engine.matching.oblique import is_oblique
 from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
-from engine.options import NccOptions
 from engine.runtime.scheduler import OutOfTime
 from engine.values import SIGNIFICANCE, Attitude, Fix, NoFix, Reason, Window
 
@@ -88,14 +87,12 @@ class Refinement:
     Attributes:
         query: the frame, with height and heading.
         samples: of the map.
-        options: of the correlation.
         doubts_tilt: whether the roll and pitch that came with the frame are only a start.
         pictures: the frame enhanced so far, by level.
     """
 
     query: Query
     samples: SampleMap
-    options: NccOptions
     doubts_tilt: bool = False
     pictures: dict[int, EnhancedFrame] = field(default_factory=dict, repr=False, compare=False)
 

@@ -34,7 +34,7 @@ class Sift(Method):
     Args:
         site: the map.
         device: where kornia's features are computed; the compiled ones are on the CPU.
-        options: settings; uses ``options.sift`` and, for refinement, NCC's enhancement of the map.
+        options: settings; uses ``options.sift``.
         samples: of the map for the refinement, if another method already has them.
     """
 
@@ -59,7 +59,6 @@ class Sift(Method):
         # kornia launches thousands of operations, which takes a GPU far longer than the compiled loops take.
         on = device if self.options.backend == "kornia" else CPU
         self.landmarks = LandmarkMap(site, on, self.options.backend)
-        self._ncc_options = options.ncc
         self.samples = SampleMap(site) if samples is None else samples
 
     @property
@@ -79,7 +78,7 @@ class Sift(Method):
         for answer in rehearse(query, rungs.all, None):
             rehearse(query, rungs.refinement, answer)
             if is_accepted(answer, query) and self.can_refine(query):
-                self._refinement(query).rehearse(answer.fix)
+                Refinement(query, self.samples).rehearse(answer.fix)
 
     def warmup_search(self, query: Query) -> None:
         """Search the whole map."""
@@ -120,15 +119,13 @@ class Sift(Method):
 
     def refined(self, query: Query, candidate: PoseCandidate) -> Fix | None:
         """The fix with its pose refined; None if that fails, or chance may have given that pose as well."""
-        refinement = self._refinement(query if candidate.drawn_at is None else query.at(candidate.drawn_at))
+        drawn = query if candidate.drawn_at is None else query.at(candidate.drawn_at)
+        refinement = Refinement(drawn, self.samples)
         found = refinement.refine_pose(candidate.fix)
         if found is None or not found.is_consistent:
             return None
         counts = found.is_clear or is_beyond_doubt(refinement.surprise_of(found), query.risk)
         return found.fix if counts else None
-
-    def _refinement(self, query: Query) -> Refinement:
-        return Refinement(query, self.samples, self._ncc_options)
 
     def explain(self, query: Query, window: Window) -> Explanation:
         """The matches in a window at the frame's own height and heading."""
