@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from engine.geo import chi_square, chi_square_of
+from engine.geo import Array, chi_square, chi_square_of
 from engine.values import SIGNIFICANCE, Fix
-
-Array = NDArray[np.float64]
 
 
 def are_consistent(apart_m: Array, covariance_m2: Array) -> bool:

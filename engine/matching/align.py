@@ -19,12 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.camera import SIDE_STEPS, Camera
-from engine.geo import inverse_2x2
+from engine.geo import Array, inverse_2x2
 from engine.kernels.between_nodes import places_between_nodes
 from engine.maps.tiles import RIM_PX, WHOLE_LEVEL_PX
 from engine.values import Attitude, Frame
-
-Array = NDArray[np.float64]
 
 # Beyond this angle off the vertical a footprint is stretched more than 4 times and relief occludes the ground.
 MAX_RAY_DEG = 75.0

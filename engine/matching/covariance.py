@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
-from engine.geo import transport_covariance
+from engine.geo import Array, transport_covariance
 from engine.values import GridPose, Peak
-
-Array = NDArray[np.float64]
 
 _MAX_TURNED = math.radians(60.0)
 _ASIDE = math.tan(math.radians(2.0))  # of an axis that counts as vertical

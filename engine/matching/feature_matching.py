@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.features import Features, Matches, match, sift
-from engine.geo import wrap_heading_deg
+from engine.geo import Array, wrap_heading_deg
 from engine.maps.landmarks import MIN_CONTRAST, LandmarkMap, as_picture
 from engine.maps.samples import ROUGH_REACH_PX
 from engine.matching.align import Orthophoto, orthorectify
@@ -31,7 +31,6 @@ from engine.values import Attitude
 if TYPE_CHECKING:  # it loads torch
     from engine.matching.point_finding import PointFinder
 
-Array = NDArray[np.float64]
 
 MAX_KEYPOINTS = 1000
 """Of the largest orthophoto."""

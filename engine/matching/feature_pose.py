@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.assumed_errors import AssumedErrors
-from engine.geo import attitude_from_rotation, wrap_difference_deg
+from engine.geo import Array, attitude_from_rotation, wrap_difference_deg
 from engine.kernels.dense import Pose
 from engine.maps.landmarks import LandmarkMap
 from engine.matching import refusals
@@ -34,7 +33,6 @@ from engine.window import SPREAD_SIGMAS
 if TYPE_CHECKING:  # it loads torch
     from engine.matching.point_finding import PointFinder
 
-Array = NDArray[np.float64]
 
 METHOD = "sift"
 _MATCHED_HEADING_SIGMA_DEG = 30.0  # of a heading given by the matches alone: nearly no information

@@ -18,17 +18,13 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from engine.geo import chi_square_of
+from engine.geo import Array, chi_square_of
 from engine.matching import pnp
-from engine.matching.pnp import MIN_INLIERS, SLACK, Fit, Problem, Reprojection
+from engine.matching.pnp import MIN_INLIERS, SLACK, Fit, Mask, Problem, Reprojection
 from engine.matching.votes import chance_of_agreeing
 from engine.options import PoseOptions
 from engine.values import SIGNIFICANCE
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _SAME_POSE_DEG = 1.5
 _CLOSER = (1.0, 2.0, 4.0)  # factors on the tolerance, tried in turn; without the prior a pose starts from the last

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from engine.geo import attitude_from_rotation, chi_square_of
+from engine.geo import Array, attitude_from_rotation, chi_square_of
 from engine.kernels import dense
 from engine.kernels.dense import DenseFit, EnhancedFrame, GaussianPrior, Pose, Samples
 from engine.kernels.scores import RADIUS_PX, enhance
@@ -26,8 +25,6 @@ from engine.matching.query import Query
 from engine.matching.unknown_slope import over_unknown_slope, wide_slope_deg
 from engine.runtime.scheduler import OutOfTime
 from engine.values import SIGNIFICANCE, Attitude, Fix, NoFix, Reason, Window
-
-Array = NDArray[np.float64]
 
 _CAPTURE_PX = 20.0  # tilts are tried on the level on which one off by one sigma moves the ground by no more
 _CLIMBED = independent_places((2.0 * _CAPTURE_PX) ** 2)  # places about a pose, the best of which refinement finds

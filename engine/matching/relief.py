@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from engine.geo import Array
 from engine.matching.align import Relief
 from engine.orthomap import OrthoMap
-
-Array = NDArray[np.float64]
 
 _BUILDING_M = 30.0  # largest width of objects on the ground
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.kernels.peaks import find_peak
-from engine.kernels.scores import enhance, orientation
+from engine.kernels.scores import FloatImage, enhance, orientation
 from engine.kernels.sums import counts, share_on_map
 from engine.matching.candidates import PeakCandidate, nats
 from engine.matching.correlation import COARSER, MIN_SIDE_PX, MIN_VALID_SHARE, Aligned, Correlator
@@ -31,8 +31,6 @@ from engine.ncc_fft import ncc
 from engine.runtime.device import Device, on_host, to_device
 from engine.values import Peak, Window
 from engine.window import level_crop
-
-FloatImage = NDArray[np.float32]
 
 _LEVEL = "structure on a level"  # a step
 _BLOCKS = 3  # along each side of the frame

@@ -17,12 +17,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from engine.geo import Array
 from engine.kernels.dense import Pose
 from engine.matching.pose import AttitudePrior
 
-Array = NDArray[np.float64]
 Mixture = tuple[Array, Array, Array]
 """Steps (N, 8) from a pose, their covariances (N, 8, 8), and the logarithms (N,) of their weights."""
 

@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 
 from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
-from engine.geo import larger_variance
+from engine.geo import Array, larger_variance
 from engine.matching.align import MAX_FIELD_DEG, to_gray
 from engine.matching.pose import AttitudePrior, PoseStart, solve_pose
 from engine.navigation.motion import GroundMotion, velocity_of
 from engine.options import PoseOptions
 from engine.values import Frame
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 _SMALL_PX = 160  # width at which a shift is estimated

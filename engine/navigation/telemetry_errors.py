@@ -11,18 +11,15 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engine.assumed_errors import AssumedErrors
 from engine.camera import Camera
-from engine.geo import wrap_heading_deg
+from engine.geo import Array, wrap_heading_deg
 from engine.matching.covariance import scale_doubt_m
 from engine.navigation.tracks import MIN_FRAMES
 from engine.options import NavigatorOptions
 from engine.values import Attitude, Fix, Frame
 from engine.window import SPREAD_SIGMAS
-
-Array = NDArray[np.float64]
 
 # States: what to add to roll, pitch and heading (deg) and to the height (a share); how late the attitude is (s).
 _ANGLES, _HEIGHT, _LAG = slice(0, 3), 3, 4
