@@ -15,6 +15,7 @@ from bench.accuracy.truth import off
 from engine import Fix, Frame, MatcherOptions, NoFix, OrthoMap, Prior, SceneMatcher
 from engine.budget import Budget, Deadline
 from engine.matching.candidates import PeakCandidate
+from engine.matching.feature_pose import FeatureMatcher
 from engine.matching.ncc import Ncc
 from engine.matching.query import Query
 from engine.matching.sift import Sift
@@ -139,8 +140,8 @@ class Bench:
         """The match by SIFT, accepted or not."""
         matcher = self.matcher(made.on, "SIFT")
         query = _query(matcher, frame, prior)
-        sift = _part(matcher, "sift", Sift)
-        found = sift.find(query, options)
+        landmarks = _part(matcher, "sift", Sift).landmarks
+        found = FeatureMatcher(query, landmarks, options).find()
         if isinstance(found, NoFix):
             return self.no_match(made, "SIFT")
         false_alarms = found.evidence.surprise - math.log(found.evidence.tried)

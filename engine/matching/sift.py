@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import replace
 from functools import partial
-from typing import TypeGuard
 
 from engine.maps.landmarks import LandmarkMap
 from engine.maps.samples import SampleMap
@@ -131,19 +130,6 @@ class Sift(Method):
         """The matches in a window at the frame's own height and heading."""
         return explain_features(FeatureMatcher(query, self.landmarks, self.options), window)
 
-    def find(
-        self, query: Query, options: SiftOptions | None = None, *, doubts_tilt: bool = False
-    ) -> PoseCandidate | NoFix:
-        """The pose of one frame, or a refusal if there is none.
-
-        Args:
-            query: the frame.
-            options: replace the method's own.
-            doubts_tilt: as :class:`.FeatureMatcher`.
-        """
-        options = options or self.options
-        return FeatureMatcher(query, self.landmarks, options, doubts_tilt=doubts_tilt).find()
-
     def works(self, query: Query) -> Works:
         """Shares of the usual scale, by the pixels of the matched picture, which determine the cost."""
         known, scale = query.telemetry, self.options.scale
@@ -157,7 +143,7 @@ class Sift(Method):
     def at_scale(self, query: Query, share: float, *, doubts_tilt: bool = False) -> PoseCandidate | NoFix:
         """The pose by all features at a share of the usual scale, not refined."""
         options = self.options if share == 1.0 else replace(self.options, scale=self.options.scale * share)
-        found = self.find(query, options, doubts_tilt=doubts_tilt)
+        found = FeatureMatcher(query, self.landmarks, options, doubts_tilt=doubts_tilt).find()
         return found if share == 1.0 or isinstance(found, NoFix) else found.coarse()
 
 
@@ -196,7 +182,8 @@ class _Rungs:
         return replace(found, fix=with_tilt_doubt(query, found.fix), is_quick=True).coarse()
 
     def _if_few_do_not_suffice(self, answer: Answer | None) -> Works:
-        return self._works if answer is None or (_is_quick(answer) and not answer.refinement_failed) else {}
+        is_left = isinstance(answer, PoseCandidate) and answer.is_quick and not answer.refinement_failed
+        return self._works if answer is None or is_left else {}
 
     def _by_all(self, answer: Answer | None, step: Hashable, *, doubts_tilt: bool = False) -> Answer:
         """The pose by all features; if the tilt is doubted, it does not rest on the stated one."""
@@ -224,7 +211,3 @@ class _Rungs:
         if not (is_accepted(answer, self._query) or refined.score >= CONFIRMING_CORRELATION):
             return None
         return replace(answer, fix=refined, is_quick=False, evidence=replace(answer.evidence, is_tested=True))
-
-
-def _is_quick(answer: Answer | None) -> TypeGuard[PoseCandidate]:
-    return isinstance(answer, PoseCandidate) and answer.is_quick

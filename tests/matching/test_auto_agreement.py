@@ -67,7 +67,7 @@ def test_two_places_that_are_about_as_evident_refuse(told, sift_nats):
 
 def test_a_refined_fix_beyond_doubt_is_not_matched_a_second_time(site, camera, frame, prior, monkeypatch):
     monkeypatch.setattr(FeatureMatcher, "find_at_once", lambda *_: pytest.fail("SIFT was asked"))
-    monkeypatch.setattr(Sift, "find", lambda *_: pytest.fail("SIFT was asked"))
+    monkeypatch.setattr(FeatureMatcher, "find", lambda *_: pytest.fail("SIFT was asked"))
     fix = SceneMatcher(site, camera, "auto", "cpu").locate(frame, prior)
     assert (fix.method, fix.stage) == ("ncc", "refined")
     assert 1.0 - fix.confidence < 1e-11
