@@ -96,9 +96,15 @@ class Ncc(Method):
         return climb(query, [*looks, *searches])[METHOD]
 
     def rungs(self, query: Query) -> tuple[list[Rung], list[Rung]]:
-        """The rungs at a frame's own heading and height, and those at others, if all else is refused."""
-        rungs = _Rungs(self, query)
-        return rungs.by_telemetry, rungs.searches
+        """The rungs at a frame's own heading and height, and those at others, if all else is refused.
+
+        A null hypothesis is tested if refinement leaves doubt: the pose is stronger evidence, and cheaper. What
+        structure finds is another candidate, which is refined and tested in its turn.
+        """
+        own = _Rungs(self, query)
+        tested = [own.refinement, own.null]
+        looks = [own.coarsest, own.at_once, own.null, own.levels, *tested, own.structure, *tested]
+        return looks, [own.search, replace(own.refinement, is_needless=is_accepted)]
 
     def works(self, query: Query) -> Works:
         """Correlation on each level, the frame's own first; or the search of the whole map."""
@@ -215,21 +221,6 @@ class _Rungs:
         self.structure = Rung(METHOD, "structure", self._if_unseen, self._match_structure)
         self.search = Rung(METHOD, "headings and heights", self._if_refused, self._search, is_accepted)
 
-    @property
-    def by_telemetry(self) -> list[Rung]:
-        """Those at the frame's own heading and height, in their order.
-
-        A null hypothesis is tested if refinement leaves doubt: the pose is stronger evidence, and cheaper. What
-        structure finds is another candidate, which is refined and tested in its turn.
-        """
-        coarse = [self.coarsest, self.at_once, self.null]
-        return [*coarse, self.levels, self.refinement, self.null, self.structure, self.refinement, self.null]
-
-    @property
-    def searches(self) -> list[Rung]:
-        """Those at other headings and heights, if the looks are refused."""
-        return [self.search, replace(self.refinement, is_needless=is_accepted)]
-
     def _if_coarse_suffices(self, answer: Answer | None) -> Works:
         """The coarsest level, if refinement may start from its peak and there is time for both.
 
@@ -237,7 +228,8 @@ class _Rungs:
         """
         query, (*finer, (coarsest, work)) = self._query, self._works.items()
         is_wide = query.site.is_large and work > MAX_WINDOW_PX
-        if is_wide or not (finer and self._can_confirm and query.scheduler.can_afford({coarsest: work})):
+        can_confirm = query.telemetry.has_tilt and query.site.has_surface and self._ncc.can_refine(query)
+        if is_wide or not (finer and can_confirm and query.scheduler.can_afford({coarsest: work})):
             return {}
         if not query.scheduler.can_afford({coarsest: work, _AT_ONCE: self._frame_px}):
             query.scheduler.note_refusal(_AT_ONCE)
@@ -350,12 +342,6 @@ class _Rungs:
 
     def _falls_short(self, answer: Answer | None) -> TypeGuard[PeakCandidate]:
         return isinstance(answer, PeakCandidate) and not answer.suffices(self._query.risk)
-
-    @property
-    def _can_confirm(self) -> bool:
-        """Whether refinement may confirm a place: with a known attitude over a surface model."""
-        query = self._query
-        return query.telemetry.has_tilt and query.site.has_surface and self._ncc.can_refine(query)
 
     def refinement_of(self, found: PeakCandidate) -> Refinement:
         """Of the frame, with the heading and height of a candidate that a search fitted."""
