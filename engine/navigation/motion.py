@@ -215,7 +215,15 @@ def velocity_of(frame: Frame) -> Array | None:
 
 
 def stamps_m2(mps: Array, options: NavigatorOptions) -> float:
-    """Variance of a way at this velocity (2,) because the stamps at both of its ends are off."""
+    """Variance of a way because the stamps at both of its ends are off.
+
+    Args:
+        mps: (2,) velocity along it.
+        options: of the navigator.
+
+    Returns:
+        Square metres per axis.
+    """
     return 2.0 * options.attitude_jitter_s**2 * float(mps @ mps)
 
 
