@@ -285,6 +285,17 @@ class OrthoMap(Georeference):
         heights = self._surface.sample(xy)
         return np.where(np.isnan(heights), self.ground_m, heights)
 
+    def surface_points(self, xy_px: ArrayLike) -> Array:
+        """Points of the surface.
+
+        Args:
+            xy_px: (N, 2) pixels of the map.
+
+        Returns:
+            (N, 3) metres east and north of the map's origin, and height as by :meth:`surface_at`.
+        """
+        return np.column_stack([self.enu_from_pixel(xy_px), self.surface_at(xy_px)])
+
     def ground_at(self, xy_px: ArrayLike) -> float:
         """Height of the bare ground at one pixel, on a plane about it that has a fifth of the surface below it.
 

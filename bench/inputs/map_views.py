@@ -116,8 +116,7 @@ def _pair(name: str, site: OrthoMap, camera: Camera, photo: Photo, size: Size) -
 
     def first_from_second(xy_px: Array) -> Array:
         map_px = site.full_from_level(xy_px + corner, level)
-        ground = np.c_[site.enu_from_pixel(map_px), site.surface_at(map_px)]
-        seen = (ground - photo.center_m) @ turn.T @ camera.matrix.T
+        seen = (site.surface_points(map_px) - photo.center_m) @ turn.T @ camera.matrix.T
         return np.asarray((seen[:, :2] / seen[:, 2:] + 0.5) * reduced - 0.5 - cut)
 
     first = np.ascontiguousarray(picture[cut[1] : cut[1] + height, cut[0] : cut[0] + width])

@@ -152,7 +152,7 @@ class OpenCvFeatures:
             return query.refuse(Reason.TOO_FEW_MATCHES, f"{len(pairs)} matches", "sift", window=window)
         points_px = (seen.xy_px[pairs[:, 0]] + 0.5) / options.scale - 0.5
         map_px = site.full_from_level(known.xy_px[pairs[:, 1]] + corner, level)
-        points_m = np.c_[site.enu_from_pixel(map_px), site.surface_at(map_px)]
+        points_m = site.surface_points(map_px)
         stats = solve_pose(
             points_m, points_px, self._camera.matrix, options.pose, prior=self._attitude(query.telemetry)
         )

@@ -176,8 +176,7 @@ class LandmarkMap:
 
     def _with_points(self, tile: NamedArrays, level: int) -> NamedArrays:
         map_px = self._site.full_from_level(tile["xy_px"], level)
-        points_m = np.column_stack([self._site.enu_from_pixel(map_px), self._site.surface_at(map_px)])
-        return tile | {"points_m": points_m}
+        return tile | {"points_m": self._site.surface_points(map_px)}
 
 
 def _count(tile: NamedArrays) -> int:

@@ -75,7 +75,7 @@ class SampleMap:
         weights = self._site.roughness_weight_at(xy_px, ROUGH_REACH_PX * 2.0**level)
         if mask is not None:
             weights = weights * mask[rows, columns]
-        points = np.column_stack([self._site.enu_from_pixel(xy_px), self._site.surface_at(xy_px)])
+        points = self._site.surface_points(xy_px)
         per_px = np.stack([across[rows, columns], down[rows, columns]], axis=-1).astype(np.float64)
         metres_per_px = self._site.enu_jacobian(xy_px[len(xy_px) // 2]) * 2.0**level  # nearly constant over a cell
         gradients = per_px @ np.linalg.inv(metres_per_px)

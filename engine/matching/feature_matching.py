@@ -222,8 +222,8 @@ class PointSearch:
 
     def _lifted(self, map_px: Array, view: MapView) -> Array:
         """(N, 3) east, north and the height of the surface at pixels (N, 2) of a view's level."""
-        site, full_px = self.query.site, self.query.site.full_from_level(map_px, view.level)
-        return np.column_stack([site.enu_from_pixel(full_px), site.surface_at(full_px)])
+        site = self.query.site
+        return site.surface_points(site.full_from_level(map_px, view.level))
 
     def _matched(self, view: MapView, points_px: Array, points_m: Array, tolerance_px: float) -> Matched:
         """The matches, weighted: on a rough surface heights vary."""

@@ -336,7 +336,7 @@ def ellipsoid(center_m: Array, covariance_m2: Array) -> Any:
 
 def _outline(site: OrthoMap, corners_px: Array, colour: tuple[int, int, int]) -> Any:
     """A closed line above the surface through map pixels (4, 2)."""
-    strip = np.column_stack([site.enu_from_pixel(corners_px), site.surface_at(corners_px) + _OUTLINE_OFFSET_M])
+    strip = site.surface_points(corners_px) + np.array([0.0, 0.0, _OUTLINE_OFFSET_M])
     return rr.LineStrips3D([_closed_polyline(strip)], colors=colour, radii=rr.Radius.ui_points(1.0))
 
 

@@ -310,6 +310,7 @@ def test_surface_is_bilinear_and_ground_is_a_low_percentile(site):
     assert site.has_surface
     xy = np.array([[10.5, 20.25], [0.0, 0.0], [118.9, 88.9]])
     assert np.allclose(site.surface_at(xy), xy @ [0.25, 0.5], atol=1e-4)
+    assert np.array_equal(site.surface_points(xy), np.c_[site.enu_from_pixel(xy), site.surface_at(xy)])
     corners, outside = [[-0.5, -0.5], [119.5, 89.5]], [[-0.6, 2.0], [119.6, 2.0], [2.0, -0.6], [2.0, 89.6]]
     assert np.allclose(site.surface_at(corners), [0.0, 74.25])  # pixels reach half a pixel out
     assert (site.surface_at(outside) == site.ground_m).all()

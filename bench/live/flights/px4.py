@@ -140,10 +140,11 @@ def read_log(log: Path, place: LocalFrame) -> list[Track]:
     """
     from pyulog import ULog
 
-    read = ULog(str(log))
+    positions = ("vehicle_global_position_groundtruth", "vehicle_global_position", "aux_global_position")
+    read = ULog(str(log), [*positions, "vehicle_local_position", "vehicle_visual_odometry"])
     data = {each.name: each.data for each in read.data_list}
     tracks = []
-    for name in ("vehicle_global_position_groundtruth", "vehicle_global_position", "aux_global_position"):
+    for name in positions:
         if (known := data.get(name)) is not None:
             east_north = place.enu_from_geodetic(known["lat"], known["lon"])
             tracks.append(np.column_stack([known["timestamp"] * 1e-6, east_north]))
